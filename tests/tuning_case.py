@@ -23,8 +23,7 @@ from jaxquad.loops import Loop
 from jaxquad.models import DecoupledAxes
 from jaxquad.simulation import Pulse, Saturation, scenario, Sine, Step
 from jaxquad.tuning import Objective
-from jaxquad.tuning._cost import evaluate_cost, stack_copies, Subproblem
-from jaxquad.tuning._multipliers import initial_multipliers
+from jaxquad.tuning._cost import evaluate_cost, initial_multipliers, stack_copies, Subproblem
 from jaxquad.tuning._parameters import select_coordinates
 from jaxquad.tuning._problem import make_problem, TimeSpan
 

@@ -22,7 +22,7 @@ from ._pilot_page import (
     StepGrid,
     VERDICTS,
 )
-from .betaflight._flown_adrc import FlownADRC
+from .betaflight._adrc import FlownADRC
 
 
 if TYPE_CHECKING:
@@ -56,9 +56,7 @@ def adrc_page(found: "ADRCAutopilot", origin: Provenance) -> PilotPage:
 
 def _headlines(found: "ADRCAutopilot") -> list[Headline]:
     headlines = [Headline(*VERDICTS[found.kind], found.verdict)]
-    for throttle, each in found.reproductions.items():
-        if each.verdict in found.verdict:
-            continue
+    for throttle, each in found.shown_again.items():
         flew = each.kind == "flown"
         word = "THE FLOWN LOOP AGAIN" if flew else "THE FLOWN LOOP IS NOT REPRODUCED"
         level = "good" if flew else "warn" if each.kind == "unknown" else "bad"

@@ -20,7 +20,7 @@ from ._page import write_pilot_page
 from ._parameters import find_parameter
 from ._rate_design import Kind
 from ._reproduce_flight import Reproduction
-from .betaflight._flown_adrc import adrc_parameters, b0_law, FlownADRC
+from .betaflight._adrc import adrc_parameters, b0_law, FlownADRC
 
 
 _BUILD = (2026, 6)  # whose names a file of the ADRC has
@@ -227,6 +227,15 @@ class ADRCAutopilot:
             raised=[axis for axis in AXES if f"d_max_{axis}" in flown],
         )  # fmt: skip
 
+    @property
+    def shown_again(self) -> Mapping[float, Reproduction]:
+        """The flown loop again by throttle, without what the verdict says of it."""
+        doubted = doubted_throttle(self.reproductions)
+        if doubted is None:
+            return self.reproductions
+        said = self.reproductions[doubted].verdict
+        return {x: each for x, each in self.reproductions.items() if each.verdict != said}
+
     def __str__(self) -> str:
         version, law = ".".join(map(str, self.version)), "ADRC" if self.flew_adrc else "PID"
         lines = [
@@ -241,8 +250,7 @@ class ADRCAutopilot:
         lines += ["", str(self.plant)] if self.plant is not None else []
         again = [
             f"flown loop at {x:.2f} throttle: {each.verdict}"
-            for x, each in self.reproductions.items()
-            if each.verdict not in self.verdict
+            for x, each in self.shown_again.items()
         ]
         lines += ["", *again] if again else []
         if self.proposal is not None:
@@ -251,6 +259,13 @@ class ADRCAutopilot:
             lines += ["", change_table(self.changes, self.words).rstrip()]
         lines += ["", *(f"! {each}" for each in self.remarks)] if self.remarks else []
         return "\n".join([*lines, "", self.verdict])
+
+
+def doubted_throttle(again: Mapping[float, Reproduction]) -> float | None:
+    """Where the flown loop is not reproduced; None where it is at one level, and off at none."""
+    off = [throttle for throttle, each in again.items() if each.kind == "not flown"]
+    blind = all(each.kind == "unknown" for each in again.values())
+    return next(iter(off or (again if blind else ())), None)
 
 
 def _remarks_on_b0(plant: GainOverThrottle, proposal: ADRCProposal, flew: bool) -> list[str]:

@@ -215,5 +215,5 @@ def _radius(error: Float[Array, "... states states"]) -> Float[np.ndarray, "..."
 
 def list_range(values: Float[Array, "..."]) -> str:
     """One number, or the lowest and the highest of several."""
-    values = np.unique(np.asarray(values))
-    return f"{values[0]:.4g}" if values.size == 1 else f"{values[0]:.4g} .. {values[-1]:.4g}"
+    low, high = np.min(np.asarray(values)), np.max(np.asarray(values))
+    return f"{low:.4g}" if low == high else f"{low:.4g} .. {high:.4g}"

@@ -40,7 +40,6 @@ from .frequency_domain._cost import (
 )
 from .frequency_domain._fit import fit as fit, guess_lagged_integrator as guess_lagged_integrator
 from .frequency_domain._held import as_sampled as as_sampled
-from .frequency_domain._normal import problem_normal as problem_normal
 from .frequency_domain._parameters import (
     Free as Free,
     name_places as name_places,

@@ -291,7 +291,7 @@ class GainOverThrottle(eqx.Module):
     def to_dict(self) -> dict[str, object]:
         """All numbers as JSON holds them: None for what is not finite or not determined."""
         curve, line = self.curve, self._line()
-        content = lambda number: {**number._asdict(), "interval_95": number.interval}
+        content = lambda number: {**number.content(), "interval_95": number.interval}
         levels = [
             {
                 "throttle": self.throttle[k],

@@ -12,8 +12,15 @@ from jaxtyping import Array, Bool, Complex, Float
 
 from jaxquad._compile import brief_options, Jit
 
-from ._closed_loop import close, ClosedLoopMatrix, join, OpenLoop
-from ._linear_parts import axis_index, linear_parts, LinearParts
+from ._linear_loop import (
+    axis_index,
+    close,
+    ClosedLoopMatrix,
+    join,
+    linear_parts,
+    LinearParts,
+    OpenLoop,
+)
 from ._loop import Loop
 from ._spectrum import abscissa, noise_gain, powers, sharpest
 from .qualities._basis import decibels, degrees, lines, shown
@@ -348,8 +355,8 @@ def _analyse_axis(
     loop: Loop, axis: int, member: tuple[int, ...] | None, smoothing: float
 ) -> LoopAnalysis:
     parts, ensemble = linear_parts(loop, [axis], member)
-    found = analyse_parts(parts, smoothing)
-    return jax.tree.map(lambda x: x.reshape(ensemble + x.shape[1:]), found)
+    analysis = analyse_parts(parts, smoothing)
+    return jax.tree.map(lambda x: x.reshape(ensemble + x.shape[1:]), analysis)
 
 
 @ft.partial(Jit, options=brief_options)
@@ -387,11 +394,11 @@ class LoopNumbers(NamedTuple):
 def loop_numbers(loop: Loop, axes: Sequence[int]) -> LoopNumbers:
     """`analyse` of some axes of all members at once; stability by the eigenvalues themselves."""
     parts, ensemble = linear_parts(loop, axes, states=_STATES)
-    found = analyse_parts(parts, 1e-5)
-    slowest = np.real(found.poles[:, 0])
-    stable = np.asarray(found.stable) & (slowest < 0)
+    analysis = analyse_parts(parts, 1e-5)
+    slowest = np.real(analysis.poles[:, 0])
+    stable = np.asarray(analysis.stable) & (slowest < 0)
     numbers = {
-        name: np.where(stable, np.asarray(vars(found)[name]), np.nan)
+        name: np.where(stable, np.asarray(vars(analysis)[name]), np.nan)
         for name in LoopNumbers._fields[2:]
     }
     rows = (stable, slowest, *numbers.values())

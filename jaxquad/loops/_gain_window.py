@@ -6,15 +6,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import DTypeLike
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from jaxquad.control import LinearController
 
-from ._closed_loop import close
-from ._linear_parts import axis_index, linear_parts, LinearParts, SampledAxis
+from ._linear_loop import axis_index, close, linear_parts, LinearParts, SampledAxis
 from ._loop import Loop
 from ._spectrum import abscissa, growth, powers, sharpest
-from .qualities._crossings import first
+from .qualities._curve import first
 
 
 _REACH = 1e4  # of the search, as a factor and its inverse
@@ -77,8 +76,8 @@ def _window(parts: LinearParts) -> GainWindow:
     plant, controller = parts.sampled()
     sharp = sharpest(_SHARP, parts.dt, plant.fresh.dtype)
     ladder = lambda matrix: powers(matrix, parts.dt, sharp)
-    held = jax.lax.stop_gradient((plant, controller))
-    grown = lambda factor: growth(ladder(_closed(*held, factor, parts.memory)), parts.dt)
+    fixed = jax.lax.stop_gradient((plant, controller))
+    grown = lambda factor: growth(ladder(_closed(*fixed, factor, parts.memory)), parts.dt)
     rate = jax.vmap(grown)
 
     def slowest(factor: Float[Array, ""]) -> Float[Array, ""]:
@@ -87,7 +86,11 @@ def _window(parts: LinearParts) -> GainWindow:
 
     factors = _candidates(rate, plant.fresh.dtype)
     rates = rate(factors)
-    inside = _run(rates < 0, _anchor(factors, rates))
+    # The stable neighbours of the plant's own gain, or of the most stable one.
+    unity = jnp.argmin(jnp.abs(jnp.log(factors)))
+    anchor = jnp.where(rates[unity] < 0, unity, jnp.argmin(rates))
+    label = jnp.cumsum(~(rates < 0))
+    inside = (rates < 0) & (label == label[anchor])
     exists, ratio = jnp.any(inside), parts.ratio
 
     crossed = jnp.stack([~inside[:-1] & inside[1:], inside[:-1] & ~inside[1:]])
@@ -123,14 +126,3 @@ def _candidates(rate: Callable[[Array], Array], dtype: DTypeLike) -> Float[Array
         closer = ends[0] * (ends[1] / ends[0]) ** share
         factors = jnp.sort(jnp.concatenate([factors, closer]))
     return factors
-
-
-def _anchor(factors: Float[Array, " points"], rates: Float[Array, " points"]) -> Array:
-    own = jnp.argmin(jnp.abs(jnp.log(factors)))
-    return jnp.where(rates[own] < 0, own, jnp.argmin(rates))
-
-
-def _run(stable: Bool[Array, " points"], anchor: Array) -> Bool[Array, " points"]:
-    """The stable neighbours of `anchor`, and it."""
-    label = jnp.cumsum(~stable)
-    return stable & (label == label[anchor])

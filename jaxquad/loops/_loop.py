@@ -163,7 +163,7 @@ def _queue_of(delay: ArrayLike, dt: float, longest: float | None) -> DelayQueue:
 
 def _queue_for(samples: Float[np.ndarray, "..."]) -> DelayQueue:
     nearest = np.round(samples)
-    whole = bool(np.all(np.abs(samples - nearest) < 1e-9 * np.maximum(nearest, 1)))
-    samples = nearest if whole else np.floor(samples)
+    is_integer = bool(np.all(np.abs(samples - nearest) < 1e-9 * np.maximum(nearest, 1)))
+    samples = nearest if is_integer else np.floor(samples)
     most, fewest = (int(f(samples)) if samples.size else 0 for f in (np.max, np.min))
-    return DelayQueue(most if whole else most + 1, not whole, False, fewest)
+    return DelayQueue(most if is_integer else most + 1, not is_integer, False, fewest)

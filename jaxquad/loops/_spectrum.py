@@ -40,8 +40,8 @@ def powers(matrix: Float[Array, "states states"], dt: float, smoothing: float) -
         scale = size(following)
         return (following / scale, 2 * log + jnp.log(scale)), carry
 
-    held = jax.lax.stop_gradient(matrix)
-    start = (held / size(held), jnp.log(size(held)))
+    fixed = jax.lax.stop_gradient(matrix)
+    start = (fixed / size(fixed), jnp.log(size(fixed)))
     last, earlier = jax.lax.scan(square, start, length=count)
     return Powers(*(jnp.concatenate([a, b[None]]) for a, b in zip(earlier, last, strict=True)))
 
@@ -85,12 +85,12 @@ def abscissa(
     """
     start = growth(ladder, dt) + smoothing
     unit, shift = jnp.eye(len(matrix), dtype=matrix.dtype), start * dt
-    reached, seen = gramian(ladder, unit, shift), gramian(_turned(ladder), unit, shift)
+    reachable, observable = gramian(ladder, unit, shift), gramian(_turned(ladder), unit, shift)
     tame = jnp.exp(-shift) * jax.lax.stop_gradient(matrix)
-    pull = _dot(_dot(seen, tame), reached)
+    pull = _dot(_dot(observable, tame), reachable)
     slope = jnp.sum(pull * tame) * dt
     moved = jnp.sum(pull * (jnp.exp(-shift) * matrix - tame)) / slope  # 0, with the derivative
-    return start - 0.5 * jnp.trace(reached) / slope + moved
+    return start - 0.5 * jnp.trace(reachable) / slope + moved
 
 
 def noise_gain(
@@ -107,11 +107,16 @@ def noise_gain(
     """
     live = (jnp.exp(-shift) * matrix, noise, command, through)
     tame, entry, reading, direct = jax.lax.stop_gradient(live)
-    reached = gramian(ladder, jnp.outer(entry, entry), shift)
-    seen = gramian(_turned(ladder), jnp.outer(reading, reading), shift)
-    power = _dot(reading, _dot(reached, reading)) + direct**2
-    pulls = (_dot(_dot(seen, tame), reached), _dot(seen, entry), _dot(reached, reading), direct)
-    changes = (x - held for x, held in zip(live, (tame, entry, reading, direct), strict=True))
+    reachable = gramian(ladder, jnp.outer(entry, entry), shift)
+    observable = gramian(_turned(ladder), jnp.outer(reading, reading), shift)
+    power = _dot(reading, _dot(reachable, reading)) + direct**2
+    pulls = (
+        _dot(_dot(observable, tame), reachable),
+        _dot(observable, entry),
+        _dot(reachable, reading),
+        direct,
+    )
+    changes = (x - fixed for x, fixed in zip(live, (tame, entry, reading, direct), strict=True))
     moved = 2 * sum(jnp.sum(p * d) for p, d in zip(pulls, changes, strict=True))
     return jnp.sqrt(power) + moved / (2 * jnp.sqrt(jnp.where(power > 0, power, jnp.inf)))
 

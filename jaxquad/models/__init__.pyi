@@ -2,7 +2,6 @@ from ._allocation import Allocation as Allocation
 from ._attitude import Attitude as Attitude
 from ._connect import realise as realise, series as series, state_space as state_space
 from ._decoupled import DecoupledAxes as DecoupledAxes, LinearAxis as LinearAxis
-from ._entry_slopes import Entry as Entry, factor_slopes as factor_slopes
 from ._exponential import matrix_exponential as matrix_exponential
 from ._from_control import from_control as from_control
 from ._modes import Mode as Mode, modes as modes
@@ -20,7 +19,6 @@ from ._protocols import (
     Model as Model,
     with_arrays as with_arrays,
 )
-from ._response import Split as Split
 from ._rotation import (
     euler_acceleration as euler_acceleration,
     euler_from_quaternion as euler_from_quaternion,
@@ -37,7 +35,7 @@ from ._simulate_linear import (
     simulate_linear as simulate_linear,
     split_delay as split_delay,
 )
-from ._state_space import explicit as explicit, matrices_of as matrices_of, StateSpace as StateSpace
+from ._state_space import explicit as explicit, StateSpace as StateSpace
 from ._transfer_function import (
     AttitudeAxis as AttitudeAxis,
     imaginary as imaginary,

@@ -1,5 +1,5 @@
 import functools as ft
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple, TypeVar
 
 import jax
@@ -20,10 +20,9 @@ class Split(NamedTuple):
 
 
 Scales = tuple[Float[Array, "states frequencies"], Float[Array, "states frequencies"]]
-Inverse = Callable[[Split, Scales], Split]
 
 
-def product(a: Split, b: Split) -> Split:
+def _product(a: Split, b: Split) -> Split:
     """The matrix product at each frequency."""
     real = imag = jnp.zeros((), a.real.dtype)
     for k in range(a.real.shape[1]):  # a plain sum is a fast loop, a reduction is not
@@ -42,41 +41,16 @@ def inverse(matrix: Split, scales: Scales) -> Split:
     undefined.
     Source: Higham, Accuracy and Stability of Numerical Algorithms, section 14.4.
     """
-    return _in_units(_invert_in_place, matrix, scales)
-
-
-@jax.custom_jvp
-def inverse_by_diagonal(matrix: Split, scales: Scales) -> Split:
-    """As `inverse`, in half the time where the diagonal elements will do as pivots.
-
-    They do where, at all frequencies, none is below a hundredth of what is left of its column.
-    Source: Duff, Erisman, Reid, Direct Methods for Sparse Matrices, threshold pivoting.
-    """
-
-    def invert(scaled: Split) -> Split:
-        found, sound = _invert_by_diagonal(scaled)
-        return jax.lax.cond(sound, lambda _: found, _invert_in_place, scaled)
-
-    return _in_units(invert, matrix, scales)
-
-
-def _in_units(invert: Callable[[Split], Split], matrix: Split, scales: Scales) -> Split:
     rows, columns = scales
-    found = invert(Split(*(rows[:, None] * part * columns[None] for part in matrix)))
+    found = _invert_in_place(Split(*(rows[:, None] * part * columns[None] for part in matrix)))
     return Split(*(columns[:, None] * part * rows[None] for part in found))
 
 
-def _derivative_of(inverse: Inverse) -> Callable[[tuple, tuple], tuple[Split, Split]]:
-    def derivative(primals, tangents):
-        found = inverse(*primals)  # whatever the scales
-        change = product(product(found, tangents[0]), found)
-        return found, Split(-change.real, -change.imag)
-
-    return derivative
-
-
-inverse.defjvp(_derivative_of(inverse))
-inverse_by_diagonal.defjvp(_derivative_of(inverse_by_diagonal))
+@inverse.defjvp
+def _inverse_jvp(primals, tangents):
+    found = inverse(*primals)  # whatever the scales
+    change = _product(_product(found, tangents[0]), found)
+    return found, Split(-change.real, -change.imag)
 
 
 def equilibrium(
@@ -114,36 +88,6 @@ def _invert_in_place(matrix: Split) -> Split:
     index = (row[:, None] * states + place[None]).reshape(-1, frequencies)
     order = lambda part: _take_along(part.reshape(-1, frequencies), index, 0).reshape(part.shape)
     return Split(order(table.real), order(table.imag))
-
-
-_LEAST = 0.01  # of its column, that a diagonal element must be to do as a pivot
-
-
-def _invert_by_diagonal(matrix: Split) -> tuple[Split, Bool[Array, ""]]:
-    """The inverse without a choice of pivots, and whether they all did."""
-
-    def step(k: Int[Array, ""], carry: tuple[Split, Array]) -> tuple[Split, Array]:
-        table, sound = carry
-        table, will_do = no_fuse(_exchange_diagonal, table, k)
-        return table, sound & will_do
-
-    sound, states = jnp.ones(matrix.real.shape[2], bool), len(matrix.real)
-    # Two steps at a time: the table goes from one place to another and back, without a copy.
-    found, sound = jax.lax.fori_loop(0, states, step, (matrix, sound), unroll=2)
-    return found, jnp.all(sound)
-
-
-def _exchange_diagonal(
-    table: Split, k: Int[Array, ""]
-) -> tuple[Split, Bool[Array, " frequencies"]]:
-    """Unknown k against its own right side, and whether the diagonal element does as a pivot."""
-    number = jnp.arange(len(table.real))[:, None]
-    column = _column(table, k)
-    size = column.real * column.real + column.imag * column.imag
-    largest = jnp.max(jnp.where(number >= k, size, 0), axis=0)
-    pivot = jax.lax.dynamic_index_in_dim(size, k, keepdims=False)
-    row = Split(*(jax.lax.dynamic_index_in_dim(part, k, keepdims=False) for part in table))
-    return _exchange(table, row, column, number == k, k), pivot >= _LEAST**2 * largest
 
 
 def _pivot_row(
@@ -222,7 +166,7 @@ def response(matrices: Matrices, omega: Float[Array, " frequencies"]) -> Split:
     Infinite, with an undefined phase, where a pole lies so near that more than a hundredth of the
     states may be rounding. Source: Tischler & Remple, eq. 12.11 and 12.12.
     """
-    return _mark_rounding(matrices, omega, solve_states(matrices, omega))
+    return _mark_rounding(matrices, omega, _solve_states(matrices, omega))
 
 
 class Solved(NamedTuple):
@@ -234,14 +178,12 @@ class Solved(NamedTuple):
     scales: Scales
 
 
-def solve_states(
-    matrices: Matrices, omega: Float[Array, " frequencies"], invert: Inverse = inverse
-) -> Solved:
+def _solve_states(matrices: Matrices, omega: Float[Array, " frequencies"]) -> Solved:
     """The response without a look at its rounding error."""
     scales = jax.lax.stop_gradient(_scales(matrices, omega))
-    resolvent = invert(_pencil(matrices, omega), scales)
+    resolvent = inverse(_pencil(matrices, omega), scales)
     states = Split(*(no_fuse(_multiply_columns, part, matrices.G) for part in resolvent))
-    value = _apply_delay(output_of(matrices, omega, states), matrices.late, omega)
+    value = _apply_delay(_output_of(matrices, omega, states), matrices.late, omega)
     return Solved(value, resolvent, states, scales)
 
 
@@ -257,7 +199,7 @@ def _response_jvp(primals, tangents):
     # dT = L (dG + dF X - d(s M) X) + d(H0 + s H1) X, late, and -j d(omega late) T.
     matrices, omega = primals
     d, d_omega = (_drop_zeros(each) for each in tangents)
-    found = solve_states(matrices, omega)
+    found = _solve_states(matrices, omega)
     value, states = _mark_rounding(matrices, omega, found), found.states
     rate = _derivative(states, omega)
     push = [
@@ -272,7 +214,7 @@ def _response_jvp(primals, tangents):
         change.append(_multiply(matrices.H1, turned))
     pushed = _add_given(push)
     if pushed is not None:
-        change.append(no_fuse(product, output_of(matrices, omega, found.resolvent), pushed))
+        change.append(no_fuse(_product, _output_of(matrices, omega, found.resolvent), pushed))
     changed = _add_given(change)
     moved = [None if changed is None else _apply_delay(changed, matrices.late, omega)]
     for late, frequency in ((d.late, omega), (matrices.late, d_omega)):
@@ -309,7 +251,7 @@ def _mass(matrices: Matrices) -> Float[Array, "states states"]:
     return jnp.eye(len(F), dtype=F.dtype) if M is None else M
 
 
-def output_of(matrices: Matrices, omega: Float[Array, " frequencies"], states: Split) -> Split:
+def _output_of(matrices: Matrices, omega: Float[Array, " frequencies"], states: Split) -> Split:
     """(H0 + s H1) times `states`, or times the resolvent."""
     rates = _multiply(matrices.H1, _derivative(states, omega))
     return _add(_multiply_real(matrices.H0, states), rates)

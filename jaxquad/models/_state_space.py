@@ -177,13 +177,9 @@ def explicit(
 
 @eqx.filter_jit  # one call of many small operations is slow outside of it
 def _frequency_response(model: StateSpace, omega: Array) -> Array:
-    parts = response(matrices_of(model), omega)
+    matrices = Matrices(model.F, model.G, model.H0, model.H1, model.M, model.lateness)
+    parts = response(matrices, omega)
     return jnp.moveaxis(jax.lax.complex(parts.real, parts.imag), -1, 0)
-
-
-def matrices_of(model: StateSpace) -> Matrices:
-    """The arrays that a response is computed from."""
-    return Matrices(model.F, model.G, model.H0, model.H1, model.M, model.lateness)
 
 
 def _host(model: StateSpace) -> tuple[np.ndarray, ...]:

@@ -1,7 +1,13 @@
 """Tuning over an ensemble: objectives, limits, the optimiser, certificates, Pareto fronts."""
 
 from ._certificate import Certificate as Certificate
-from ._certify import certify as certify, describe_controller as describe_controller
+from ._certify import (
+    certify as certify,
+    describe_controller as describe_controller,
+    KNOWN_INERTIA as KNOWN_INERTIA,
+    paper_designs as paper_designs,
+    peers as peers,
+)
 from ._cost import Evaluation as Evaluation
 from ._design_result import (
     DesignResult as DesignResult,
@@ -24,14 +30,13 @@ from ._objective import (
     Worst as Worst,
 )
 from ._pareto import Pareto as Pareto, pareto as pareto
-from ._peers import (
-    KNOWN_INERTIA as KNOWN_INERTIA,
-    paper_designs as paper_designs,
-    peers as peers,
-)
 from ._quantities import QUANTITIES as QUANTITIES, Quantity as Quantity
 from ._tail import Tail as Tail
 from ._tune import tune as tune
-from ._tuned import LimitResult as LimitResult, Optimum as Optimum, Tuned as Tuned
+from ._tuned import (
+    LimitResult as LimitResult,
+    Optimum as Optimum,
+    Tuned as Tuned,
+    worst_flights as worst_flights,
+)
 from ._verdict import Bound as Bound, Verdict as Verdict
-from ._worst_flights import worst_flights as worst_flights

@@ -1,6 +1,7 @@
 """What a design was shown to do on fresh members, and how that is printed."""
 
-from collections.abc import Mapping
+import functools as ft
+from collections.abc import Iterable
 from typing import NotRequired, TypedDict
 
 import equinox as eqx
@@ -45,18 +46,18 @@ _NAMED = (
 
 def member_text(certificate: "Certificate", index: int) -> str:
     """The parameters of one member; values of different axes have slashes between them."""
-    known = certificate.member(index)
-    J = known["inertia"]
+    facts = certificate.member(index)
+    J = facts["inertia"]
     parts = [f"J {_joined(J)} kg m^2"]
     if certificate.nominal is not None:
         parts[0] += f" = {_joined(J / certificate.nominal)} J0"
-    if "lag" in known:
-        parts.append(f"lag {_joined(1e3 * known['lag'])} ms")
-    parts.append(f"KT {_joined(known['torque_gain'])}")
+    if "lag" in facts:
+        parts.append(f"lag {_joined(1e3 * facts['lag'])} ms")
+    parts.append(f"KT {_joined(facts['torque_gain'])}")
     if np.any(certificate.facts["delay"] > 0):
-        parts.append(f"delay {_joined(1e3 * known['delay'])} ms")
-    if not np.allclose(known["assumed_inertia"], 1):
-        parts.append(f"scheduled at {_joined(known['assumed_inertia'])} J")
+        parts.append(f"delay {_joined(1e3 * facts['delay'])} ms")
+    if not np.allclose(facts["assumed_inertia"], 1):
+        parts.append(f"scheduled at {_joined(facts['assumed_inertia'])} J")
     return f"member {index}: {', '.join(parts)}"
 
 
@@ -97,12 +98,11 @@ _LINES = (
     ("saturated, %", "mean", "saturation_share", "mean"),
     ("disturbance err., N m", "mean", "disturbance_rmse", "mean"),
 )  # fmt: skip
-_FIRST = 34
 
 
 def describe(certificate: "Certificate") -> str:
     """The verdicts, the limits, the designs side by side, the worst members, and the remarks."""
-    lines = [verdict(certificate), *(f"  {each}" for each in certificate.verdicts)]
+    lines = [headline(certificate), *(f"  {verdict}" for verdict in certificate.verdicts)]
     lines += [f"  ! {remark}" for remark in certificate.remarks]
     lines += [f"  {distance}" for distance in certificate.distances]
     lines += _table(certificate.summaries)
@@ -114,10 +114,15 @@ def describe(certificate: "Certificate") -> str:
         )
     lines += [f"  worst members of {certificate.name}:"]
     lines += [f"    {line}" for line in worst_lines(certificate)]
-    return "\n".join([*lines, f"  {_provenance(certificate.provenance)}"])
+    source = certificate.provenance
+    versions = ", ".join(f"{name} {version}" for name, version in source["versions"].items())
+    loops = f" and {source['linear_members']} linear loops" if source["linear_members"] else ""
+    count = f"{source['members']} members{loops}"
+    lines.append(f"  {count}, {source['sampling']}, key {source['key']}; {versions}")
+    return "\n".join(lines)
 
 
-def verdict(certificate: "Certificate") -> str:
+def headline(certificate: "Certificate") -> str:
     """One line: whether the design may be flown, or which of the three verdicts fails."""
     fresh = "fresh " * certificate.provenance["fresh"]
     text, further = f"{certificate.members} {fresh}members", certificate.further
@@ -127,47 +132,31 @@ def verdict(certificate: "Certificate") -> str:
 
 
 def _table(rows: dict[str, DesignSummary]) -> list[str]:
+    """A column for each design: shares of members first, then the statistics of `_LINES`."""
     widths = {name: max(len(name), 7) + 3 for name in rows}
-    head = " " * (_FIRST + 2) + "".join(f"{name:>{widths[name]}}" for name in rows)
-    lines = [head, *_counts(rows, widths)]
-    for title, which, quantity, statistic in _LINES:
-        cells = "".join(
-            f"{_cell(row, quantity, statistic):>{widths[name]}}" for name, row in rows.items()
-        )
-        lines.append(f"  {title:<22}{which:<12}{cells}")
-    return lines
 
+    def line(title: str, which: str, cells: Iterable[str]) -> str:
+        columns = "".join(f"{x:>{w}}" for x, w in zip(cells, widths.values(), strict=True))
+        return f"  {title:<22}{which:<12}{columns}"
 
-def _counts(rows: dict[str, DesignSummary], widths: dict[str, int]) -> list[str]:
+    def statistic(row: DesignSummary, quantity: str, which: str) -> str:
+        linear = QUANTITIES[quantity].linear and quantity != "abscissa"
+        if (linear and row.unstable) or quantity not in row.statistics:
+            return "n/a"
+        value = row.statistics[quantity]._asdict()[which]
+        return QUANTITIES[quantity].text(value, unit=False)
+
     share = lambda x: "n/a" if x is None else f"{100 * x:.3g}"
-    values = {
-        ("unstable, %", "found"): [
-            None if row.unstable is None else row.unstable / row.members for row in rows.values()
-        ],
-        ("", "at most"): [row.unstable_at_most for row in rows.values()],
-        ("diverged, %", ""): [row.diverged / row.members for row in rows.values()],
-        ("lost, %", ""): [row.lost / row.members for row in rows.values()],
-    }
+    unstable = [None if x.unstable is None else x.unstable / x.members for x in rows.values()]
+    at_most = [x.unstable_at_most for x in rows.values()]
     return [
-        f"  {title:<22}{which:<12}"
-        + "".join(f"{share(x):>{w}}" for x, w in zip(numbers, widths.values(), strict=True))
-        for (title, which), numbers in values.items()
+        line("", "", rows),
+        line("unstable, %", "found", map(share, unstable)),
+        line("", "at most", map(share, at_most)),
+        line("diverged, %", "", [share(x.diverged / x.members) for x in rows.values()]),
+        line("lost, %", "", [share(x.lost / x.members) for x in rows.values()]),
+        *(line(a, b, [statistic(x, q, s) for x in rows.values()]) for a, b, q, s in _LINES),
     ]
-
-
-def _cell(row: DesignSummary, quantity: str, statistic: str) -> str:
-    linear = QUANTITIES[quantity].linear and quantity != "abscissa"
-    unknown = linear and row.unstable
-    if unknown or quantity not in row.statistics:
-        return "n/a"
-    return QUANTITIES[quantity].text(row.statistics[quantity]._asdict()[statistic], unit=False)
-
-
-def _provenance(known: Provenance) -> str:
-    versions = ", ".join(f"{name} {version}" for name, version in known["versions"].items())
-    further = f" and {known['linear_members']} linear loops" if known["linear_members"] else ""
-    count = f"{known['members']} members{further}"
-    return f"{count}, {known['sampling']}, key {known['key']}; {versions}"
 
 
 # No b0 stabilises a LADRC beyond this lag times wc, by wo / wc: docs/control.md.
@@ -287,7 +276,7 @@ class Certificate(eqx.Module):
     @property
     def holds(self) -> bool:
         """Whether none of the three verdicts fails: only then the design may be flown."""
-        return all(each.holds is not False for each in self.verdicts)
+        return all(verdict.holds is not False for verdict in self.verdicts)
 
     @property
     def independent(self) -> bool:
@@ -297,16 +286,14 @@ class Certificate(eqx.Module):
     @property
     def summaries(self) -> dict[str, DesignSummary]:
         """Statistics of each design over the members."""
-        known = self.independent
-        return {name: summarise_design(x, independent=known) for name, x in self.designs.items()}
+        summarise = ft.partial(summarise_design, independent=self.independent)
+        return {name: summarise(design) for name, design in self.designs.items()}
 
     @property
     def _baselines(self) -> dict[str, DesignSummary]:
-        given = {"doing nothing": self.idle, "start": self.start}
-        known = self.independent
-        return {
-            n: summarise_design(x, independent=known) for n, x in given.items() if x is not None
-        }
+        summarise = ft.partial(summarise_design, independent=self.independent)
+        start = {} if self.start is None else {"start": summarise(self.start)}
+        return {"doing nothing": summarise(self.idle)} | start
 
     def member(self, index: int) -> dict[str, Float[np.ndarray, " axes"]]:
         """The parameters of one member, per axis, in SI units; further ones follow those flown."""
@@ -318,32 +305,19 @@ class Certificate(eqx.Module):
     def content(self) -> dict[str, object]:
         """Everything, arrays per member included, for `jaxquad.report.write_json`."""
         return {
-            "certificate": verdict(self),
+            "certificate": headline(self),
             "holds": self.holds,
-            "verdicts": [each._asdict() for each in self.verdicts],
+            "verdicts": [verdict._asdict() for verdict in self.verdicts],
             "provenance": self.provenance,
-            "limits": [distance._asdict() | {"met": distance.met} for distance in self.distances],
+            "limits": [distance.content() for distance in self.distances],
             "designs": {name: row.content() for name, row in self.summaries.items()},
             "baselines": {name: row.content() for name, row in self._baselines.items()},
             "error": self.error,
             "remarks": self.remarks,
             "members": self.facts | {"nominal_inertia": self.nominal},
-            "per_member": {name: _arrays(design) for name, design in self.designs.items()},
-            "further": None if self.further is None else _further(self.further),
+            "per_member": {name: design.content() for name, design in self.designs.items()},
+            "further": None if self.further is None else self.further.content(),
         }
 
     def __str__(self) -> str:
         return describe(self)
-
-
-def _further(further: LinearMembers) -> dict[str, object]:
-    """How many further members there are, and how the linear loops of the design do on them."""
-    design = further.design
-    worst = {name: design.worst_member(name) for name in design.by_axis}
-    values = {n: None if k is None else design.of(n)[k] for n, k in worst.items()}
-    return {"members": design.members, "unstable": design.unstable_count, "worst": values}
-
-
-def _arrays(design: DesignResult) -> Mapping[str, object]:
-    flags = {"unstable": design.unstable, "diverged": design.diverged, "lost": design.lost}
-    return flags | {name: design.of(name) for name in design.by_axis}

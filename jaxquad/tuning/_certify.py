@@ -1,3 +1,5 @@
+"""Designs that a tuned one is compared with."""
+
 import dataclasses
 from collections.abc import Mapping, Sequence
 from importlib.metadata import version
@@ -8,16 +10,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key, PyTree
 
-from jaxquad.control import Reference
+from jaxquad.control import certainty_equivalence, LADRC, Reference, ScheduledLADRC
 from jaxquad.ensembles import Ensemble, Members
 from jaxquad.loops import Loop
+from jaxquad.models import DecoupledAxes, Multirotor, QUANSER_HOVER
 from jaxquad.simulation import Authority, beyond_authority, find_authority, Scenario
 
 from ._certificate import Certificate, find_ladrc, lag_remark, Provenance
 from ._design_result import measure_distances
 from ._evaluate_design import analyse_further, evaluate_design, member_facts
 from ._objective import Limit
-from ._problem import decouple, DeviceChoice, require_same_rate, TimeSpan
+from ._problem import decouple, DeviceChoice, Plant, require_same_rate, TimeSpan
 from ._quantities import QUANTITIES
 
 
@@ -104,8 +107,9 @@ def certify(
     if name in peers:
         raise ValueError(f"a peer has the name {name!r} of the design itself: rename it")
     # Independent draws, as the bound of a share needs.
-    given = isinstance(ensemble, Members)
-    drawn = ensemble if given else ensemble.fresh(loop, members, key)
+    given_members = isinstance(ensemble, Members)
+    nominal = decouple(loop.plant)
+    drawn = ensemble if given_members else ensemble.fresh(loop, members, key)
     require_same_rate(loop, drawn)
     flight = drawn.flight(scenario)
     evaluate = lambda design: evaluate_design(design, drawn, flight, span, devices)
@@ -117,37 +121,39 @@ def certify(
         further = analyse_further(
             loop, ensemble, scenario, key, flown=drawn.size, count=linear_members
         )
-    known = _provenance(ensemble, drawn, key)
-    known["linear_members"] = 0 if further is None else further.design.members
-    known["controller"] = describe_controller(loop.controller)
-    found = Certificate(
+    source: Provenance = {
+        "members": drawn.size,
+        "linear_members": 0 if further is None else further.design.members,
+        "fresh": not given_members,
+        "sampling": "given" if given_members else "random",
+        "key": None if given_members else np.asarray(jax.random.key_data(key)).tolist(),
+        "precision": str(drawn.assumed_inertia.dtype),
+        "ensemble": None if given_members else str(ensemble).splitlines(),
+        "device": jax.devices()[0].device_kind,
+        "versions": {name: version(name) for name in ("jaxquad", "jax", "jaxlib", "numpy")},
+        "controller": describe_controller(loop.controller),
+    }
+    certificate = Certificate(
         designs={name: design} | others,
-        distances=measure_distances(design, limits, independent=not given, further=further),
+        distances=measure_distances(design, limits, independent=not given_members, further=further),
         facts=member_facts(drawn),
-        nominal=_nominal_inertia(loop) if isinstance(ensemble, Ensemble) else None,
-        provenance=known,
+        nominal=None
+        if given_members
+        else np.array(np.broadcast_to(nominal.inertia, nominal.shape)),
+        provenance=source,
         remarks=(),
         idle=idle,
         start=error_at_start,
-        error="itae" if _moves(flight) else "rms",
+        error="itae" if np.any(np.asarray(flight.reference) != 0) else "rms",
         further=further,
     )
-    limits_of = _authority(loop, drawn)
-    remarks = _remarks(found, loop.controller, drawn) + beyond_authority(limits_of, flight)
+    members_loop = drawn.loop(loop.controller)
+    authority = _find_authority(members_loop.plant, members_loop.drive, members_loop.controller)
+    remarks = _remarks(certificate, loop.controller, drawn) + beyond_authority(authority, flight)
     if isinstance(ensemble, Ensemble) and ensemble.plants is not None:
         remarks += _beyond_band(loop.controller, ensemble.plants.band)
-        remarks += _beyond_record(limits_of, ensemble.plants.largest_command)
-    return dataclasses.replace(found, remarks=tuple(remarks))
-
-
-def _moves(flight: Scenario) -> bool:
-    """Whether the reference leaves 0: then the time of the error counts, else its size alone."""
-    return bool(np.any(np.asarray(flight.reference) != 0))
-
-
-def _authority(loop: Loop, drawn: Members) -> Authority | None:
-    members = drawn.loop(loop.controller)
-    return _find_authority(members.plant, members.drive, members.controller)
+        remarks += _beyond_record(authority, ensemble.plants.largest_command)
+    return dataclasses.replace(certificate, remarks=tuple(remarks))
 
 
 _find_authority = eqx.filter_jit(find_authority)  # many small operations, as one program
@@ -156,9 +162,9 @@ _find_authority = eqx.filter_jit(find_authority)  # many small operations, as on
 _ROUNDED = 1.01  # by which a number may exceed what the record knows without a word
 
 
-def _beyond_record(found: Authority | None, largest: float | None) -> list[str]:
+def _beyond_record(authority: Authority | None, largest: float | None) -> list[str]:
     """Whether the command may exceed all that the record has, where both are known."""
-    limit = np.inf if found is None else float(np.max(np.asarray(found.command)))
+    limit = np.inf if authority is None else float(np.max(np.asarray(authority.command)))
     if largest is None or not np.isfinite(limit) or limit <= _ROUNDED * largest:
         return []
     return [
@@ -184,27 +190,6 @@ def _beyond_band(controller: PyTree, band: tuple[float, float] | None) -> list[s
     ]
 
 
-def _nominal_inertia(loop: Loop) -> Float[np.ndarray, " axes"]:
-    axes = decouple(loop.plant)
-    return np.array(jnp.broadcast_to(axes.inertia, axes.shape))
-
-
-def _provenance(given: Ensemble | Members, drawn: Members, key: Key[Array, ""]) -> Provenance:
-    fresh = isinstance(given, Ensemble)
-    names = ("jaxquad", "jax", "jaxlib", "numpy")
-    return {
-        "members": drawn.size,
-        "linear_members": 0,
-        "fresh": fresh,
-        "sampling": "random" if fresh else "given",
-        "key": np.asarray(jax.random.key_data(key)).tolist() if fresh else None,
-        "precision": str(drawn.assumed_inertia.dtype),
-        "ensemble": str(given).splitlines() if fresh else None,
-        "device": jax.devices()[0].device_kind,
-        "versions": {name: version(name) for name in names},
-    }
-
-
 def describe_controller(controller: PyTree) -> dict[str, object]:
     """The controller's class and numbers, by their places in it."""
     leaves = jax.tree_util.tree_leaves_with_path(eqx.filter(controller, eqx.is_array))
@@ -212,15 +197,100 @@ def describe_controller(controller: PyTree) -> dict[str, object]:
     return {"class": type(controller).__name__, "numbers": numbers}
 
 
-def _remarks(found: Certificate, controller: PyTree, drawn: Members) -> list[str]:
-    missed = [x for x in found.distances if QUANTITIES[x.quantity].linear and not x.met]
+def _remarks(certificate: Certificate, controller: PyTree, drawn: Members) -> list[str]:
+    missed = [x for x in certificate.distances if QUANTITIES[x.quantity].linear and not x.met]
     lag = lag_remark(controller, drawn.delay, decouple(drawn.plant).lag)
-    remarks = [lag] if lag and (missed or not found.stable) else []
-    if not found.independent:
+    remarks = [lag] if lag and (missed or not certificate.stable) else []
+    if not certificate.independent:
         remarks.append("the members were given: whether the tuner saw them is not known")
-    counts = {n: x.unstable_count for n, x in found.designs.items() if x.unstable_count}
+    counts = {n: x.unstable_count for n, x in certificate.designs.items() if x.unstable_count}
     if counts:
         text = ", ".join(f"{count} of {n}" for n, count in counts.items())
         remarks.append(f"no Ms and no margins (n/a) over members that are unstable: {text}")
-    others = [(n, x.observer_instability) for n, x in found.designs.items() if n != found.name]
-    return remarks + [f"of {n}: {why}" for n, why in others if why]
+    others = {n: x for n, x in certificate.designs.items() if n != certificate.name}
+    whys = {n: x.observer_instability for n, x in others.items()}
+    return remarks + [f"of {n}: {why}" for n, why in whys.items() if why]
+
+
+WC, WO = 10.0, 30.0  # rad/s, the paper's
+KNOWN_INERTIA = "b0 = KT/J"  # the name of the design that knows the inertia
+PAPER_B0 = (3.0, 1.6)  # before and after the paper's adaptation, rad/s^2 per V
+# +u and -u on two motors: the one convention in which the paper's gains are stable
+HOVER_GAIN = 2 * QUANSER_HOVER.arm * QUANSER_HOVER.thrust_coefficient / QUANSER_HOVER.inertia[0]
+
+
+def paper_designs(plant: Plant, *, dt: float = 0.002) -> dict[str, LADRC]:
+    """The paper's two LADRCs for a plant: 10 and 30 rad/s with b0 = 3, and with b0 = 1.6.
+
+    On the roll axis of the Quanser Hover (b = 0.848 rad/s^2 per V) b0 is exactly that. On another
+    plant or axis it has the same ratio to b: 3.54 and 1.89. Source: section 5 of the paper,
+    docs/equations.md.
+
+    **Arguments:**
+
+    - `plant`: the nominal `jq.DecoupledAxes` or `jq.models.Multirotor`, without an ensemble.
+    - `dt`: the sample interval in s.
+
+    **Returns:**
+
+    The designs by name, for `peers=` of a tune or certificate.
+
+    **Raises:**
+
+    - `ValueError`: the plant is an ensemble, or of another kind.
+    """
+    KT, J = _nominal_numbers(plant)
+    b = KT / J
+    designs = {}
+    for b0 in PAPER_B0:
+        scaled = b0 * b / HOVER_GAIN
+        on_hover = np.allclose(scaled, b0, rtol=2e-3)
+        name = f"paper b0 = {b0:g}" if on_hover else f"paper b0 = {b0 / HOVER_GAIN:.3g} b"
+        designs[name] = LADRC(WC, WO, b0 * np.ones_like(b) if on_hover else scaled, dt=dt)
+    return designs
+
+
+def peers(plant: Plant, *, pid: PyTree | None = None, dt: float = 0.002) -> dict[str, PyTree]:
+    """Designs to stand beside a tuned one in its certificate, by name.
+
+    The paper's two, and "b0 = KT/J": the LADRC with the paper's bandwidths, 10 and 30 rad/s, whose
+    b0 is exact for the inertia that the controller is given (certainty equivalence).
+
+    **Arguments:**
+
+    - `plant`, `dt`: as for `jq.tuning.paper_designs`.
+    - `pid`: a PID tuned on the same ensemble, to add as "tuned PID".
+
+    **Returns:**
+
+    The designs by name.
+
+    **Raises:**
+
+    - `ValueError`: as `jq.tuning.paper_designs` does.
+    """
+    KT, J = _nominal_numbers(plant)
+    # As a map of ln J, b0 = KT / J is straight: two knots, far apart, hold it everywhere.
+    map = certainty_equivalence(KT, J, span=(1e-3, 1e3), knots=2)
+    designs: dict[str, PyTree] = dict(paper_designs(plant, dt=dt))
+    designs[KNOWN_INERTIA] = ScheduledLADRC(LADRC(WC, WO, KT / J, dt=dt), map)
+    return designs if pid is None else designs | {"tuned PID": pid}
+
+
+def _nominal_numbers(
+    plant: Plant,
+) -> tuple[Float[np.ndarray, " axes"], Float[np.ndarray, " axes"]]:
+    """KT in N m per unit of command and J in kg m^2, in NumPy: nothing is compiled."""
+    if not isinstance(plant, DecoupledAxes | Multirotor):
+        raise ValueError(
+            f"the plant is a {type(plant).__name__}: give the nominal jq.DecoupledAxes or "
+            "jq.models.Multirotor, such as loop.plant"
+        )
+    axes = decouple(plant)
+    if len(axes.shape) > 1:
+        raise ValueError(
+            f"the plant is an ensemble of {axes.shape[1:]}: give the nominal one, for whose "
+            "gain the designs are made"
+        )
+    KT, J = np.broadcast_arrays(np.asarray(axes.torque_gain, float), np.asarray(axes.inertia))
+    return KT, J

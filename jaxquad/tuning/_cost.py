@@ -85,8 +85,8 @@ def evaluate_cost(
     arrays, rest = eqx.partition(subproblem, eqx.is_array)
     if len(z) == 1:
         alone = eqx.combine(jax.tree.map(lambda x: x[0], arrays), rest)
-        found = _evaluate_one(z[0], coordinates, problem, alone)
-        return jax.tree.map(lambda x: x[None], found)
+        result = _evaluate_one(z[0], coordinates, problem, alone)
+        return jax.tree.map(lambda x: x[None], result)
     common, fixed = eqx.partition((coordinates, problem), eqx.is_array)
 
     @jax.jit  # traced once, for its shapes and for its use
@@ -94,8 +94,8 @@ def evaluate_cost(
         of, members = eqx.combine(common, fixed)
         return _evaluate_one(z, of, members, eqx.combine(mine, rest))
 
-    def one(given: tuple[Array, Array, PyTree]) -> CostResult:
-        z, on, mine = given
+    def one(arguments: tuple[Array, Array, PyTree]) -> CostResult:
+        z, on, mine = arguments
         shapes = jax.eval_shape(run, z, mine, common)
         skip = lambda *_: jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
         return jax.lax.cond(on, run, skip, z, mine, common)
@@ -131,26 +131,25 @@ def _cost(
         fly = lambda c: problem.in_time(c, in_flight)
         numbers |= jax.lax.cond(subproblem.fly, fly, lambda c: unknown, controller)
     costs = objective.costs({name: x[:, : problem.counted] for name, x in numbers.items()})
-    seen = {name: QUANTITIES[name].combine_axes(x, worst=True) for name, x in numbers.items()}
-    limited = _limited(controller, problem, limits, seen)
+    worst = {name: QUANTITIES[name].combine_axes(x, worst=True) for name, x in numbers.items()}
+    # Limits of the linear loop, which is cheap, are kept on many more members.
+    bounded, names = dict(worst), {x.quantity for x in limits if QUANTITIES[x.quantity].linear}
+    if problem.limited is not None and names:
+        wide = problem.limited.numbers(controller, names, SMOOTHING)
+        bounded |= {n: QUANTITIES[n].combine_axes(wide[n], worst=True) for n in names}
+    limited = tuple(bounded[x.quantity][: count_members(problem, x)] for x in limits)
     beyond = tuple(limit.beyond(x) for limit, x in zip(limits, limited, strict=True))
     cost = objective.risk(costs)
     settling = jnp.mean(soft(slowest - subproblem.rate))
-    constrained = cost + _lagrangian(beyond, subproblem.multipliers)
-    total = jnp.where(subproblem.fly, constrained, settling)
-    return total, (cost, costs, seen, limited, beyond)
-
-
-def _limited(
-    controller: PyTree, problem: Problem, limits: Sequence[Limit], seen: dict[str, Array]
-) -> tuple[Array, ...]:
-    """The quantity of each limit: of the linear loop, which is cheap, on many more members."""
-    names = {limit.quantity for limit in limits if QUANTITIES[limit.quantity].linear}
-    found = dict(seen)
-    if problem.limited is not None and names:
-        wide = problem.limited.numbers(controller, names, SMOOTHING)
-        found |= {n: QUANTITIES[n].combine_axes(wide[n], worst=True) for n in names}
-    return tuple(found[limit.quantity][: count_members(problem, limit)] for limit in limits)
+    # The augmented Lagrangian of Powell, Hestenes and Rockafellar.
+    penalty = jnp.zeros(())
+    for k, levels in enumerate(beyond):
+        multiplier = subproblem.multipliers.values[k]
+        stiffness = subproblem.multipliers.stiffness[k]
+        forced = jnp.maximum(multiplier + stiffness * levels, 0)
+        penalty = penalty + jnp.sum(forced**2 - multiplier**2) / (2 * stiffness)
+    total = jnp.where(subproblem.fly, cost + penalty, settling)
+    return total, (cost, costs, worst, limited, beyond)
 
 
 def count_members(problem: Problem, limit: Limit) -> int:
@@ -158,16 +157,6 @@ def count_members(problem: Problem, limit: Limit) -> int:
     if QUANTITIES[limit.quantity].linear and problem.limited is not None:
         return problem.limited.members
     return problem.members if isinstance(limit.over, Worst) else problem.counted
-
-
-def _lagrangian(beyond: Sequence[Array], multipliers: Multipliers) -> Float[Array, ""]:
-    """What limits add, by the augmented Lagrangian of Powell, Hestenes and Rockafellar."""
-    total = jnp.zeros(())
-    for k, levels in enumerate(beyond):
-        multiplier, stiffness = multipliers.values[k], multipliers.stiffness[k]
-        forced = jnp.maximum(multiplier + stiffness * levels, 0)
-        total = total + jnp.sum(forced**2 - multiplier**2) / (2 * stiffness)
-    return total
 
 
 class Evaluation(NamedTuple):
@@ -212,14 +201,80 @@ class Progress:
 
 def describe_evaluation(count: int, now: Evaluation) -> str:
     """One line of text of an evaluation; of several problems, the best one's numbers."""
-    known = np.isfinite(now.cost)
-    best = int(np.argmin(np.where(known, now.cost, np.inf)))
+    running = np.isfinite(now.cost)
+    best = int(np.argmin(np.where(running, now.cost, np.inf)))
     parts = [f"{now.phase} {count:3d}", f"cost {now.cost[best]:9.5f}"]
-    if known.size > 1:
-        parts.append(f"(best of {known.sum()} running)")
+    if running.size > 1:
+        parts.append(f"(best of {running.sum()} running)")
     if "itae" in now.means and now.phase == "optimise":
         parts.append(f"ITAE {np.degrees(now.means['itae'][best]):.4g} deg s^2")
     parts.append(f"stable {100 * now.stable[best]:.3g} %")
     parts.append(f"worst member {now.worst[best]:.0f}")
     parts.append(f"|gradient| {now.gradient_norm[best]:.2g}")
     return "  ".join([*parts, f"{now.seconds:.1f} s"])
+
+
+MET = 2e-3  # beyond a limit, as a level: 0.2 %
+_STIFFNESS, _STIFFER = 4.0, 4.0
+_STALLED = 0.9  # of what a limit was missed by before: it falls no further
+_AS_GOOD = 1.05  # of the least miss: of rounds that miss limits so nearly alike, the cost decides
+
+
+def initial_multipliers(problem: Problem, limits: Sequence[Limit], problems: int) -> Multipliers:
+    """Before anything is known of the limits."""
+    sizes = [count_members(problem, limit) for limit in limits]
+    values = tuple(as_array(np.zeros((problems, size))) for size in sizes)
+    return Multipliers(values, as_array(np.full((problems, len(sizes)), _STIFFNESS)))
+
+
+def update_multipliers(
+    result: CostResult,
+    multipliers: Multipliers,
+    before: Float[np.ndarray, "problems limits"],
+    on: Bool[np.ndarray, " problems"],
+) -> tuple[Multipliers, Float[np.ndarray, "problems limits"]]:
+    """The next multipliers of problems that are `on`, and how far each limit is missed.
+
+    A limit becomes stiffer where it is missed by more than a quarter of what it was `before`.
+    """
+    keep, values, most = np.asarray(on)[:, None], [], []
+    stiffness = np.asarray(multipliers.stiffness)
+    for k, beyond in enumerate(map(np.asarray, result.beyond)):
+        old = np.asarray(multipliers.values[k])
+        raised = np.maximum(old + stiffness[:, k : k + 1] * beyond, 0)
+        values.append(as_array(np.where(keep, raised, old)))
+        most.append(beyond.max(axis=1))
+    missed = np.stack(most, axis=1)
+    slow = missed > np.maximum(0.25 * before, MET)
+    stiffer = np.where(slow & keep, _STIFFER, 1.0) * stiffness
+    return Multipliers(tuple(values), as_array(stiffer)), missed
+
+
+class Rounds:
+    """Where each round of multipliers ended, and whether another one is worth it."""
+
+    def __init__(self) -> None:
+        self.points: list[Float[np.ndarray, "problems n"]] = []
+        self.costs: list[Float[np.ndarray, " problems"]] = []
+        self.missed: list[Float[np.ndarray, " problems"]] = []
+
+    def add(self, z: np.ndarray, cost: np.ndarray, beyond: np.ndarray) -> None:
+        self.points.append(np.array(z))
+        self.costs.append(np.asarray(cost))
+        self.missed.append(np.maximum(beyond, 0).sum(axis=1))
+
+    @property
+    def stalled(self) -> Bool[np.ndarray, " problems"]:
+        """Which problems miss limits by more than 2 %, and came no nearer to them in two rounds."""
+        if len(self.missed) < 3:
+            return np.zeros(len(self.points[0]), bool)
+        least, last, now = np.min(self.missed[:-2], axis=0), *self.missed[-2:]
+        return (now > 10 * MET) & (np.minimum(last, now) > _STALLED * least)
+
+    def best(self) -> Float[np.ndarray, "problems n"]:
+        """The last round's end where it meets the limits, else the one that misses them least."""
+        missed, costs = np.stack(self.missed), np.stack(self.costs)
+        near = missed <= _AS_GOOD * missed.min(axis=0)
+        chosen = np.argmin(np.where(near, costs, np.inf), axis=0)
+        chosen = np.where(missed[-1] <= 2 * MET, len(missed) - 1, chosen)
+        return np.stack([self.points[r][k] for k, r in enumerate(chosen)])

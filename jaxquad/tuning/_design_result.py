@@ -54,20 +54,29 @@ class DesignResult(eqx.Module):
         - `ValueError`: the quantity was not computed.
         """
         if quantity not in self.by_axis:
-            known = ", ".join(self.by_axis)
-            raise ValueError(f"{quantity!r} was not computed: choose one of {known}")
+            computed = ", ".join(self.by_axis)
+            raise ValueError(f"{quantity!r} was not computed: choose one of {computed}")
         if QUANTITIES[quantity].summed and not worst_axis:
             return np.sum(self.by_axis[quantity], axis=0)
-        worst = _worst_axis(self.by_axis[quantity], QUANTITIES[quantity].sign)
-        if self.unstable is not None and _needs_stability(quantity):
+        sign, by_axis = QUANTITIES[quantity].sign, self.by_axis[quantity]
+        some = ~np.isnan(by_axis)
+        worst = sign * np.max(np.where(some, sign * by_axis, -np.inf), axis=0)
+        worst = np.where(some.any(axis=0), worst, np.nan)
+        needs_stability = QUANTITIES[quantity].linear and quantity != "abscissa"
+        if self.unstable is not None and needs_stability:
             return np.where(self.unstable, np.nan, worst)
         return worst
 
     def worst_member(self, quantity: str) -> int | None:
         """The index of the member with the worst finite number; None without any."""
         values = QUANTITIES[quantity].sign * self.of(quantity)
-        known = np.isfinite(values)
-        return int(np.argmax(np.where(known, values, -np.inf))) if known.any() else None
+        finite = np.isfinite(values)
+        return int(np.argmax(np.where(finite, values, -np.inf))) if finite.any() else None
+
+    def content(self) -> Mapping[str, object]:
+        """Every member's numbers, for `jaxquad.report.write_json`."""
+        flags = {"unstable": self.unstable, "diverged": self.diverged, "lost": self.lost}
+        return flags | {name: self.of(name) for name in self.by_axis}
 
 
 class LinearMembers(NamedTuple):
@@ -75,6 +84,13 @@ class LinearMembers(NamedTuple):
 
     design: DesignResult  # numbers of the linear loop; none of these members has flown
     facts: dict[str, Float[np.ndarray, "axes members"]]  # as in `Certificate`
+
+    def content(self) -> dict[str, object]:
+        """How many there are, and how the linear loops of the design do on them."""
+        design = self.design
+        worst = {name: design.worst_member(name) for name in design.by_axis}
+        values = {n: None if k is None else design.of(n)[k] for n, k in worst.items()}
+        return {"members": design.members, "unstable": design.unstable_count, "worst": values}
 
 
 def with_further(design: DesignResult, further: LinearMembers | None) -> DesignResult:
@@ -92,16 +108,6 @@ def with_further(design: DesignResult, further: LinearMembers | None) -> DesignR
         join(mine.lost, other.lost),
         mine.observer_instability,
     )
-
-
-def _needs_stability(quantity: str) -> bool:
-    return QUANTITIES[quantity].linear and quantity != "abscissa"
-
-
-def _worst_axis(values: Float[np.ndarray, "axes members"], sign: float) -> Numbers:
-    known = ~np.isnan(values)
-    worst = sign * np.max(np.where(known, sign * values, -np.inf), axis=0)
-    return np.where(known.any(axis=0), worst, np.nan)
 
 
 def upper_bound(count: int, draws: int, *, level: float = 0.95) -> float:
@@ -202,23 +208,17 @@ def summarise_design(design: DesignResult, *, independent: bool) -> DesignSummar
 
 def _statistics(design: DesignResult, name: str) -> Statistics:
     values, sign = design.of(name), QUANTITIES[name].sign
-    known = values[~np.isnan(values)]
-    partial = known.size < values.size and not QUANTITIES[name].linear
-    if not known.size or partial:
-        return Statistics(np.nan, np.nan, np.nan, known.size, design.worst_member(name))
-    worst = sign * np.max(sign * known)
-    return Statistics(
-        float(np.mean(known)), sign * _p95(sign * known), float(worst), known.size,
-        design.worst_member(name),
-    )  # fmt: skip
-
-
-def _p95(values: Numbers) -> float:
-    """Infinite as soon as it rests on an infinite value."""
-    ordered = np.sort(values)
-    if not np.isfinite(ordered).all():
-        return float(ordered[int(np.ceil(0.95 * (ordered.size - 1)))])
-    return float(np.quantile(ordered, 0.95))
+    numbers, member = values[~np.isnan(values)], design.worst_member(name)
+    partial = numbers.size < values.size and not QUANTITIES[name].linear
+    if not numbers.size or partial:
+        return Statistics(np.nan, np.nan, np.nan, numbers.size, member)
+    ordered = np.sort(sign * numbers)
+    if np.isfinite(ordered).all():
+        p95 = float(np.quantile(ordered, 0.95))
+    else:  # infinite as soon as it rests on an infinite value
+        p95 = float(ordered[int(np.ceil(0.95 * (ordered.size - 1)))])
+    worst = float(sign * ordered[-1])
+    return Statistics(float(np.mean(numbers)), sign * p95, worst, numbers.size, member)
 
 
 class Distance(NamedTuple):
@@ -228,7 +228,7 @@ class Distance(NamedTuple):
     over: str  # the number over the members that is bounded, such as "worst"
     sense: str  # "at most" or "at least"
     bound: float
-    found: float  # NaN if it is not known, infinite with unstable members
+    reached: float  # NaN if it is not known, infinite with unstable members
     slack: float  # met by this much; below 0, missed
     percent: float  # slack over the bound
     beyond: int  # members that are beyond the bound themselves
@@ -237,6 +237,12 @@ class Distance(NamedTuple):
     members: int
     member: int | None  # the worst one
     beyond_at_most: float | None = None  # share of all members, with 95 % confidence
+
+    def content(self) -> Mapping[str, object]:
+        """Everything, for `jaxquad.report.write_json`."""
+        names = {"reached": "found"}  # as result files have it
+        plain = {names.get(name, name): value for name, value in self._asdict().items()}
+        return plain | {"met": self.met}
 
     @property
     def met(self) -> bool:
@@ -249,30 +255,32 @@ class Distance(NamedTuple):
     def __str__(self) -> str:
         shown = QUANTITIES[self.quantity]
         demand = f"{shown.title}, {self.over}, {self.sense} {shown.text(self.bound)}"
-        if np.isnan(self.found):
+        if np.isnan(self.reached):
             return f"{demand}: not known, because the scenario or the controller does not have it"
         beyond = self._beyond
         if self.without:
-            known = np.isfinite(self.of_others)
-            others = f"; of the others {shown.text(self.of_others)}" if known else ""
+            finite = np.isfinite(self.of_others)
+            others = f"; of the others {shown.text(self.of_others)}" if finite else ""
             return f"{demand}: missed, {self.without} members are unstable{others}{beyond}"
-        if not np.isfinite(self.found):
-            return f"{demand}: {shown.text(self.found)}, {'met' if self.met else 'missed'}{beyond}"
-        difference = abs(shown.number(self.found) - shown.number(self.bound))
+        if not np.isfinite(self.reached):
+            return (
+                f"{demand}: {shown.text(self.reached)}, {'met' if self.met else 'missed'}{beyond}"
+            )
+        difference = abs(shown.number(self.reached) - shown.number(self.bound))
         by = f"{'met' if self.met else 'missed'} by {difference:.3g} {shown.unit}".rstrip()
         share = f" ({abs(self.percent):.2g} %)" if np.isfinite(self.percent) else ""
-        return f"{demand}: {shown.text(self.found)}, {by}{share}{beyond}"
+        return f"{demand}: {shown.text(self.reached)}, {by}{share}{beyond}"
 
     @property
     def _beyond(self) -> str:
         """How many members are beyond the limit, and what that proves of all."""
         if not covers(self):
             return ""
-        found = f", {self.beyond} of {self.members} members beyond"
+        count = f", {self.beyond} of {self.members} members beyond"
         if self.beyond_at_most is None:
-            return found
+            return count
         most = 100 * self.beyond_at_most
-        return f"{found} (proven: at most {most:.2g} % of all, 95 % confidence)"
+        return f"{count} (proven: at most {most:.2g} % of all, 95 % confidence)"
 
 
 def covers(distance: Distance) -> bool:
@@ -306,8 +314,8 @@ def measure_distances(
 def _distance(design: DesignResult, limit: Limit, independent: bool) -> Distance:
     bound, sign = float(limit.bound), limit.sign
     values = sign * _with_unstable(design, limit.quantity)  # larger is worse
-    found = sign * _risk(limit.over, values)
-    slack = sign * (bound - found)
+    reached = sign * _risk(limit.over, values)
+    slack = sign * (bound - reached)
     over, beyond = risk_text(limit.over), int(np.sum(~(values <= sign * bound)))
     proven = independent and over == "worst"
     return Distance(
@@ -315,7 +323,7 @@ def _distance(design: DesignResult, limit: Limit, independent: bool) -> Distance
         over=over,
         sense="at least" if limit.at_most is None else "at most",
         bound=bound,
-        found=found,
+        reached=reached,
         slack=slack,
         percent=100 * slack / abs(bound) if bound else np.copysign(np.inf, slack),
         beyond=beyond,

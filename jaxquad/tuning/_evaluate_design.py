@@ -1,12 +1,17 @@
 """One design on many members: their flights, and their linear loops."""
 
 import dataclasses
+import functools as ft
 from collections.abc import Iterator, Sequence
+from typing import NamedTuple
 
+import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Key, PyTree
 
+from jaxquad._compile import brief_options, Jit
 from jaxquad._core import as_array, map_in_threads
 from jaxquad.control import (
     LADRC,
@@ -17,11 +22,24 @@ from jaxquad.control import (
 )
 from jaxquad.ensembles import Ensemble, Members
 from jaxquad.loops import Loop, loop_numbers, LoopNumbers
-from jaxquad.simulation import Scenario
+from jaxquad.simulation import (
+    check_run,
+    Devices,
+    find_authority,
+    find_steps,
+    FlightMetrics,
+    loop_over_devices,
+    over_cores,
+    placed,
+    SampleResult,
+    scan_loop,
+    Scenario,
+    Window,
+    window,
+)
 
 from ._design_result import DesignResult, LinearMembers
-from ._flown import fly
-from ._problem import decouple, DeviceChoice, Plant, TimeSpan
+from ._problem import decouple, DeviceChoice, TimeSpan
 from ._quantities import LINEAR
 
 
@@ -46,7 +64,10 @@ def evaluate_design(
     unstable = None if linear is None else ~np.all(linear.stable, axis=0)
     observed = isinstance(controller, ObserverController)
     why = controller.observer_instability() if observed else ""
-    lost = flown.diverged | _carried_off(flown.greatest, flight)
+    # Carried off: the error exceeds all that the reference moves by more than a quarter turn.
+    reference = np.asarray(flight.reference)
+    moved = max(float(np.max(reference)), 0.0) - min(float(np.min(reference)), 0.0)
+    lost = flown.diverged | ~(flown.greatest <= _TILTED + moved)
     return DesignResult(numbers, unstable, flown.diverged, lost, why)
 
 
@@ -78,16 +99,16 @@ def analyse_further(
         return _linear(loop.controller, drawn, still.flight(scenario)), member_facts(drawn)
 
     parts = map_in_threads(analyse, _draw_further(loop, ensemble, key, flown, count))
-    found = [linear for linear, _ in parts if linear is not None]
-    if not found:
+    loops = [linear for linear, _ in parts if linear is not None]
+    if not loops:
         return None
-    facts = [known for _, known in parts]
+    facts = [some for _, some in parts]
     join = lambda parts: np.concatenate(parts, axis=-1)
-    numbers = {name: join([x._asdict()[name] for x in found]) for name in LINEAR}
-    unstable = ~np.all(join([x.stable for x in found]), axis=0)
+    numbers = {name: join([x._asdict()[name] for x in loops]) for name in LINEAR}
+    unstable = ~np.all(join([x.stable for x in loops]), axis=0)
     none = np.zeros_like(unstable)
-    known = {name: join([x[name] for x in facts]) for name in facts[0]}
-    return LinearMembers(DesignResult(numbers, unstable, none, none), known)
+    joined = {name: join([x[name] for x in facts]) for name in facts[0]}
+    return LinearMembers(DesignResult(numbers, unstable, none, none), joined)
 
 
 _FURTHER = 0xF0C5  # folded into the key of members that do not fly
@@ -98,9 +119,9 @@ def _draw_further(
 ) -> Iterator[Members]:
     count = min(_MULTIPLE * flown, _MOST) if count is None else count
     keys = jax.random.split(jax.random.fold_in(key, _FURTHER), -(-count // flown))
-    for each in np.asarray(jax.random.key_data(keys)):  # keys by themselves: a program to part them
-        own = jax.random.wrap_key_data(as_array(each), impl=jax.random.key_impl(keys))
-        yield ensemble.fresh(loop, flown, own)
+    for data in np.asarray(jax.random.key_data(keys)):  # in NumPy: to index keys compiles
+        slice_key = jax.random.wrap_key_data(as_array(data), impl=jax.random.key_impl(keys))
+        yield ensemble.fresh(loop, flown, slice_key)
 
 
 def certified_members(
@@ -114,24 +135,15 @@ def certified_members(
 def member_facts(drawn: Members) -> dict[str, Float[np.ndarray, "axes members"]]:
     """Inertia, torque gain, lag and delay in SI units; assumed_inertia over the true one."""
     plant = decouple(drawn.plant)
-    given = {"inertia": plant.inertia, "torque_gain": plant.torque_gain, "lag": plant.lag}
+    parameters = {"inertia": plant.inertia, "torque_gain": plant.torque_gain, "lag": plant.lag}
     shape = (plant.shape[0], drawn.size)
     wide = lambda x: np.broadcast_to(np.asarray(x) if x.ndim > 1 else x[:, None], shape)
-    facts = {n: np.array(wide(x)) for n, x in given.items() if x is not None}
+    facts = {n: np.array(wide(x)) for n, x in parameters.items() if x is not None}
     facts["delay"] = np.array(np.broadcast_to(np.asarray(drawn.delay), shape))
     return facts | {"assumed_inertia": np.asarray(drawn.assumed_inertia) / facts["inertia"]}
 
 
 _TILTED = np.pi / 2  # rad: a vehicle that is turned further pushes downwards
-
-
-def _carried_off(
-    greatest: Float[np.ndarray, " members"], flight: Scenario
-) -> Bool[np.ndarray, " members"]:
-    """Members whose error exceeds all that the reference moves by more than a quarter turn."""
-    reference = np.asarray(flight.reference)
-    moved = max(float(np.max(reference)), 0.0) - min(float(np.min(reference)), 0.0)
-    return ~(greatest <= _TILTED + moved)
 
 
 _PER_MEMBER = ("b0", "kp", "ki", "kd", "feedforward")  # what scheduling may change
@@ -141,16 +153,16 @@ def _widen(controller: PyTree, axes: int, members: int) -> PyTree:
     """The gains of a LADRC or PID in one shape, so that all of a kind share a compile."""
     if not isinstance(controller, LADRC | PID):
         return controller
+
+    def full(gain: Array, name: str) -> Array:
+        shape = (axes, members) if name in _PER_MEMBER or gain.ndim > 1 else (axes,)
+        values = np.asarray(gain)
+        if values.ndim:
+            values = values.reshape(values.shape + (1,) * (len(shape) - values.ndim))
+        return as_array(np.broadcast_to(values, shape))
+
     gains = {name: x for name, x in vars(controller).items() if isinstance(x, Array)}
-    full = {name: _full(x, name, axes, members) for name, x in gains.items()}
-    return dataclasses.replace(controller, **full)
-
-
-def _full(gain: Array, name: str, axes: int, members: int) -> Array:
-    shape = (axes, members) if name in _PER_MEMBER or gain.ndim > 1 else (axes,)
-    given = np.asarray(gain)
-    aligned = given.reshape(given.shape + (1,) * (len(shape) - given.ndim)) if given.ndim else given
-    return as_array(np.broadcast_to(aligned, shape))
+    return dataclasses.replace(controller, **{name: full(x, name) for name, x in gains.items()})
 
 
 def _linear(controller: PyTree, members: Members, flight: Scenario) -> LoopNumbers | None:
@@ -159,26 +171,102 @@ def _linear(controller: PyTree, members: Members, flight: Scenario) -> LoopNumbe
         return None
     axes = flight.reference.shape[1]
     loop = members.loop(controller).with_controller(_widen(scheduled, axes, members.size))
-    plants = _with_payloads(members.plant, flight)
+    plants = [members.plant]
+    if flight.payload is not None:  # with the most and the least that the flight makes it carry
+        extremes = [np.max(flight.payload, axis=0), np.min(flight.payload, axis=0)]
+        plants += [members.plant.with_added_inertia(x) for x in extremes if np.any(x != 0)]
     return _worst([loop_numbers(loop.with_plant(x), range(axes)) for x in plants], members.size)
 
 
 def _worst(loops: Sequence[LoopNumbers], members: int) -> LoopNumbers:
     """Of the same members as different plants: stable where all are, else NaN as one of them."""
-    each = lambda x: np.broadcast_to(x.reshape(len(x), -1), (len(x), members))
-    loops = [LoopNumbers(*map(each, loop)) for loop in loops]
+    wide = lambda x: np.broadcast_to(x.reshape(len(x), -1), (len(x), members))
+    loops = [LoopNumbers(*map(wide, loop)) for loop in loops]
     stable = np.all([loop.stable for loop in loops], axis=0)
     worst = {"abscissa": np.max([loop.abscissa for loop in loops], axis=0)}
     for name in LoopNumbers._fields[2:]:
         find = np.min if name.endswith("margin") else np.max
-        found = find([loop._asdict()[name] for loop in loops], axis=0)
-        worst[name] = np.where(stable, found, np.nan)
+        extreme = find([loop._asdict()[name] for loop in loops], axis=0)
+        worst[name] = np.where(stable, extreme, np.nan)
     return LoopNumbers(stable, **worst)
 
 
-def _with_payloads(plant: Plant, flight: Scenario) -> list[Plant]:
-    """The plant, and with the most and the least that the flight makes it carry."""
-    if flight.payload is None:
-        return [plant]
-    extremes = [np.max(flight.payload, axis=0), np.min(flight.payload, axis=0)]
-    return [plant, *(plant.with_added_inertia(x) for x in extremes if np.any(x != 0))]
+_OF_ALL = ("activity", "energy", "saturation_share", "peak", "rms", "disturbance_rmse")
+_INTEGRALS = ("itae", "iae", "ise")
+_OF_PARTS = (*_INTEGRALS, "overshoot", "peak")
+
+
+class Flown(NamedTuple):
+    """What a flight was, by members."""
+
+    numbers: dict[str, Float[np.ndarray, "axes members"]]
+    diverged: Bool[np.ndarray, " members"]
+    greatest: Float[np.ndarray, " members"]  # rad, the error at any time and of any axis
+
+
+def fly(loop: Loop, flight: Scenario, span: TimeSpan, devices: DeviceChoice = None) -> Flown:
+    """Fly the loops of members; `flight` has their noise in it.
+
+    From event to event the clock of the integrals starts again, and the greatest overshoot counts.
+    """
+    check_run(loop, flight)
+    samples, dt = len(flight.reference), loop.dt
+    span_of_all = window(samples, dt, start=span.start, stop=span.stop, load_start=span.load_start)
+    parts = [window(samples, dt, start=a, stop=b, load_start=None) for a, b in span.parts]
+    windows = tuple(Window(*map(as_array, x)) for x in (span_of_all, *parts))
+    run, places = placed(loop, flight, devices)
+    *metrics, diverged = over_cores(_run, run, (windows,), places)
+    numbers, by_part = jax.tree.map(lambda x: np.asarray(x, float), tuple(metrics))
+    stack = lambda name: np.stack([part[name] for part in by_part])
+    overshoot = stack("overshoot")
+    some = ~np.isnan(overshoot)  # no part with a step: none
+    greatest = np.max(np.where(some, overshoot, -np.inf), axis=0)
+    numbers |= {name: stack(name).sum(axis=0) for name in _INTEGRALS}
+    numbers["overshoot"] = np.where(some.any(axis=0), greatest, np.nan)
+    numbers["activity_rate"] = numbers["activity"] / ((span_of_all[1] + 1 - span_of_all[0]) * dt)
+    return Flown(numbers, np.asarray(diverged), np.max(stack("peak"), axis=(0, 1)))
+
+
+Finished = tuple[dict[str, Array], list[dict[str, Array]], Bool[Array, "*ensemble"]]
+
+
+@ft.partial(Jit, options=brief_options)
+def _run(
+    loop: Loop, scenario: Scenario, windows: tuple[Window, ...], devices: Devices | None = None
+) -> Finished:
+    return loop_over_devices(_measure, (loop, scenario), windows, devices)
+
+
+def _measure(run: tuple[Loop, Scenario], windows: tuple[Window, ...]) -> Finished:
+    loop, scenario = run
+    authority = find_authority(loop.plant, loop.drive, loop.controller)
+
+    def metrics(span: Window, wanted: tuple[str, ...]) -> FlightMetrics:
+        return FlightMetrics(
+            wanted=wanted,
+            window=span,
+            dt=loop.dt,
+            steps=find_steps(scenario.reference, [(span.first, span.until)]),
+            from_first=jnp.asarray(span.first == 0) if wanted is _OF_PARTS else None,
+            torque_gain=None if authority is None else authority.torque_gain,
+            limit=None if authority is None else authority.command,
+        )
+
+    span_of_all, *parts = windows
+    sums = _Parts((metrics(span_of_all, _OF_ALL), *(metrics(part, _OF_PARTS) for part in parts)))
+    total, _, running = scan_loop(loop, scenario, sums)
+    numbers, *by_part = [one.finish(x) for one, x in zip(sums.parts, total, strict=True)]
+    return numbers, by_part, ~running
+
+
+class _Parts(eqx.Module):
+    """Adds up the numbers of several windows of one flight."""
+
+    parts: tuple[FlightMetrics, ...]
+
+    def begin(self, like: Float[Array, " axes *ensemble"]) -> tuple[PyTree, ...]:
+        return tuple(part.begin(like) for part in self.parts)
+
+    def update(self, total: tuple[PyTree, ...], now: SampleResult) -> tuple[tuple, None]:
+        pairs = zip(self.parts, total, strict=True)
+        return tuple(part.update(sums, now)[0] for part, sums in pairs), None

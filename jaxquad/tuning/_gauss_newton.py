@@ -56,7 +56,7 @@ class GaussNewton(eqx.Module):
             raise ValueError(f"steps is {self.steps} and stride {self.stride}: give 1 or more")
 
 
-class _Given(eqx.Module):
+class _Squares(eqx.Module):
     coordinates: Coordinates
     problem: Problem
     penalties: Sequence[Penalty]
@@ -89,35 +89,37 @@ def minimise_squares(
     import optimistix as optx
 
     units = jnp.ones((problem.linear.assumed_inertia.shape[0], problem.members))
-    given = _Given(coordinates, problem, objective.penalties, units, method.stride)
-    own = jnp.sum(_errors(jnp.asarray(start), given) ** 2, axis=0)
-    given = eqx.tree_at(lambda g: g.scale, given, jnp.sum(own, axis=0, keepdims=True) + 0 * own)
+    squares = _Squares(coordinates, problem, objective.penalties, units, method.stride)
+    size = jnp.sum(_errors(jnp.asarray(start), squares) ** 2, axis=0)
+    squares = eqx.tree_at(
+        lambda s: s.scale, squares, jnp.sum(size, axis=0, keepdims=True) + 0 * size
+    )
     solver = optx.LevenbergMarquardt(
         rtol=method.tolerance, atol=method.tolerance, linear_solver=lx.Normal(lx.Cholesky())
     )
     with jax.numpy_dtype_promotion("standard"):
-        found = optx.least_squares(
-            _linearised, solver, jnp.asarray(start), given, max_steps=method.steps, throw=False
+        solution = optx.least_squares(
+            _linearised, solver, jnp.asarray(start), squares, max_steps=method.steps, throw=False
         )
-    done = bool(found.result == optx.RESULTS.successful)
-    return np.asarray(found.value), int(found.stats["num_steps"]), done
+    done = bool(solution.result == optx.RESULTS.successful)
+    return np.asarray(solution.value), int(solution.stats["num_steps"]), done
 
 
-def _residuals(z: Float[Array, " n"], given: _Given) -> tuple[Array, Array]:
-    members = given.problem.members
-    tracking = _errors(z, given) / jnp.sqrt(given.scale + _LEAST)[None]
-    controller = given.coordinates.controller_at(z)
-    flights, linear = split_quantities({p.quantity for p in given.penalties} | {"abscissa"})
-    numbers = given.problem.linear.numbers(controller, linear, SMOOTHING)
+def _residuals(z: Float[Array, " n"], squares: _Squares) -> tuple[Array, Array]:
+    members = squares.problem.members
+    tracking = _errors(z, squares) / jnp.sqrt(squares.scale + _LEAST)[None]
+    controller = squares.coordinates.controller_at(z)
+    flights, linear = split_quantities({p.quantity for p in squares.penalties} | {"abscissa"})
+    numbers = squares.problem.linear.numbers(controller, linear, SMOOTHING)
     if flights:
-        numbers |= given.problem.in_time(controller, flights)
+        numbers |= squares.problem.in_time(controller, flights)
     gate = stability_gate(numbers["abscissa"])
     costs = [
         p(
             QUANTITIES[p.quantity].combine_axes(numbers[p.quantity]),
             gate if is_gated(p.quantity) else gate + 1,
         )
-        for p in given.penalties
+        for p in squares.penalties
     ]
     bounds = jnp.sqrt(jnp.stack(costs) + _LEAST) if costs else jnp.zeros((0, members))
     # ITSE goes as the square of ITAE: half of it, for the same change of the cost.
@@ -125,8 +127,8 @@ def _residuals(z: Float[Array, " n"], given: _Given) -> tuple[Array, Array]:
 
 
 @eqx.filter_custom_jvp
-def _linearised(z: Float[Array, " n"], given: _Given) -> tuple[Array, Array]:
-    return _residuals(z, given)
+def _linearised(z: Float[Array, " n"], squares: _Squares) -> tuple[Array, Array]:
+    return _residuals(z, squares)
 
 
 @_linearised.def_jvp
@@ -148,10 +150,10 @@ class _Errors(eqx.Module):
         return total, now.reference - now.angle
 
 
-def _errors(z: Float[Array, " n"], given: _Given) -> Float[Array, "points axes members"]:
+def _errors(z: Float[Array, " n"], squares: _Squares) -> Float[Array, "points axes members"]:
     """sqrt(t) error every few samples, t from the last event."""
-    problem, stride = given.problem, given.stride
-    loop = problem.loop_around(given.coordinates.controller_at(z))
+    problem, stride = squares.problem, squares.stride
+    loop = problem.loop_around(squares.coordinates.controller_at(z))
     stored = scan_loop(loop, problem.flight, _Errors())[1]
     index = np.arange(int(problem.window.first), int(problem.window.last) + 1, stride)
     since = np.min([np.where(index >= a, index - a, np.inf) for a, _ in problem.parts], axis=0)

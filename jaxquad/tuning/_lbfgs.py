@@ -94,10 +94,12 @@ def minimise(
     """
     z = np.array(start, float)
     on = np.ones(len(z), bool) if on is None else np.array(on)
-    known = [Pairs() for _ in z] if pairs is None else pairs
-    searches = [_lbfgs(x, method, _bound(enough, k), known[k]) for k, x in enumerate(z)]
+    curvature = [Pairs() for _ in z] if pairs is None else pairs
+    searches = [_lbfgs(x, method, _bound(enough, k), curvature[k]) for k, x in enumerate(z)]
     still = [_Point(x, np.nan, np.full_like(x, np.nan)) for x in z]
-    ends: list[_End] = [(point, False, "not started", known[k]) for k, point in enumerate(still)]
+    ends: list[_End] = [
+        (point, False, "not started", curvature[k]) for k, point in enumerate(still)
+    ]
     counts = np.zeros(len(z), int)
     z = np.stack([next(search) for search in searches])
     while on.any():
@@ -141,17 +143,17 @@ def _lbfgs(z: Vector, method: LBFGS, enough: Callable[[float], bool], pairs: Pai
         if direction @ point.gradient >= 0:  # rounding has spoilt the pairs
             pairs, direction = [], -point.gradient
         step = _first(direction, pairs, method)
-        found, left = yield from _search_line(point, direction, step, left, method.longest_step)
-        if found is None and pairs:
+        lower, left = yield from _search_line(point, direction, step, left, method.longest_step)
+        if lower is None and pairs:
             pairs = []  # once more, downhill
             continue
-        if found is None:
+        if lower is None:
             return point, idle > 0, "no step lowers the cost any further", pairs
-        s, y = found.z - point.z, found.gradient - point.gradient
+        s, y = lower.z - point.z, lower.gradient - point.gradient
         if s @ y > 1e-10 * (y @ y):
             pairs = [*pairs, (s, y)][-method.memory :]
-        idle = idle + 1 if point.value - found.value < method.tolerance else 0
-        point = found
+        idle = idle + 1 if point.value - lower.value < method.tolerance else 0
+        point = lower
         if idle == 2:
             return point, True, "the cost no longer falls", pairs
 

@@ -1,6 +1,6 @@
 """Which numbers of a controller are tuned, and the coordinates in which they are."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator
 
 import equinox as eqx
 import jax
@@ -8,8 +8,10 @@ import numpy as np
 from jaxtyping import Array, Float, PyTree
 
 from jaxquad._core import as_array, ensemble_shape
-from jaxquad.control import find_transform, Transform, Tunable
+from jaxquad.control import find_transform, ObserverController, Transform, Tunable
 from jaxquad.identify import Free, name_places, Parameters, Place, select_parameters, with_values
+
+from ._verdict import Bound
 
 
 class Block(eqx.Module):
@@ -71,9 +73,9 @@ class Coordinates(eqx.Module):
     def values(self, z: Float[np.ndarray, " n"]) -> dict[str, float]:
         """The tuned numbers by name."""
         tuned = eqx.filter(build_design(self, as_array(z)), eqx.is_inexact_array)
-        held = [np.asarray(x).reshape(-1) for x in jax.tree.leaves(tuned)]
+        leaves = [np.asarray(x).reshape(-1) for x in jax.tree.leaves(tuned)]
         places = {place.name: place for place in name_places(self.controller)}
-        at = lambda place: float(held[place.leaf][place.index])
+        at = lambda place: float(leaves[place.leaf][place.index])
         return {name: at(places[name]) for name in self.names}
 
 
@@ -98,8 +100,17 @@ def select_coordinates(controller: PyTree, free: Free = None) -> Coordinates:
     - `ValueError`: names that do not exist, a number that starts at 0, an ensemble of controllers,
         or single precision.
     """
-    _require_one(controller)
-    free = list(_default(controller)) if free is None else free
+    if ensemble := ensemble_shape(controller):
+        raise ValueError(
+            f"the controller is an ensemble of {ensemble}: give one controller; "
+            "a tune makes its own copies for members and starts"
+        )
+    if free is None and not isinstance(controller, Tunable):
+        raise ValueError(
+            f"a {type(controller).__name__} does not say which of its numbers are tuned: name "
+            'them, free=["kp", "kd"], or give it a method tunable()'
+        )
+    free = list(controller.tunable()) if free is None else free
     places = name_places(controller)
     blocks: list[Block] = []
     chosen = free
@@ -114,24 +125,6 @@ def select_coordinates(controller: PyTree, free: Free = None) -> Coordinates:
     return Coordinates(controller, parameters, tuple(blocks))
 
 
-def _require_one(controller: PyTree) -> None:
-    ensemble = ensemble_shape(controller)
-    if ensemble:
-        raise ValueError(
-            f"the controller is an ensemble of {ensemble}: give one controller; "
-            "a tune makes its own copies for members and starts"
-        )
-
-
-def _default(controller: PyTree) -> Mapping[str, Transform | None]:
-    if not isinstance(controller, Tunable):
-        raise ValueError(
-            f"a {type(controller).__name__} does not say which of its numbers are tuned: name "
-            'them, free=["kp", "kd"], or give it a method tunable()'
-        )
-    return controller.tunable()
-
-
 def _block(controller: PyTree, name: str, places: list[Place]) -> Block | None:
     """The array of that name, if a part of the controller declares coordinates for it."""
     transform = find_transform(controller, name)
@@ -142,3 +135,46 @@ def _block(controller: PyTree, name: str, places: list[Place]) -> Block | None:
     values = np.asarray(leaves[mine[0].leaf])
     start = np.asarray(transform.inverse(values))
     return Block(mine, values.shape, transform, as_array(start.reshape(-1)))
+
+
+_NEAR, _FLAT = 0.02, 1e-3  # nepers to a bound, and the slope per neper that pushes against it
+
+
+def find_refusal(coordinates: Coordinates, z: Float[np.ndarray, " n"]) -> str:
+    """Why the controller at `z` cannot be built or must not be flown; empty if it can."""
+    return refusal_of(build_design(coordinates, as_array(z)))
+
+
+def refusal_of(controller: PyTree) -> str:
+    """As `find_refusal`, of a controller that was not checked when it was made."""
+    for part in _iter_modules(controller):
+        try:
+            for kind in type(part).__mro__:  # as when it is made
+                if "__check_init__" in vars(kind):
+                    vars(kind)["__check_init__"](part)
+        except ValueError as error:
+            return str(error)
+    if not isinstance(controller, ObserverController):
+        return ""
+    return controller.observer_instability() or controller.observer_slowness()
+
+
+def find_bounds(
+    coordinates: Coordinates, z: Float[np.ndarray, " n"], gradient: Float[np.ndarray, " n"]
+) -> tuple[Bound, ...]:
+    """The numbers that could lower the cost if the controller allowed them a small step more."""
+    bounds, values = [], coordinates.values(z)
+    for k, name in enumerate(values):
+        step = np.zeros_like(z)
+        step[k] = -_NEAR * np.sign(gradient[k])
+        if abs(gradient[k]) > _FLAT and (why := find_refusal(coordinates, z + step)):
+            bounds.append(Bound(name, values[name], why))
+    return tuple(bounds)
+
+
+def _iter_modules(tree: PyTree) -> Iterator[eqx.Module]:
+    """`tree` and the modules in it."""
+    if isinstance(tree, eqx.Module):
+        yield tree
+        for part in vars(tree).values():
+            yield from _iter_modules(part)

@@ -1,4 +1,5 @@
 import dataclasses
+import functools as ft
 from collections.abc import Mapping, Sequence
 
 import equinox as eqx
@@ -16,17 +17,14 @@ from ._certificate import Certificate
 from ._certify import certify
 from ._cost import Progress, stack_copies
 from ._design_result import DesignResult, DesignSummary, front_point, summarise_design
-from ._drawn import draw_or_take, tighten
 from ._lbfgs import LBFGS
 from ._objective import Limit, Objective, Penalty
-from ._parameters import build_design, Coordinates, select_coordinates
-from ._phases import Solution, solve
+from ._parameters import build_design, find_bounds, select_coordinates
+from ._phases import solve
 from ._problem import DeviceChoice, make_problem, TimeSpan
 from ._quantities import QUANTITIES
-from ._refusal import find_bounds
-from ._requirements import require_kinds
-from ._tune import judge_descent, stabilising_rate
-from ._verdict import Verdict
+from ._tail import draw_or_take, tighten
+from ._tune import judge_descent, require_kinds, stabilising_rate
 
 
 def describe_front(pareto: "Pareto") -> str:
@@ -107,16 +105,20 @@ class Pareto(eqx.Module):
 
     def content(self) -> dict[str, object]:
         """Every point's numbers, for `jaxquad.report.write_json`."""
-        own = vars(self) | {"effort": self.effort, "tracking": self.tracking, "front": self.front}
+        fields = vars(self) | {
+            "effort": self.effort,
+            "tracking": self.tracking,
+            "front": self.front,
+        }
         names = ("over", "levels", "effort", "tracking", "front", "converged", "evaluations")
         summaries = [c.summaries[c.name] for c in self.certificates]
         rows = [
             {**x.content(), "holds": c.holds}
             for x, c in zip(summaries, self.certificates, strict=True)
         ]
-        known = self.certificates[0].independent
-        peers = {n: summarise_design(x, independent=known).content() for n, x in self.peers.items()}
-        return {name: own[name] for name in names} | {"points": rows, "peers": peers}
+        summarise = ft.partial(summarise_design, independent=self.certificates[0].independent)
+        peers = {name: summarise(x).content() for name, x in self.peers.items()}
+        return {name: fields[name] for name in names} | {"points": rows, "peers": peers}
 
     def __str__(self) -> str:
         return describe_front(self)
@@ -166,7 +168,7 @@ def pareto(
     over, objective = _NAMES[over], Objective() if objective is None else objective
     method = LBFGS() if method is None else method
     require_kinds(loop, ensemble, scenario, objective, limits, method)
-    held = _levels(over, objective, points, levels)
+    levels_of = _levels(over, objective, points, levels)
     if isinstance(ensemble, Members) and not isinstance(fresh, Members):
         raise ValueError("the members to tune on are given: give fresh=, other members, too")
     key = jax.random.key(0) if key is None else key
@@ -175,13 +177,13 @@ def pareto(
     drawn = draw_or_take(loop, ensemble, members, key)
     problem = make_problem(loop.controller, drawn, scenario, span=span, devices=devices)
     tightened = tuple(tighten(limit, reserve) for limit in limits)
-    found = solve(
-        coordinates, problem, np.tile(coordinates.start, (len(held), 1)),
-        _objectives(objective, over, held), stack_copies(tightened, len(held)),
+    solution = solve(
+        coordinates, problem, np.tile(coordinates.start, (len(levels_of), 1)),
+        _objectives(objective, over, levels_of), stack_copies(tightened, len(levels_of)),
         method=method, rate=stabilising_rate(objective), progress=watched,
     )  # fmt: skip
     seconds = watched.seconds
-    designs = [build_design(coordinates, jnp.asarray(z)) for z in found.z]
+    designs = [build_design(coordinates, jnp.asarray(z)) for z in solution.z]
     others, count = (fresh, 0) if isinstance(fresh, Members) else (ensemble, fresh)
     certificates = [
         certify(
@@ -191,22 +193,22 @@ def pareto(
         for k, design in enumerate(designs)
     ]  # fmt: skip
     certificates = [
-        dataclasses.replace(one, convergence=_judge_point(coordinates, found, k))
+        dataclasses.replace(
+            one,
+            convergence=judge_descent(
+                solution, k, find_bounds(coordinates, solution.z[k], solution.gradient[k])
+            ),
+        )
         for k, one in enumerate(certificates)
     ]
-    beside = {name: x for name, x in certificates[0].designs.items() if name != "tuned"}
+    peer_designs = {name: x for name, x in certificates[0].designs.items() if name != "tuned"}
     certificates[0] = dataclasses.replace(
         certificates[0], designs={"tuned": certificates[0].design}
     )
     return Pareto(
-        over, held, tuple(designs), tuple(certificates), beside, found.converged,
-        found.evaluations, seconds,
+        over, levels_of, tuple(designs), tuple(certificates), peer_designs, solution.converged,
+        solution.evaluations, seconds,
     )  # fmt: skip
-
-
-def _judge_point(coordinates: Coordinates, found: Solution, k: int) -> Verdict:
-    bounds = find_bounds(coordinates, found.z[k], found.gradient[k])
-    return judge_descent(found, k, bounds)
 
 
 def _levels(
@@ -220,10 +222,11 @@ def _levels(
                 "front give 2 points or more and a penalty, or levels=[...]"
             )
         return np.geomspace(*_REACH[over], points) * knees[0]
-    held = np.asarray(levels, float)
-    if held.ndim != 1 or held.size < 2 or not np.all((held > 0) & (np.diff(held, prepend=0) > 0)):
+    values = np.asarray(levels, float)
+    rising = np.all((values > 0) & (np.diff(values, prepend=0) > 0))
+    if values.ndim != 1 or values.size < 2 or not rising:
         raise ValueError(f"levels are {levels}: give 2 or more above 0 that rise")
-    return held
+    return values
 
 
 def _objectives(objective: Objective, over: str, levels: np.ndarray) -> Objective:

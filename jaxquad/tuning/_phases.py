@@ -16,18 +16,20 @@ from ._cost import (
     CostResult,
     evaluate_cost,
     Evaluation,
+    initial_multipliers,
+    MET,
     Multipliers,
     Progress,
+    Rounds,
     Subproblem,
     take_problem,
+    update_multipliers,
 )
 from ._gauss_newton import GaussNewton, minimise_squares
 from ._lbfgs import Descent, Evaluate, LBFGS, minimise, Pairs
-from ._multipliers import initial_multipliers, MET, Rounds, update_multipliers
 from ._objective import Limit, Objective
-from ._parameters import build_design, Coordinates
+from ._parameters import build_design, Coordinates, refusal_of
 from ._problem import Problem
-from ._refusal import refusal_of
 from ._tail import (
     Beyond,
     half_of_reserve,
@@ -93,9 +95,9 @@ def solve(
     slowest = runner.slowest(first.z)
     stable = slowest < 0
     multipliers = initial_multipliers(problem, limits, len(first.z))
-    found = runner.optimise(first.z, stable, stable, multipliers)
+    end = runner.optimise(first.z, stable, stable, multipliers)
     guards = None if search is None or search.flights is None else search.flights.guards
-    state = _State(runner, found, first.evaluations, stable, slowest < rate, Tail(), guards)
+    state = _State(runner, end, first.evaluations, stable, slowest < rate, Tail(), guards)
     if search is not None:
         state = _keep_on_tail(state, search)
     return _solution(state)
@@ -112,7 +114,7 @@ class _State(NamedTuple):
     """Where all problems are, and what they descend on."""
 
     runner: "_Runner"
-    found: "_Optimised"
+    end: "_Optimised"
     stabilising: Int[np.ndarray, " problems"]  # evaluations of the first phase
     stable: Bool[np.ndarray, " problems"]
     stabilised: Bool[np.ndarray, " problems"]
@@ -121,7 +123,7 @@ class _State(NamedTuple):
 
 
 def _solution(state: _State) -> Solution:
-    second, multipliers, result, beyond, counts = state.found
+    second, multipliers, result, beyond, counts = state.end
     return Solution(
         z=second.z, cost=np.where(state.stable, np.asarray(result.cost), np.nan),
         gradient=second.gradient, stable=state.stable, stabilised=state.stabilised,
@@ -132,21 +134,21 @@ def _solution(state: _State) -> Solution:
 
 
 def _keep_on_tail(
-    state: _State, search: Search, asked: Bool[np.ndarray, " problems"] | None = None
+    state: _State, search: Search, chosen: Bool[np.ndarray, " problems"] | None = None
 ) -> _State:
     """Search for members that are beyond limits, and descend again with the worst of them.
 
-    Searched for are those of problems that are `asked` for (all, by default) and keep the limits on
+    Searched for are those of the problems `chosen` (all, by default) and keep the limits on
     the members known so far.
     """
     met = np.maximum(half_of_reserve(search.aimed, search.limits), MET)
-    asked = state.stable if asked is None else asked
+    chosen = state.stable if chosen is None else chosen
     for _ in range(SEARCHES):
-        on = asked & np.all(state.found.beyond <= met, axis=1)
+        on = chosen & np.all(state.end.beyond <= met, axis=1)
         if not on.any():
             break
         runner, tail = state.runner, state.tail
-        worst = search_tail(search, tail.searches, runner.coordinates, state.found.descent.z, on)
+        worst = search_tail(search, tail.searches, runner.coordinates, state.end.descent.z, on)
         runner.progress.say(str(worst))
         state = state._replace(tail=tail.with_search(worst))
         if not worst.count:
@@ -159,23 +161,24 @@ def _with_worst(
     state: _State, worst: Beyond, search: Search, on: Bool[np.ndarray, " problems"]
 ) -> _State:
     """The problems that are `on` descend again, with the worst among the members of limits."""
-    runner, found = state.runner, state.found
-    problem, multipliers, guards = runner.problem, found.multipliers, state.guards
-    known = found.result, runner.limits, on
-    if worst.loops is not None and worst.loops.found:
-        problem, multipliers = put_loops(worst.loops, problem, multipliers, *known)
+    runner, end = state.runner, state.end
+    problem, multipliers, guards = runner.problem, end.multipliers, state.guards
+    critical = end.result, runner.limits, on
+    if worst.loops is not None and worst.loops.places:
+        problem, multipliers = put_loops(worst.loops, problem, multipliers, *critical)
     if worst.members is not None and search.flights is not None and guards is not None:
-        given = search.flights, guards, problem, multipliers
-        guards, problem, multipliers = put_flights(worst.members, *given, *known)
+        guards, problem, multipliers = put_flights(
+            worst.members, search.flights, guards, problem, multipliers, *critical
+        )
     runner = dataclasses.replace(runner, problem=problem, limits=search.aimed)
     met = half_of_reserve(search.aimed, search.limits)
-    known = found.descent.z, state.stable, on, multipliers, met, found.descent.pairs
-    again = runner.optimise(*known)
-    found = again._replace(
-        descent=_merge(found.descent, again.descent, on), counts=found.counts + again.counts
+    before = end.descent
+    again = runner.optimise(before.z, state.stable, on, multipliers, met, before.pairs)
+    end = again._replace(
+        descent=_merge(before, again.descent, on), counts=end.counts + again.counts
     )
     tail = state.tail._replace(added=state.tail.added + worst.added)
-    return state._replace(runner=runner, found=found, tail=tail, guards=guards)
+    return state._replace(runner=runner, end=end, tail=tail, guards=guards)
 
 
 class _Memory:
@@ -200,9 +203,9 @@ class _Runner(eqx.Module):
         self, z: np.ndarray, on: np.ndarray, fly: ArrayLike, multipliers: Multipliers
     ) -> CostResult:
         """One evaluation of the problems that are on."""
-        return _on_host(evaluate_cost(*self._given(z, on, fly, multipliers)))
+        return _on_host(evaluate_cost(*self._arguments(z, on, fly, multipliers)))
 
-    def _given(
+    def _arguments(
         self, z: np.ndarray, on: np.ndarray, fly: ArrayLike, multipliers: Multipliers
     ) -> tuple[Array, Array, Coordinates, Problem, Subproblem]:
         count = len(z)
@@ -217,7 +220,7 @@ class _Runner(eqx.Module):
         def evaluate(z: np.ndarray, on: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             # Before the costs, and looked at while they run: JAX runs one program after the other.
             designs = [self._design(x) for x, go in zip(z, on, strict=True) if go]
-            running = evaluate_cost(*self._given(z, on, fly, multipliers))
+            running = evaluate_cost(*self._arguments(z, on, fly, multipliers))
             refused = np.zeros(len(z), bool)
             refused[np.flatnonzero(on)] = [bool(self.refusal(design)) for design in designs]
             result = _on_host(running)
@@ -257,23 +260,23 @@ class _Runner(eqx.Module):
         self,
         z: np.ndarray,
         on: np.ndarray,
-        given: Multipliers,
+        multipliers: Multipliers,
         left: int,
         pairs: Sequence[Pairs] | None,
     ) -> Descent:
         """One round of the second phase, of at most `left` evaluations."""
         if isinstance(self.method, LBFGS):
             method = dataclasses.replace(self.method, evaluations=left)
-            return minimise(self.evaluator(True, given), z, method, on=on, pairs=pairs)
+            return minimise(self.evaluator(True, multipliers), z, method, on=on, pairs=pairs)
         ends = [self._squares(k, x) if on[k] else (x, 0, False) for k, x in enumerate(z)]
         points, steps, done = zip(*ends, strict=True)
-        value, gradient = self.evaluator(True, given)(np.stack(points), on)
+        value, gradient = self.evaluator(True, multipliers)(np.stack(points), on)
         reasons = tuple(
             "" if d else f"stopped after {s} steps" for s, d in zip(steps, done, strict=True)
         )
-        known = tuple(Pairs() for _ in z)
+        none = tuple(Pairs() for _ in z)
         return Descent(
-            np.stack(points), value, gradient, np.array(steps), np.array(done), reasons, known
+            np.stack(points), value, gradient, np.array(steps), np.array(done), reasons, none
         )
 
     def _squares(self, k: int, z: np.ndarray) -> tuple[np.ndarray, int, bool]:
@@ -303,9 +306,9 @@ class _Runner(eqx.Module):
         most = self.method.evaluations if isinstance(self.method, LBFGS) else 0
         for _ in range(_ROUNDS if self.limits else 1):
             left = min(most, int(_TIMES * most - counts.max()))
-            found = self.descend(z, on, multipliers, left, pairs)
-            descent = found if descent is None else _merge(descent, found, on)
-            z, counts, pairs = descent.z, counts + found.evaluations, descent.pairs
+            latest = self.descend(z, on, multipliers, left, pairs)
+            descent = latest if descent is None else _merge(descent, latest, on)
+            z, counts, pairs = descent.z, counts + latest.evaluations, descent.pairs
             result = self.evaluate(z, everyone, able, multipliers)
             if not self.limits:
                 return _Optimised(descent, multipliers, result, beyond, counts)

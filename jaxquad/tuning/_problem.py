@@ -62,7 +62,7 @@ class TimeSpan(NamedTuple):
 _SOFTNESS = 0.005  # of the limit, about which a command counts as saturated in part
 
 
-_WHOLE = TimeSpan()
+_FULL_FLIGHT = TimeSpan()
 
 
 class LinearLoops(eqx.Module):
@@ -109,8 +109,8 @@ class LinearLoops(eqx.Module):
     ) -> dict[str, Float[Array, "axes members"]]:
         """The wanted quantities of the linear loop of each member, the abscissa with them."""
 
-        def run(own: PyTree, controller: PyTree) -> dict[str, Array]:
-            axes, delay, inertia = own
+        def run(loops: PyTree, controller: PyTree) -> dict[str, Array]:
+            axes, delay, inertia = loops
             loop = Loop(
                 axes,
                 schedule_for_analysis(controller, inertia),
@@ -119,17 +119,17 @@ class LinearLoops(eqx.Module):
                 dt=self.dt,
             )
             places = range(len(inertia))
-            found = linear_numbers(loop, places, wanted, smoothing=smoothing, smooth=True)
-            each = lambda x: jnp.broadcast_to(x.reshape(len(x), -1), inertia.shape)
-            return {name: each(x) for name, x in found.items()}
+            numbers = linear_numbers(loop, places, wanted, smoothing=smoothing, smooth=True)
+            wide = lambda x: jnp.broadcast_to(x.reshape(len(x), -1), inertia.shape)
+            return {name: wide(x) for name, x in numbers.items()}
 
         if len(self.devices) < 2:
             return run((self.axes, self.delay, self.assumed_inertia), controller)
         full = lambda x: jnp.broadcast_to(
             x if x.ndim > 1 else x[:, None], (x.shape[0], self.members)
         )
-        own = (jax.tree.map(full, self.axes), self.delay, self.assumed_inertia)
-        return over_devices(run, own, controller, devices=self.devices)
+        loops = (jax.tree.map(full, self.axes), self.delay, self.assumed_inertia)
+        return over_devices(run, loops, controller, devices=self.devices)
 
 
 class Problem(eqx.Module):
@@ -170,14 +170,14 @@ class Problem(eqx.Module):
     def _summed(
         self, loop: Loop, flight: Scenario, names: tuple[str, ...]
     ) -> dict[str, Float[Array, "axes members"]]:
-        found = find_authority(loop.plant, loop.drive, loop.controller)
+        authority = find_authority(loop.plant, loop.drive, loop.controller)
         sums = FlightMetrics(
             wanted=names,
             window=self.window,
             dt=loop.dt,
             steps=find_steps(flight.reference, self.parts),
-            torque_gain=None if found is None else found.torque_gain,
-            limit=None if found is None else found.command,
+            torque_gain=None if authority is None else authority.torque_gain,
+            limit=None if authority is None else authority.command,
             smooth=True,
         )
         return sums.finish(scan_loop(loop, flight, sums)[0])
@@ -189,7 +189,7 @@ def make_problem(
     scenario: Scenario,
     limited: Members | None = None,
     *,
-    span: TimeSpan = _WHOLE,
+    span: TimeSpan = _FULL_FLIGHT,
     devices: DeviceChoice = None,
     counted: int | None = None,
 ) -> Problem:

@@ -8,18 +8,29 @@ from typing import NamedTuple, TypeVar
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
+from jaxtyping import Array, ArrayLike, Bool, Float, Int, Key, PyTree
 
 from jaxquad._compile import brief_options, Jit
 from jaxquad._core import as_array, mark_members, on_host
-from jaxquad.ensembles import Members
+from jaxquad.ensembles import Ensemble, Members
+from jaxquad.loops import Loop
+from jaxquad.simulation import Scenario
 
 from ._certificate import Certificate
-from ._cost import CostResult, Multipliers, SMOOTHING, take_problem
+from ._cost import CostResult, Multipliers, SMOOTHING, stack_copies, take_problem
 from ._design_result import covers, DesignResult, Distance, Numbers, with_further
+from ._evaluate_design import fly, flying_loop
 from ._objective import Limit, Worst
 from ._parameters import build_design, Coordinates
-from ._problem import linear_loops, LinearLoops, Problem
+from ._problem import (
+    DeviceChoice,
+    linear_loops,
+    LinearLoops,
+    make_problem,
+    Problem,
+    require_same_rate,
+    TimeSpan,
+)
 from ._quantities import QUANTITIES
 
 
@@ -61,13 +72,13 @@ class Tail(NamedTuple):
     added: int = 0  # to those that limits are kept on
     certificates: int = 0  # each on other members; all but the last found members to tune on
 
-    def with_search(self, found: "Beyond") -> "Tail":
+    def with_search(self, beyond: "Beyond") -> "Tail":
         """After one more search."""
         return self._replace(
             searches=self.searches + 1,
-            searched=self.searched + found.searched,
-            flown=self.flown + found.flights,
-            beyond=found.count,
+            searched=self.searched + beyond.searched,
+            flown=self.flown + beyond.flights,
+            beyond=beyond.count,
         )
 
 
@@ -75,11 +86,11 @@ class WorstLoops(NamedTuple):
     """Linear loops to keep limits on: where they lie in their slices, the worst first."""
 
     slices: list[LinearLoops]
-    found: list[tuple[int, int]]  # slice, and place in it
+    places: list[tuple[int, int]]  # slice, and place in it
 
     def put_into(self, limited: LinearLoops, places: Int[np.ndarray, " some"]) -> LinearLoops:
         """They take the `places` of others."""
-        slices, chosen = np.array(self.found).T
+        slices, chosen = np.array(self.places).T
         for k in np.unique(slices):
             mine = slices == k
             limited = limited.replaced(places[mine], self.slices[k], chosen[mine])
@@ -98,7 +109,7 @@ class Beyond(NamedTuple):
     @property
     def added(self) -> int:
         """How many there are to tune on."""
-        loops = 0 if self.loops is None else len(self.loops.found)
+        loops = 0 if self.loops is None else len(self.loops.places)
         return loops + (0 if self.members is None else self.members.size)
 
     def __str__(self) -> str:
@@ -118,12 +129,12 @@ def search_tail(
     An unstable loop has no number that a limit could pull at: it is left to the certificate.
     """
     designs = [(as_array(z[k]), take_problem(search.limits, int(k))) for k in able.nonzero()[0]]
-    found = Beyond(None, None, 0)
+    beyond = Beyond(None, None, 0)
     if search.linear is not None:
         levels = lambda loops: [_levels(x, coordinates, loops, limits) for x, limits in designs]
         slices, ranked, count = _search(search.linear, number, _LOOPS // SLICE, levels)
         loops = WorstLoops(slices, [place for _, place in ranked[:_ADDED]])
-        found = Beyond(loops, None, count, len(slices) * SLICE)
+        beyond = Beyond(loops, None, count, len(slices) * SLICE)
     if search.flights is not None:
         fly, most = search.flights.fly, max(1, _FLIGHTS // search.flights.size)
         controllers = [(build_design(coordinates, x), limits) for x, limits in designs]
@@ -131,8 +142,9 @@ def search_tail(
         slices, ranked, count = _search(search.flights.draw, number, most, levels)
         members = take_members(slices, [place for _, place in ranked[:GUARDS]])
         flights = len(slices) * search.flights.size
-        found = found._replace(members=members, count=found.count + count, flights=flights)
-    return found
+        count += beyond.count
+        beyond = beyond._replace(members=members, count=count, flights=flights)
+    return beyond
 
 
 Slice = TypeVar("Slice")
@@ -175,8 +187,8 @@ def _levels(
     """How far linear loops are beyond limits that every member has to keep, the greatest of all."""
     kept = [limit for limit in limits if is_kept_by_loops(limit)]
     names = {limit.quantity for limit in kept}
-    found = loops.numbers(coordinates.controller_at(z), names, SMOOTHING)
-    values = {name: QUANTITIES[name].combine_axes(found[name], worst=True) for name in names}
+    numbers = loops.numbers(coordinates.controller_at(z), names, SMOOTHING)
+    values = {name: QUANTITIES[name].combine_axes(numbers[name], worst=True) for name in names}
     level = jnp.max(jnp.stack([limit.beyond(values[limit.quantity]) for limit in kept]), axis=0)
     return jnp.where(level < _LOST, level, -jnp.inf)
 
@@ -234,7 +246,7 @@ def _rank(design: DesignResult, missed: Sequence[Distance]) -> list[int]:
         return []
     values = [design.of(x.quantity, worst_axis=True) for x in missed]
     pairs = zip(missed, values, strict=True)
-    level = np.max([_level(x.quantity, found, x.bound) for x, found in pairs], axis=0)
+    level = np.max([_level(x.quantity, value, x.bound) for x, value in pairs], axis=0)
     return [int(k) for k in np.argsort(-level, kind="stable") if level[k] > 0]
 
 
@@ -272,7 +284,7 @@ def put_loops(
     """Limits are kept on the worst in place of the least critical; their multipliers begin at 0."""
     assert problem.limited is not None
     kept = [is_kept_by_loops(limit) for limit in limits]
-    places = _rank_places(result, kept, able)[: len(worst.found)]
+    places = _rank_places(result, kept, able)[: len(worst.places)]
     values = [np.array(x) for x in multipliers.values]
     for value in (x for x, mine in zip(values, kept, strict=True) if mine):
         value[:, places] = 0.0
@@ -317,14 +329,109 @@ def take_members(slices: Sequence[Members], places: Sequence[tuple[int, int]]) -
     longest = max(x.longest_delay for x in slices)
     alike = [dataclasses.replace(x, longest_delay=longest) for x in slices]
 
-    def pick(own: bool, *parts: Array) -> Array:
-        if not own:
+    def pick(per_member: bool, *parts: Array) -> Array:
+        if not per_member:
             return parts[0]
         keys = jnp.issubdtype(parts[0].dtype, jax.dtypes.prng_key)
-        given = [np.asarray(jax.random.key_data(x)).T if keys else np.asarray(x) for x in parts]
-        taken = [x[..., k] for x, (_, k) in zip(given, used, strict=True)]
+        arrays = [np.asarray(jax.random.key_data(x)).T if keys else np.asarray(x) for x in parts]
+        taken = [x[..., k] for x, (_, k) in zip(arrays, used, strict=True)]
         together = np.concatenate(taken, axis=-1)[..., order]
         return jax.random.wrap_key_data(as_array(together.T)) if keys else as_array(together)
 
     marks = mark_members(alike[0], (alike[0].size,))
     return jax.tree.map(pick, marks, *alike)
+
+
+_WIDE = 256  # members more, whose linear loops have to keep limits
+_FIRST = 2  # folded into the key of the first slice of loops that is searched
+_FLOWN = 0xF17E  # and of the first slice of flights
+_GUARDING = 0x6A2D  # of those that fly for limits alone
+_MARGIN = 0.01  # of the reserve, what is left once the worst of a search are tuned on
+
+
+class Job(NamedTuple):
+    """What is tuned, and for what."""
+
+    loop: Loop  # its controller is the start
+    ensemble: Ensemble | Members
+    scenario: Scenario
+    limits: tuple[Limit, ...]
+    span: TimeSpan
+    devices: DeviceChoice
+    key: Key[Array, ""]  # of all draws
+
+
+def draw_or_take(
+    loop: Loop, ensemble: Ensemble | Members, count: int, key: Key[Array, ""]
+) -> Members:
+    """`count` members of an ensemble, or the members that were given."""
+    if isinstance(ensemble, Ensemble):
+        return ensemble.draw(loop, count, key)
+    require_same_rate(loop, ensemble)
+    return ensemble
+
+
+def pose_problem(job: Job, drawn: Members, search: Search | None) -> Problem:
+    """The problem on the members `drawn`, and on those that guard limits."""
+    if search is None or search.flights is None:
+        controller, span = job.loop.controller, job.span
+        problem = make_problem(controller, drawn, job.scenario, span=span, devices=job.devices)
+    else:
+        problem = search.flights.problem(search.flights.guards)
+    linear = any(QUANTITIES[limit.quantity].linear for limit in job.limits)
+    if isinstance(job.ensemble, Members) or not linear:
+        return problem
+    # More members where there are limits of the linear loop, whose worst case is in a corner.
+    limited = job.ensemble.draw(job.loop, _WIDE, jax.random.fold_in(job.key, 1))
+    return dataclasses.replace(problem, limited=linear_loops(limited, job.devices))
+
+
+def make_search(
+    job: Job, drawn: Members, *, reserve: float, starts: int, size: int
+) -> Search | None:
+    """Members to search for those beyond limits, and the limits that those found have to keep.
+
+    `size` is that of a slice of flights.
+    """
+    loop, ensemble, limits = job.loop, job.ensemble, job.limits
+    if isinstance(ensemble, Members) or not any(isinstance(x.over, Worst) for x in limits):
+        return None
+    fresh = lambda salt, count: ensemble.fresh(loop, count, jax.random.fold_in(job.key, salt))
+
+    def fly_members(controller: PyTree, members: Members) -> dict[str, np.ndarray]:
+        loop = flying_loop(controller, members)
+        return fly(loop, members.flight(job.scenario), job.span, job.devices).numbers
+
+    def problem(guards: Members) -> Problem:
+        """In which the guards fly, too, for limits alone."""
+        places = [(k, i) for k, some in enumerate((drawn, guards)) for i in range(some.size)]
+        flown = take_members([drawn, guards], places)
+        assert flown is not None
+        return make_problem(
+            job.loop.controller, flown, job.scenario,
+            span=job.span, devices=job.devices, counted=drawn.size,
+        )  # fmt: skip
+
+    flights = FlightSearch(
+        lambda k: fresh(_FLOWN + k, size), fly_members, problem, fresh(_GUARDING, GUARDS), size
+    )
+    loops = lambda k: linear_loops(fresh(_FIRST + k, SLICE), job.devices)
+    small = min(reserve, _MARGIN)
+    aimed = [tighten(x, small if isinstance(x.over, Worst) else reserve) for x in limits]
+    return Search(
+        loops if any(map(is_kept_by_loops, limits)) else None,
+        flights if any(map(is_kept_by_flights, limits)) else None,
+        stack_copies(limits, starts),
+        stack_copies(tuple(aimed), starts),
+    )
+
+
+def tighten(limit: Limit, reserve: float) -> Limit:
+    """The limit with a reserve; raise ValueError for one outside of 0 <= reserve < 1."""
+    if not 0 <= reserve < 1:
+        raise ValueError(
+            f"reserve is {reserve}: give the share by which limits are tightened, as 0.03"
+        )
+    share = limit.sign * np.sign(np.asarray(limit.bound)) * reserve
+    name = "at_least" if limit.at_most is None else "at_most"
+    return Limit(limit.quantity, **{name: on_host(limit.bound) * (1 - share)}, over=limit.over)

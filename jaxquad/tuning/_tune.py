@@ -14,22 +14,19 @@ from jaxquad._core import as_array
 from jaxquad.ensembles import Ensemble, Members
 from jaxquad.identify import Free
 from jaxquad.loops import Loop
-from jaxquad.simulation import Scenario
+from jaxquad.simulation import find_steps, Scenario
 
 from ._certificate import Certificate, lag_remark
 from ._certify import certify
 from ._cost import Listener, Progress, stack_copies
-from ._drawn import draw_or_take, Job, make_search, pose_problem, tighten
 from ._evaluate_design import certified_members
-from ._gauss_newton import GaussNewton
+from ._gauss_newton import GaussNewton, require_squares
 from ._lbfgs import LBFGS
 from ._objective import Limit, Objective
-from ._parameters import build_design, Coordinates, select_coordinates
+from ._parameters import build_design, Coordinates, find_bounds, select_coordinates
 from ._phases import go_on, Solution, solve
 from ._problem import DeviceChoice, Problem, TimeSpan
-from ._refusal import find_bounds
-from ._requirements import require_fresh, require_kinds, require_steps
-from ._tail import certified_beyond, Search
+from ._tail import certified_beyond, draw_or_take, Job, make_search, pose_problem, Search, tighten
 from ._tuned import distinct_optima, LimitResult, scatter_starts, Tuned
 from ._verdict import Bound, judge_convergence, Verdict
 
@@ -181,9 +178,9 @@ def _certify(
             begun=job.loop.controller, key=key, devices=job.devices, **job.span._asdict(),
         )  # fmt: skip
 
-    key, made, seconds = job.key, 1, 0.0
+    key, certificates, seconds = job.key, 1, 0.0
     latest = certificate(solution.z[best], key)
-    while search is not None and isinstance(ensemble, Ensemble) and made < _CERTIFICATES:
+    while search is not None and isinstance(ensemble, Ensemble) and certificates < _CERTIFICATES:
         members = certified_members(job.loop, ensemble, key, flown=count)
         worst = certified_beyond(latest, members)
         if not worst.added:
@@ -191,9 +188,9 @@ def _certify(
         began = time.perf_counter()
         solution = go_on(solution, worst, search, best)
         seconds += time.perf_counter() - began
-        key = jax.random.fold_in(job.key, _AGAIN + made)
-        latest, made = certificate(solution.z[best], key), made + 1
-    return _Certified(solution, latest, made, seconds)
+        key = jax.random.fold_in(job.key, _AGAIN + certificates)
+        latest, certificates = certificate(solution.z[best], key), certificates + 1
+    return _Certified(solution, latest, certificates, seconds)
 
 
 def _tuned(
@@ -207,9 +204,9 @@ def _tuned(
 ) -> Tuned:
     solution, certificate = certified.solution, certified.certificate
     tuned = build_design(coordinates, as_array(solution.z[best]))
-    found = _limit_results(job.limits, solution, best)
+    limits = _limit_results(job.limits, solution, best)
     bounds = find_bounds(coordinates, solution.z[best], solution.gradient[best])
-    convergence = judge_descent(solution, best, bounds, found)
+    convergence = judge_descent(solution, best, bounds, limits)
     if certificate is not None:
         certificate = dataclasses.replace(certificate, convergence=convergence)
     return Tuned(
@@ -221,14 +218,14 @@ def _tuned(
         converged=bool(solution.converged[best]),
         cost=float(solution.cost[best]),
         values=coordinates.values(solution.z[best]),
-        limits=found,
+        limits=limits,
         minima=distinct_optima(solution, coordinates),
         evaluations=int(solution.evaluations[best]),
         stabilising=int(solution.stabilising[best]),
         tail=solution.tail._replace(certificates=certified.certificates),
         history=tuple(watched.history),
         seconds=seconds + certified.seconds,
-        remarks=tuple(_remarks(tuned, problem, solution, best, found)),
+        remarks=tuple(_remarks(tuned, problem, solution, best, limits)),
     )
 
 
@@ -262,9 +259,9 @@ def _limit_results(
     for k, limit in enumerate(limits):
         values = as_array(solution.result.limited[k][index])
         excess = float(_excess(limit, values))
-        found = float(limit.bound) + limit.sign * excess
+        reached = float(limit.bound) + limit.sign * excess
         active = float(np.asarray(solution.multipliers.values[k])[index].sum()) > _ACTIVE
-        results.append(LimitResult(limit, found, excess <= 0, active))
+        results.append(LimitResult(limit, reached, excess <= 0, active))
     return tuple(results)
 
 
@@ -283,7 +280,7 @@ def judge_descent(
         gradient=float(np.max(np.abs(solution.gradient[index]))),
         evaluations=int(solution.evaluations[index]),
         bounds=bounds,
-        missed=[f"{x.limit} cannot be met: {x.found:.4g} at best" for x in limits if not x.met],
+        missed=[f"{x.limit} cannot be met: {x.reached:.4g} at best" for x in limits if not x.met],
     )
 
 
@@ -308,3 +305,63 @@ def _remarks(
         remark = lag_remark(controller, problem.linear.delay, problem.linear.axes.lag)
         if remark is not None:
             yield remark
+
+
+def require_kinds(
+    loop: object,
+    ensemble: object,
+    scenario: object,
+    objective: object,
+    limits: object,
+    method: object,
+) -> None:
+    """Raise ValueError for an argument of another kind, and for limits on no sum of squares."""
+    if not isinstance(loop, Loop):
+        raise ValueError(
+            f"loop is a {type(loop).__name__}: give jq.Loop(plant, controller, ...), whose "
+            "controller is the start"
+        )
+    if not isinstance(ensemble, Ensemble | Members):
+        raise ValueError(
+            f"ensemble is a {type(ensemble).__name__}: give jq.Ensemble(inertia=...), or "
+            "jq.ensembles.Members of it"
+        )
+    if not isinstance(scenario, Scenario):
+        raise ValueError(
+            f"scenario is a {type(scenario).__name__}: give jq.scenario(duration=..., ...)"
+        )
+    if not isinstance(objective, Objective):
+        name = type(objective).__name__
+        raise ValueError(f"objective is a {name}: give jq.Objective(terms={{'itae': 1.0}}, ...)")
+    if not isinstance(limits, Sequence) or not all(isinstance(x, Limit) for x in limits):
+        raise ValueError(f"limits are {limits}: give a list, as [jq.Limit('overshoot', at_most=5)]")
+    if not isinstance(method, LBFGS | GaussNewton):
+        raise ValueError(f"method is {method!r}: give jq.tuning.LBFGS() or jq.tuning.GaussNewton()")
+    if isinstance(method, GaussNewton):
+        require_squares(objective, limits)
+
+
+def require_fresh(fresh: object, drawn: Members, peers: Mapping[str, PyTree] | None) -> None:
+    """Raise ValueError for members that are tuned on, and for a peer of the design's name."""
+    if "tuned" in (peers or {}):
+        raise ValueError("a peer has the name 'tuned' of the design itself: rename it")
+    if isinstance(fresh, Members):
+        data = [np.asarray(jax.random.key_data(x.keys)) for x in (fresh, drawn)]
+        mine, theirs = ({tuple(row) for row in x} for x in data)
+        if mine & theirs:
+            raise ValueError(
+                f"{len(mine & theirs)} of the fresh members are those that are tuned on: a "
+                "certificate needs others, as ensemble.fresh(loop, 256, key) draws them"
+            )
+
+
+def require_steps(problem: Problem, wanted: frozenset[str]) -> None:
+    """Raise ValueError for an overshoot where there is no step."""
+    if "overshoot" not in wanted:
+        return
+    steps = find_steps(problem.flight.reference, problem.parts)
+    if not np.any(np.asarray(steps.known & (steps.target != steps.before))):
+        raise ValueError(
+            "overshoot is wanted, but the reference makes no step from event to event: give a "
+            "scenario with one, and its times as Objective(events=...)"
+        )

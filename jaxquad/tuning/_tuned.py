@@ -1,14 +1,25 @@
+"""The nominal loop and the worst members of a design, flown again sample by sample."""
+
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import equinox as eqx
+import jax
 import numpy as np
 from jaxtyping import Float, PyTree
+
+from jaxquad._core import as_array
+from jaxquad.control import schedule_for_flight
+from jaxquad.ensembles import Ensemble, Members
+from jaxquad.loops import Loop
+from jaxquad.simulation import Scenario, simulate, Simulation
 
 from ._certificate import Certificate
 from ._cost import Evaluation
 from ._objective import Limit
 from ._parameters import Coordinates
 from ._phases import Solution
+from ._quantities import QUANTITIES
 from ._tail import Tail
 from ._verdict import Bound, Verdict
 
@@ -47,27 +58,27 @@ def scatter_starts(
 
 def distinct_optima(solution: Solution, coordinates: Coordinates) -> tuple[Optimum, ...]:
     """The distinct points at which the starts ended, the best first."""
-    found: list[Optimum] = []
+    optima: list[Optimum] = []
     cost, z = solution.cost, solution.z
     for k in np.argsort(np.where(np.isnan(cost), np.inf, cost), kind="stable"):
         same = [
-            i for i, o in enumerate(found)
+            i for i, o in enumerate(optima)
             if abs(o.cost - cost[k]) < _COST and np.max(np.abs(o.z - z[k])) < _PLACE
         ]  # fmt: skip
         if same:
-            old = found[same[0]]
-            found[same[0]] = old._replace(starts=(*old.starts, int(k)))
+            old = optima[same[0]]
+            optima[same[0]] = old._replace(starts=(*old.starts, int(k)))
         else:
             values, done = coordinates.values(z[k]), bool(solution.converged[k])
-            found.append(Optimum(float(cost[k]), z[k], values, (int(k),), done))
-    return tuple(found)
+            optima.append(Optimum(float(cost[k]), z[k], values, (int(k),), done))
+    return tuple(optima)
 
 
 class LimitResult(NamedTuple):
     """How a limit ended on the members that were tuned on."""
 
     limit: Limit
-    found: float  # in the limit's unit
+    reached: float  # in the limit's unit
     met: bool
     active: bool  # the cost would be lower without it
 
@@ -123,7 +134,7 @@ class Tuned(eqx.Module):
     @property
     def holds(self) -> bool:
         """Whether all three verdicts hold: only then the design may be flown."""
-        return all(each.holds is True for each in self.verdicts)
+        return all(verdict.holds is True for verdict in self.verdicts)
 
     def __str__(self) -> str:
         first, *rest = ["NOT CERTIFIED: no fresh members were asked for", *self.verdicts]
@@ -155,13 +166,13 @@ def _describe_effort(tuned: Tuned) -> str:
 
 def _describe_limit(one: LimitResult) -> str:
     if not one.met:
-        beyond = abs(one.found - float(one.limit.bound))
+        beyond = abs(one.reached - float(one.limit.bound))
         return (
-            f"limit on {one.limit}: {one.found:.4g} (by {beyond:.3g}) on the members tuned on, "
+            f"limit on {one.limit}: {one.reached:.4g} (by {beyond:.3g}) on the members tuned on, "
             "MISSED: it cannot be met together with the others"
         )
     state = "active" if one.active else "not active"
-    return f"limit on {one.limit}: {one.found:.4g} on the members tuned on, {state}"
+    return f"limit on {one.limit}: {one.reached:.4g} on the members tuned on, {state}"
 
 
 def describe_tail(tail: Tail) -> str:
@@ -190,3 +201,100 @@ def _describe_optima(minima: tuple[Optimum, ...]) -> list[str]:
 def _list_starts(starts: tuple[int, ...]) -> str:
     shown = ", ".join(str(k) for k in starts[:8])
     return shown if len(starts) <= 8 else f"{shown}, ..."
+
+
+def worst_flights(
+    design: Tuned | Certificate,
+    loop: Loop,
+    ensemble: Ensemble | Members,
+    scenario: Scenario,
+    *,
+    quantities: Sequence[str] = ("itae", "sensitivity_peak"),
+) -> dict[str, Simulation]:
+    """Fly the nominal loop, and the members of a certificate that are worst in some quantity.
+
+    The members have the noise that was theirs.
+
+    **Arguments:**
+
+    - `design`: a tuned design with its certificate, or a certificate, whose design is
+        `loop.controller`.
+    - `loop`, `ensemble`, `scenario`: those that it was made with. Where it was made on given
+        members, these are the `ensemble`.
+    - `quantities`: names of `jaxquad.tuning`.
+
+    **Returns:** simulations by what they are: "nominal", "worst ITAE (member 12)".
+
+    **Raises:** ValueError for a design without certificate, for unknown quantities, and for parts
+    that the certificate was not made with.
+    """
+    certificate = design.certificate if isinstance(design, Tuned) else design
+    if certificate is None:
+        raise ValueError(
+            "the design has no certificate, so that its worst members are not known: tune with "
+            "fresh=256, or simulate some members with jq.simulate"
+        )
+    controller = design.controller if isinstance(design, Tuned) else loop.controller
+    worst = _worst(certificate, quantities)
+    flights = {"nominal": _nominal(certificate, loop, controller, scenario)}
+    if worst:
+        members = _members(certificate, loop, ensemble).take(list(worst))
+        flown = simulate(members.loop(controller), members.flight(scenario))
+        flights |= {text: _member(flown, k) for k, text in enumerate(worst.values())}
+    return flights
+
+
+def _worst(certificate: Certificate, quantities: Sequence[str]) -> dict[int, str]:
+    """The worst members, with the quantities in which they are."""
+    unknown = [name for name in quantities if name not in certificate.design.by_axis]
+    if unknown or not quantities:
+        computed = ", ".join(certificate.design.by_axis)
+        raise ValueError(f"no quantities {unknown} in the certificate: choose from {computed}")
+    worst: dict[int, list[str]] = {}
+    for name in quantities:
+        index = certificate.design.worst_member(name)
+        if index is not None:
+            worst.setdefault(index, []).append(QUANTITIES[name].title)
+    return {k: f"worst {' and '.join(names)} (member {k})" for k, names in worst.items()}
+
+
+def _members(certificate: Certificate, loop: Loop, ensemble: Ensemble | Members) -> Members:
+    if isinstance(ensemble, Members):
+        members = ensemble
+    else:
+        data = certificate.provenance["key"]
+        if data is None:
+            raise ValueError(
+                "the certificate was made on members that were given: give these as the ensemble"
+            )
+        key = jax.random.wrap_key_data(as_array(np.asarray(data, np.uint32)))
+        members = ensemble.fresh(loop, certificate.members, key)
+    shape = certificate.facts["assumed_inertia"].shape
+    if members.assumed_inertia.shape != shape:
+        raise ValueError(
+            f"the members have the shape {members.assumed_inertia.shape}, but the certificate was "
+            f"made on {shape}: give the loop and ensemble that it was made with"
+        )
+    return members
+
+
+def _member(flights: Simulation, k: int) -> Simulation:
+    """One of an ensemble of simulations. Compiles nothing."""
+    count = flights.diverged.shape
+    at = lambda x: as_array(np.asarray(x)[..., k])
+    pick = lambda x: at(x) if x.shape[-1:] == count and x.ndim > 2 else x
+    parts = {name: pick(part) for name, part in flights.scenario.parts.items()}
+    return Simulation(
+        flights.time, at(flights.angle), at(flights.measurement), at(flights.command),
+        at(flights.saturated), {}, at(flights.diverged), Scenario(**parts, dt=flights.scenario.dt),
+        flights.dt,
+    )  # fmt: skip
+
+
+def _nominal(
+    certificate: Certificate, loop: Loop, controller: PyTree, scenario: Scenario
+) -> Simulation:
+    inertia = certificate.nominal
+    if inertia is None:
+        inertia = np.exp(np.mean(np.log(certificate.facts["inertia"]), axis=1))
+    return simulate(loop.with_controller(schedule_for_flight(controller, inertia)), scenario)

@@ -57,15 +57,15 @@ def judge_stability(
     """
     every = with_further(design, further)
     failures = [*_instabilities(design, every, place), *_missed(distances, place)]
-    known = independent and not failures
+    proven = independent and not failures
     kept, others = _split(distances, covers)
     unstable = np.zeros(every.members, bool) if every.unstable is None else every.unstable
     if further is None:
-        text = _within(design, unstable | design.diverged, kept, "members are stable", known)
+        text = _within(design, unstable | design.diverged, kept, "members are stable", proven)
     else:
         linear, flown = _split(kept, lambda x: QUANTITIES[x.quantity].linear)
-        text = _within(every, unstable, linear, "members are stable", known)
-        text += f"; {_within(design, design.diverged, flown, 'flights are bounded', known)}"
+        text = _within(every, unstable, linear, "members are stable", proven)
+        text += f"; {_within(design, design.diverged, flown, 'flights are bounded', proven)}"
     if failures:
         remedy = "Lower the bandwidth, tune with a tighter limit, or narrow the ensemble"
         return Verdict("STABILITY", False, "; ".join([*failures, text]), remedy)
@@ -84,25 +84,25 @@ def _within(
     lost: Bool[np.ndarray, " members"],
     kept: Sequence[Distance],
     what: str,
-    known: bool,
+    proven: bool,
 ) -> str:
     """How many members are neither lost nor beyond a limit that each has to keep, as a sentence."""
     for distance in kept:
         lost = lost | beyond_limit(design, distance)
     titles = _titles(kept)
     within = f" and within the limit{'s' * (len(titles) > 1)} on {_join(titles)}" if titles else ""
-    return f"{_count(~lost)} {what}{within}{_share(lost, 'are not', known)}"
+    return f"{_count(~lost)} {what}{within}{_share(lost, 'are not', proven)}"
 
 
 def _instabilities(design: DesignResult, every: DesignResult, place: Place) -> list[str]:
-    found = []
+    failures = []
     if every.unstable is None:
-        found.append("the controller has no method linear(), so its stability is not known")
+        failures.append("the controller has no method linear(), so its stability is not known")
     elif every.unstable.any():
-        found.append(_where(every, every.unstable, "linearly unstable", place))
+        failures.append(_where(every, every.unstable, "linearly unstable", place))
     if design.diverged.any():
-        found.append(_where(design, design.diverged, "diverged in flight", place))
-    return found + ([design.observer_instability] if design.observer_instability else [])
+        failures.append(_where(design, design.diverged, "diverged in flight", place))
+    return failures + ([design.observer_instability] if design.observer_instability else [])
 
 
 def _where(
@@ -189,12 +189,12 @@ def _numbers(
 ) -> str:
     """Error, overshoot and time saturated, beside doing nothing and the start."""
     shown = QUANTITIES[error]
-    beside = [f"doing nothing {_mean(idle, error)}"]
-    beside += [f"the start {_mean(start, error)}"] if start is not None else []
+    references = [f"doing nothing {_mean(idle, error)}"]
+    references += [f"the start {_mean(start, error)}"] if start is not None else []
     worst = shown.text(float(np.max(design.of(error))))
     mean = shown.text(float(np.mean(design.of(error))))
     parts = [f"{shown.title} {mean} in the mean and {worst} at worst"]
-    parts[0] += f" ({', '.join(beside)})"
+    parts[0] += f" ({', '.join(references)})"
     for quantity in ("overshoot", "saturation_share"):
         values: Numbers = design.of(quantity)
         if not np.isnan(values).any():
@@ -259,8 +259,8 @@ def judge_convergence(
 
 def overall(verdicts: Sequence[Verdict], on: str) -> str:
     """The first line: whether the design may be flown, and which verdicts say no."""
-    asked = [v.name for v in verdicts if v.holds is not None]
+    holding = [v.name for v in verdicts if v.holds is not None]
     failed = [v.name for v in verdicts if v.holds is False]
     if not failed:
-        return f"CERTIFICATE HOLDS on {on}: {_join(asked)}"
+        return f"CERTIFICATE HOLDS on {on}: {_join(holding)}"
     return f"CERTIFICATE FAILS on {on}, not to be flown: {_join(failed)}"

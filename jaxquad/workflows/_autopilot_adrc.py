@@ -2,7 +2,7 @@
 
 import dataclasses
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +13,9 @@ from jaxquad.autopilot import (
     ADRCTargets,
     betaflight_adrc_loop,
     betaflight_loop,
+    doubted_throttle,
     FilterChain,
+    firmware_named,
     flies_adrc,
     FlightChannels,
     Flown,
@@ -35,10 +37,9 @@ from jaxquad.spectra import (
     LocalPolynomial,
 )
 
-from ._kinds import SettingsError
 from ._log import read_records
-from ._settings import IdentifySettings
-from ._tune_settings import AutopilotSettings
+from ._options import SettingsError
+from ._settings import AutopilotSettings, IdentifySettings
 
 
 _LINES = 40  # frequencies of a reproduced response
@@ -46,7 +47,8 @@ _LINES = 40  # frequencies of a reproduced response
 
 def flew_adrc(path: Path, proposal: Proposal) -> bool:
     """Whether a log is of a flight with Betaflight's proposed ADRC."""
-    return proposal.vehicle == "betaflight" and flies_adrc(settings_of(path, proposal).values)
+    firmware = firmware_named(proposal.vehicle)
+    return firmware.has_adrc and firmware.flies_adrc(settings_of(path, proposal).values)
 
 
 def tune_adrc(
@@ -56,7 +58,7 @@ def tune_adrc(
 
     Raises `SettingsError` for another firmware, and for a hover throttle other than the flown one.
     """
-    if proposed.vehicle != "betaflight":
+    if not firmware_named(proposed.vehicle).has_adrc:
         raise SettingsError(
             f"`law` is adrc, which is proposed for Betaflight alone (its pull request 15400), and "
             f"{path} is a log of {proposed.vehicle}: leave it out"
@@ -92,7 +94,10 @@ def _tuned(found: ADRCAutopilot, plant: GainOverThrottle, asked: IdentifySetting
             for level, x in enumerate(plant.throttle)
         }
         found = dataclasses.replace(found, reproductions=again)
-        if why := _doubt(again):
+        if (doubted := doubted_throttle(again)) is not None:
+            why = again[doubted].verdict
+            if again[doubted].kind == "not flown":
+                why = f"this log cannot tell: at {doubted:.2f} throttle {why}"
             return dataclasses.replace(found, verdict=why)
         made = propose_adrc(
             plant, found.flown, found.axis, hover=settings.hover, members=settings.members,
@@ -195,13 +200,3 @@ def _respond(path: Path, asked: IdentifySettings, plant: GainOverThrottle) -> Fr
         list(read_records(path, asked)), np.geomspace(*band, _LINES),
         estimator=JointInputOutput(local) if asked.reference else local,
     )  # fmt: skip
-
-
-def _doubt(again: Mapping[float, Reproduction]) -> str:
-    """Why the flown loop is not reproduced; empty where it is at one level, and off at none."""
-    for throttle, each in again.items():
-        if each.kind == "not flown":
-            return f"this log cannot tell: at {throttle:.2f} throttle {each.verdict}"
-    if all(each.kind == "unknown" for each in again.values()):
-        return next(each.verdict for each in again.values())
-    return ""

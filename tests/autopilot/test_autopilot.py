@@ -117,8 +117,8 @@ class PoorFit(SimpleNamespace):
 CANNOT_TELL = Message(f"this log cannot tell: «plant|{POOR}». Fly a chirp")
 
 
-@pytest.mark.parametrize("verdict", [CANNOT_TELL, AGAIN])
-def test_the_printed_verdict_repeats_nothing_of_what_is_above_it(verdict):
+@pytest.mark.parametrize(("verdict", "kind"), [(CANNOT_TELL, "flown"), (AGAIN, "not flown")])
+def test_the_printed_verdict_repeats_nothing_of_what_is_above_it(verdict, kind):
     """Of stand-ins: such fits and loops were printed of a measured flight, each sentence twice."""
     flown = SimpleNamespace(version=(4, 2), axis=0, firmware="betaflight", unmodelled=(), old={})
     vars(flown).update(filters_text="", angle=None, measured=None)
@@ -126,7 +126,8 @@ def test_the_printed_verdict_repeats_nothing_of_what_is_above_it(verdict):
     vars(found).update(
         kind="cannot tell", verdict=verdict, flown=flown, stages=(), throttle=None, filters=None,
         new={},
-        identification=SimpleNamespace(fit=PoorFit()), reproduction=SimpleNamespace(verdict=AGAIN),
+        identification=SimpleNamespace(fit=PoorFit()),
+        reproduction=SimpleNamespace(verdict=AGAIN, kind=kind),
     )  # fmt: skip
     text = str(found)
     assert text.count(AGAIN) == text.count(POOR) == 1

@@ -40,6 +40,7 @@ def test_the_file_is_read_without_a_remark(log, columns):
     assert read_settings(log).version == (2026, 6, 0)
 
 
+@pytest.mark.slow
 def test_the_same_seed_writes_the_same_file_and_another_one_does_not(log, tmp_path):
     assert write_chirp_log(tmp_path / "again.bfl").read_bytes() == log.read_bytes()
     assert write_chirp_log(tmp_path / "other.bfl", seed=1).read_bytes() != log.read_bytes()

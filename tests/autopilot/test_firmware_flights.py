@@ -55,6 +55,7 @@ def test_the_law_replayed_leaves_nothing_of_the_logged_terms(data, folder, name,
         assert check.terms["output"].share < 1e-4 and check.late == pytest.approx(1 / 400)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("changed", "wrong"),
     [({"relax": None}, "I"), ({"p": [50.0, 47.0, 45.0]}, "P"), ({"d": [34.0, 34.0, 0.0]}, "D")],
@@ -65,6 +66,7 @@ def test_another_law_is_named_by_its_term(data, changed, wrong):
     assert check.text.startswith(f"these are not the gains that flew: {wrong} in the log")
 
 
+@pytest.mark.slow
 def test_a_set_point_that_acts_a_loop_later_is_found_and_said(data):
     path = data / ARDUPILOT / "rate_chirp_pitch.BIN"
     settings = AutopilotSettings(axis="pitch")
@@ -182,6 +184,7 @@ def test_all_axes_are_of_one_flight_of_a_file_with_several(data, tmp_path, capsy
         assert each["identified_with"]["output"].startswith("log2.")
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("without_type_checks")  # of the stand-ins
 def test_an_axis_that_fails_costs_no_other(data, monkeypatch):
     def tune(axis, filters):

@@ -113,6 +113,7 @@ def test_betaflights_page_has_a_step_and_the_margins_of_its_law(log, tmp_path, n
     assert "The law of the log's parameters" in page.text("section")
 
 
+@pytest.mark.slow
 def test_a_loop_of_ones_own_is_tuned_behind_the_filters(tmp_path):
     path = write_sweep(tmp_path / "sweep.csv")
     asked = IdentifySettings(input="M=right-left", output="q", units={"q": "rad/s"}, band=(0.5, 6))

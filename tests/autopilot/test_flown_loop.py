@@ -59,6 +59,7 @@ def closed(log):
     return jq.frequency_response(chosen, 2 * np.pi * np.geomspace(1.0, 50.0, 30))
 
 
+@pytest.mark.slow
 def test_the_loop_that_flew_is_reproduced_within_the_errors(log, fit):
     found = jq.autopilot.reproduce_flight(fit, LAW, log, unit="deg/s")
     assert found.kind == "flown" and "is the one that flew" in str(found)

@@ -17,9 +17,8 @@ import optimistix as optx
 from tuning_case import ensemble, EVENTS, flight, loop, objective, STARTS
 
 from jaxquad.tuning import LBFGS
-from jaxquad.tuning._cost import evaluate_cost, stack_copies, Subproblem
+from jaxquad.tuning._cost import evaluate_cost, initial_multipliers, stack_copies, Subproblem
 from jaxquad.tuning._lbfgs import minimise
-from jaxquad.tuning._multipliers import initial_multipliers
 from jaxquad.tuning._parameters import select_coordinates
 from jaxquad.tuning._problem import make_problem, TimeSpan
 

@@ -28,6 +28,7 @@ def found():
     return list(messages())
 
 
+@pytest.mark.slow
 def test_the_messages_are_found(found):
     texts = [text for _, text in found]
     assert len(texts) > 800

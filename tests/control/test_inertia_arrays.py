@@ -53,6 +53,7 @@ ALL = [windowed(window=1.0), recursive(), lock_in()]
 SOME = [pytest.param(ALL[0], marks=pytest.mark.slow), *ALL[1:]]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("estimator", SOME, ids=lambda e: type(e).__name__)
 def test_single_precision_agrees(estimator):
     single = RigRecord(*(x.astype(np.float32) for x in gusty()))

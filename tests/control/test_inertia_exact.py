@@ -13,6 +13,7 @@ from scipy.signal import lfilter
 from jaxquad.control import paper_inertia, ProbeTones
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("order", [1, 2, 3])
 def test_exact_data_give_the_exact_inertia_for_any_filter(order):
     """Both sides of the sampled equation pass the same filter: nothing is approximated."""

@@ -49,6 +49,7 @@ def test_observers_of_several_axes_are_compared_each_with_its_own_wc():
     assert "decays at 0.7" in halved([4.0, 12.5], wo, 0.5).observer_slowness()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("order", [1, 2])
 def test_the_barrier_ends_where_an_observer_is_as_slow_as_the_feedback(order):
     rng = np.random.default_rng(order)

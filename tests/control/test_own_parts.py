@@ -186,6 +186,7 @@ def test_a_controller_flies_as_its_linear_form_says():
     assert not bool(jq.analyse(unstable).stable)
 
 
+@pytest.mark.slow
 def test_an_observer_of_the_same_matrices_flies_and_is_linearised_as_the_librarys():
     own, same = (
         LADRC(10.0, 30.0, KT / J, observer=x) for x in (TextbookObserver(), CurrentObserver())

@@ -99,6 +99,7 @@ def test_a_straight_line_gets_its_two_ends_in_equal_parts():
     np.testing.assert_allclose(found.power[strong] / found.power.sum(), 0.5, atol=0.05)
 
 
+@pytest.mark.slow
 def test_the_equivalence_theorem_certifies_the_design(sharp):
     assert sharp.dispersion.max() == pytest.approx(3.0, rel=2e-3)
     used = np.isin(sharp.offered, sharp.omega)
@@ -107,6 +108,7 @@ def test_the_equivalence_theorem_certifies_the_design(sharp):
     assert 0.99 < sharp.efficiency <= 1.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("models", "limits", "criterion", "lines"),
     [
@@ -150,6 +152,7 @@ def test_the_certificate_bounds_bad_powers_too():
         assert 0 < value(best) - value(other) < gap
 
 
+@pytest.mark.slow
 def test_peaks_reach_but_never_pass_the_limits():
     found = design_of(PLANT, rate=6.0, output_amplitude=4.0, lines=8)
     shares = [peak / limit for peak, limit in found.limits.values()]
@@ -163,6 +166,7 @@ def test_peaks_reach_but_never_pass_the_limits():
     assert np.abs(output).max() == pytest.approx(found.limits["output"][0], rel=0.01)
 
 
+@pytest.mark.slow
 def test_a_rate_limit_moves_power_to_lower_lines_and_costs_information():
     free, slow = (
         design_of(PLANT, lines=8, rate=rate, output_amplitude=100.0) for rate in (100.0, 4.0)
@@ -179,6 +183,7 @@ def test_lines_sets_how_many_share_the_power():
     assert f"{found.omega.size} of 31 lines" in str(found) and "(lines=10)" in str(found)
 
 
+@pytest.mark.slow
 def test_a_design_for_one_parameter_is_sharpest_there():
     region, delay = (
         design_of(PLANT, lines=8, criterion=each) for each in (DOptimal(), AOptimal(("delay",)))

@@ -35,6 +35,7 @@ def test_the_readme_and_the_site_lead_to_the_page():
     assert "validation.md" in (ROOT / "mkdocs.yml").read_text()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["short-20", "trends", "jitter"])
 def test_the_efficient_estimate_scatters_as_the_bound_says(name):
     """Without the library: the records' noise, through the weights of the bound alone."""

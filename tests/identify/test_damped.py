@@ -75,6 +75,7 @@ def holds(fit, name, value):
     return low <= value <= high
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("damping", [0.0, 0.1, 0.5, 2.1, 5.0])
 def test_the_intervals_hold_with_and_without_damping(damping):
     """95 % of 20, less two standard deviations."""
@@ -89,6 +90,7 @@ def test_the_intervals_hold_with_and_without_damping(damping):
         assert sum(holds(fit, "damping", damping) for fit in fits) >= 17
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("damping", [0.0, 2.1])
 def test_a_flown_chirp_shows_a_damping_where_there_is_one(damping):
     frf = jq.frequency_response(closed_loop(damping, seed=0))
@@ -153,6 +155,7 @@ def test_other_models_are_refused_and_nothing_fitted_stays_so():
     assert not empty.verdict.fitted and fit_damped(empty) is empty
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("log", ["mixer_chirp_roll", "rate_chirp_pitch"])
 def test_a_firmware_s_gain_is_right_beside_a_small_damping(data, log, without_type_checks):
     """437.5 rad/s^2 and 30 ms, and a damping of 0.12 and 0.11 1/s."""

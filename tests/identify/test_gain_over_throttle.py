@@ -55,6 +55,7 @@ def found():
     return identify(flight())
 
 
+@pytest.mark.slow
 def test_stretches_are_where_each_level_was_flown(found):
     assert len(found.stretches) == found.throttle.size
     for spans, seconds in zip(found.stretches, found.seconds, strict=True):

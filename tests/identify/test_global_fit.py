@@ -44,6 +44,7 @@ def test_one_start_a_turn_of_phase_away_stays_in_its_minimum():
     assert fit.minima == ()
 
 
+@pytest.mark.slow
 def test_several_starts_find_the_truth(many):
     assert np.all(np.abs(many.values - [3.0, 0.1, 0.05]) < 4 * many.standard_errors)
     assert many.chi_squared < 2

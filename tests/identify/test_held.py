@@ -42,6 +42,7 @@ def response(said):
     return jq.frequency_response(said, OMEGA)
 
 
+@pytest.mark.slow
 def test_a_held_input_is_fitted_exactly_with_the_plants_own_delay(response):
     fit = jq.fit(START, response, free=FREE)
     np.testing.assert_allclose(fit.values, [400.0, 1.2, 400.0, 0.031], rtol=1e-6)
@@ -86,6 +87,7 @@ TWO = jq.StateSpace(F=[[-1.0]], G=[[2.0, 3.0]], H0=[[1.0]])
 NO_SECOND = jq.StateSpace(F=[[-1.0]], G=[[2.0, 0.0]], H0=[[1.0]])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("band", [None, {("y0", "u1"): None}])
 def test_a_response_that_the_model_has_none_of_is_left_out_and_said(band):
     """`G[0][1]` is 0 and fixed: the second input has no response in the model, but in the data."""

@@ -10,7 +10,8 @@ import pytest
 from synthetic import response_of
 
 import jaxquad as jq
-from jaxquad.identify.frequency_domain._bounds import _polished, one_sided, one_sided_limits
+from jaxquad.identify.frequency_domain._bounds import polish
+from jaxquad.identify.uncertainty._zero_bounds import one_sided, one_sided_limits
 
 
 ML = jq.identify.MaximumLikelihood()
@@ -157,6 +158,7 @@ def test_along_the_null_direction_the_posterior_is_the_prior_and_is_called_so():
     assert any("determined by the prior alone" in remark for remark in fit.remarks)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("band", [(3.0, 12.0), (1.0, 6.0)], ids=["inside", "delay runs to zero"])
 def test_lag_and_delay_of_a_narrow_band_are_determined_as_a_sum(band):
     truth = jq.LaggedIntegrator(280.0, 0.016, 0.011)
@@ -194,6 +196,7 @@ def test_no_wider_band_is_advised_where_none_would_help(alone):
     )
 
 
+@pytest.mark.slow
 def test_a_common_factor_of_numerator_and_denominator_is_not_determined():
     truth = jq.TransferFunction([8.0], [1.0, 3.0, 9.0])
     fit = jq.fit(truth, response_of(truth, seed=0), cost=ML, free=("numerator", "denominator"))
@@ -203,6 +206,7 @@ def test_a_common_factor_of_numerator_and_denominator_is_not_determined():
     assert len(fit.combinations) == 3
 
 
+@pytest.mark.slow
 def test_a_parameter_without_effect_is_named():
     frf = response_of(RIG, seed=0)
     fit = jq.fit(start(), frf, free=("K_t", "lag", jq.identify.Real("K_af", scale=1e-9)), cost=ML)
@@ -281,6 +285,7 @@ def test_where_there_is_no_minimum_no_number_is_given():
     assert "the fit found no minimum: where the solver stopped" in str(fit)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("steps", [1, 2, 3, 4, 5])
 def test_a_fit_that_still_moves_by_a_quarter_of_an_error_has_no_numbers(steps):
     frf = response_of(jq.LaggedIntegrator(280.0, 0.016, 0.011), seed=0)
@@ -334,6 +339,7 @@ def test_a_combination_whose_error_is_a_third_of_its_size_is_not_determined(nois
         assert found.standard_error <= 0.3 * abs(found.value)
 
 
+@pytest.mark.slow
 def test_a_value_that_the_record_does_not_determine_is_not_given_by_its_name():
     truth = jq.models.AttitudeAxis(L=0.2, K_t=0.1, J_x=0.05, lag=0.05)
     fit = jq.fit(truth, response_of(truth, seed=0), free=("K_t", "J_x", "lag"), cost=ML)
@@ -386,7 +392,7 @@ def test_a_limit_of_another_level_is_where_the_cost_has_risen_by_as_much(seed, m
     start = jq.LaggedIntegrator(70.0, 0.03, 0.02)
     fit = jq.fit(start, frf, free=("gain", "lag"), cost=ML)
     for level, score in ((0.68, 0.4677), (0.9, 1.2816), (0.999, 3.0902)):
-        monkeypatch.setattr("jaxquad.identify.frequency_domain._bounds._RISE", score**2)
+        monkeypatch.setattr("jaxquad.identify.uncertainty._zero_bounds._RISE", score**2)
         (bound,) = jq.fit(start, frf, free=("gain", "lag"), cost=ML).verdict.bounds
         for model_error, limit in ((True, bound.limit), (False, bound.noise_limit)):
             low, high = fit.interval("lag", level=level, model_error=model_error)
@@ -397,7 +403,7 @@ def test_a_limit_that_rounding_hides_is_infinite_and_a_model_without_numbers_no_
     """A lag at zero beside a free delay may have a variance of -10, or reach 1e300 s."""
     calls = []
     watched = lambda *given: calls.append(given) or one_sided_limits(*given)
-    monkeypatch.setattr("jaxquad.identify.uncertainty._seen.one_sided_limits", watched)
+    monkeypatch.setattr("jaxquad.identify.uncertainty._zero_bounds.one_sided_limits", watched)
     frf = response_of(jq.LaggedIntegrator(80.0, 1e-9, 0.02), error=0.05, seed=0)
     jq.fit(jq.LaggedIntegrator(70.0, 0.03, 0.02), frf, free=("gain", "lag"), cost=ML)
     [(problem, solution, k, inflations)] = calls
@@ -405,4 +411,4 @@ def test_a_limit_that_rounding_hides_is_infinite_and_a_model_without_numbers_no_
     assert limits[:2] == [np.inf, np.inf] and 0 < limits[2] < 0.01
     for far in (700.0, 800.0, np.inf):
         z = np.where(np.arange(2) == k, far, solution.z)
-        assert not np.isfinite(_polished(problem, z, [k], solution)[1].cost)
+        assert not np.isfinite(polish(problem, z, [k], solution)[1].cost)

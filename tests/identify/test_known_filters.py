@@ -3,6 +3,7 @@
 import dataclasses
 
 import numpy as np
+import pytest
 from scipy.signal import lfilter
 from synthetic import response_of
 
@@ -53,6 +54,7 @@ def test_a_fit_is_of_the_plant_before_the_filters():
     np.testing.assert_allclose(fitted.values, [60.0, 0.03, 0.004], rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_inputs_pass_the_filters_as_the_firmware_computes_them():
     time = np.arange(SAMPLES) / RATE
     u = np.sin(2 * np.pi * 3 * time) * (time > 1) + 2.0
@@ -66,6 +68,7 @@ def test_inputs_pass_the_filters_as_the_firmware_computes_them():
     assert behind_filters(record, []) is record
 
 
+@pytest.mark.slow
 def test_a_model_without_the_filters_verifies_on_what_is_behind_them():
     plant = jq.LaggedIntegrator(30.0, 0.03, 0.0).transfer_function()
     time = np.arange(SAMPLES) / RATE

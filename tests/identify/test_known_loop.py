@@ -58,6 +58,7 @@ def flown(seed):
     return jq.Record(TIME, u, y, hold=DT), slow
 
 
+@pytest.mark.slow
 def test_the_series_of_a_loop_is_its_sensitivity():
     record, slow = flown(0)
     _, whole, closed = loop_filters()

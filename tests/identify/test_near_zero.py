@@ -19,6 +19,7 @@ def fit_flown(delay, seed, error=0.03):
     return jq.fit(jq.LaggedIntegrator(30.0, 0.02, 0.002), frf)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("delay", [0.0, 50e-6, 125e-6, 300e-6])
 def test_a_small_delay_is_no_ignorance(delay):
     """At 1 Hz to 38 Hz 0.1 ms are 1.4 deg at most; 95 % of 40 intervals hold the truth."""
@@ -29,6 +30,7 @@ def test_a_small_delay_is_no_ignorance(delay):
         assert sum(inside) >= 35
 
 
+@pytest.mark.slow
 def test_a_value_of_less_than_two_standard_errors_ends_at_its_one_sided_limit():
     fits = [fit_flown(125e-6, seed, error=0.045) for seed in range(40)]
     vague = [fit for fit in fits if fit.standard_errors[2] > 0.52 * fit.values[2] > 0]
@@ -52,6 +54,7 @@ def test_models_drawn_around_it_keep_its_sign_and_its_order():
         assert 0.5 * limit < np.quantile(drawn, 0.95) < 1.5 * limit
 
 
+@pytest.mark.slow
 def test_a_firmware_s_chirp_with_a_delay_near_zero_is_identifiable(data):
     log = data / "betaflight_firmware" / "A_chirp_plain.BFL"
     proposal = jq.workflows.autopilot(log, jq.workflows.AutopilotSettings(axis="roll"))
@@ -83,6 +86,7 @@ def weak():
     return [jq.fit(start, swept(seed)) for seed in range(30)]
 
 
+@pytest.mark.slow
 def test_a_lag_at_zero_is_in_the_interval_of_the_delay(weak):
     """Either both are marked, or both intervals hold the truth, in 93 % of the records at least."""
     wrong = 0
@@ -114,6 +118,7 @@ def test_draws_of_a_lag_near_zero_spread_as_the_sum_says(weak):
     assert np.std(drawn.lag + drawn.delay) == pytest.approx(total.standard_error, rel=0.1)
 
 
+@pytest.mark.slow
 def test_a_small_lead_has_its_limit_for_the_lag_and_its_sum():
     """100 (0.004 s + 1) e^(-0.008 s) / s: no lag at all, and 4 ms late."""
     model = jq.TransferFunction([0.4, 100.0], [1.0, 0.0], delay=0.008)

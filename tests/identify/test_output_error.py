@@ -68,6 +68,7 @@ def test_from_the_wrong_sign_nothing_is_called_determined(start):
     assert len(table) == 3 and all("not determined" in line for line in table)
 
 
+@pytest.mark.slow
 def test_a_refinement_that_stops_early_says_so_and_keeps_its_numbers_apart():
     fit = refined(CLEAN + 0.05 * noise(1))
     short = refine(START, jq.Record(TIME, U, CLEAN + 0.05 * noise(1)), free=FREE, max_steps=1)

@@ -54,6 +54,7 @@ def response_of_pair(seed: int) -> jq.spectra.FrequencyResponse:
     )
 
 
+@pytest.mark.slow
 def test_outputs_that_share_noise_sharpen_each_other_and_claim_what_they_scatter():
     frfs = [response_of_pair(seed) for seed in range(100)]
     fits = [jq.fit(START, frf) for frf in frfs]
@@ -68,6 +69,7 @@ def test_outputs_that_share_noise_sharpen_each_other_and_claim_what_they_scatter
     assert np.all(claimed < 0.7 * alone.noise_standard_errors)
 
 
+@pytest.mark.slow
 def test_pairs_that_share_noise_count_together_in_a_batch_as_in_one_fit():
     frfs = [response_of_pair(seed) for seed in range(3)]
     batch = jq.identify.fit_batch(START, frfs)

@@ -129,6 +129,7 @@ def test_a_fit_is_refined_with_its_own_ties():
     np.testing.assert_array_less(np.abs(again.values - fit.values), 0.1 * fit.standard_errors)
 
 
+@pytest.mark.slow
 def test_noise_that_cannot_be_modelled_is_refused():
     with pytest.raises(ValueError, match="and a noise model exclude each other"):
         refine(TRUTH, record(8), noise="auto", band=(1.0, 10.0))

@@ -44,6 +44,7 @@ def reduced():
     return jq.identify.reduce_structure(START, measured(0.0, 0.0), free=FREE, cost=ML)
 
 
+@pytest.mark.slow
 def test_what_is_not_there_is_left_out(reduced):
     assert set(reduced.dropped) == {"spring", "lag"}
     assert reduced.fit.names == ("gain", "damping")

@@ -53,6 +53,7 @@ def decay(z, data):
 DATA = 2 * np.exp(-0.7 * np.linspace(0.0, 2.0, 8)) + 0.05 * np.cos(9 * np.arange(8))
 
 
+@pytest.mark.slow
 def test_a_fit_to_one_record_is_one_program_and_it_mixes_what_shares_noise():
     omega, compiled = OMEGA[::2], []
 

@@ -125,6 +125,7 @@ def test_a_stop_at_a_wall_says_so_and_is_not_converged():
     )
 
 
+@pytest.mark.slow
 def test_no_finite_start_at_all_is_refused():
     problem = problem_of(Walled(jnp.asarray(1.0)), constant_response(), (jq.identify.Real("b"),))
     with pytest.raises(ValueError, match="not finite at any of 3 starts"):

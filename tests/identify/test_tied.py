@@ -31,6 +31,7 @@ FREE = ("gains[0]", "lags[0]", "lags[1]")
 ML = jq.identify.MaximumLikelihood()
 
 
+@pytest.mark.slow
 def test_a_tied_number_follows_the_free_one():
     fit = jq.fit(START, response_of(TRUTH), free=FREE, tied=TIED, cost=ML)
     np.testing.assert_allclose(fit.values, [3.0, 0.2, 0.05], rtol=1e-7)
@@ -45,6 +46,7 @@ def test_a_tie_sharpens_what_both_outputs_determine():
     assert tied.standard_errors[0] < 0.8 * apart.standard_errors[0]
 
 
+@pytest.mark.slow
 def test_a_derived_quantity_moves_with_what_is_tied():
     fit = jq.fit(START, response_of(TRUTH, seed=0), free=FREE, tied=TIED, cost=ML)
     apart = fit.derived(lambda m: m.gains[0] - m.gains[1])
@@ -69,6 +71,7 @@ def test_what_is_tied_is_shown_with_its_value_and_error():
     assert stored["interval_95"] == pytest.approx(tied.interval())
 
 
+@pytest.mark.slow
 def test_what_follows_an_undetermined_parameter_is_not_determined():
     """Of L K_t / J_x the record shows the product alone."""
     truth = jq.models.AttitudeAxis(L=0.2, K_t=0.1, J_x=0.05, lag=0.05)
@@ -79,6 +82,7 @@ def test_what_follows_an_undetermined_parameter_is_not_determined():
     assert "not determined" in row and row.split()[-1] == f"{fit.tied[0].value:.5g}"
 
 
+@pytest.mark.slow
 def test_the_gain_of_a_transfer_function_moves_with_what_is_tied():
     servo = jq.TransferFunction([900.0], [1.0, 36.0, 900.0])
     tied = {"numerator[0]": lambda servo: servo.denominator[2]}
@@ -106,6 +110,7 @@ def test_an_impossible_tie_is_refused(tied, message):
         jq.fit(START, response_of(TRUTH), free=FREE, tied=tied)
 
 
+@pytest.mark.slow
 def test_a_tie_may_follow_an_earlier_one_and_no_later_one():
     first, second = {"lags[1]": lambda m: m.gains[0] / 60}, {"lags[0]": lambda m: 4 * m.lags[1]}
     fit = jq.fit(START, response_of(TRUTH), tied=TIED | first | second, cost=ML)

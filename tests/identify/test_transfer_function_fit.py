@@ -91,6 +91,7 @@ PLANTS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", PLANTS)
 def test_a_plant_is_recovered_from_its_response_alone(name):
     truth = PLANTS[name]
@@ -171,6 +172,7 @@ def test_automatic_starts_reach_the_lowest_minimum_of_random_plants():
     assert np.mean(reached) >= 0.95
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [None, 0])
 def test_the_minimum_is_that_of_scipy_and_the_plant_is_recovered(seed):
     frf = response_of(PLANT, seed=seed, omega=OMEGA)
@@ -220,6 +222,7 @@ def test_a_pole_and_a_zero_that_cancel_are_not_identifiable():
         factors(fit)
 
 
+@pytest.mark.slow
 def test_a_pole_that_leaves_the_band_takes_the_gain_along():
     slow = response_of(model_of([], pair_of(0.4, 5.0), 20.0, 0.02), seed=2, omega=OMEGA)
     fit = fit_transfer_function(slow, zeros=0, poles=3)
@@ -231,6 +234,7 @@ def test_a_pole_that_leaves_the_band_takes_the_gain_along():
     assert abs(pair.values[1] - 5.0) < 3 * error < 0.5
 
 
+@pytest.mark.slow
 def test_repeated_roots_are_flagged_and_have_no_error():
     triple = model_of([], [-6.0, -6.0, -6.0], 200.0, 0.01)
     found = factors(fit_transfer_function(response_of(triple, seed=1, omega=OMEGA), 0, 3))
@@ -294,6 +298,7 @@ def test_orders_that_mean_nothing_are_refused(options, message):
         guess_transfer_function(frf, **options)
 
 
+@pytest.mark.slow
 def test_one_pair_of_several_is_picked_with_its_own_errors():
     axes = response_of(PLANT, error=0.03, omega=OMEGA)
     two = two_outputs(axes)

@@ -27,6 +27,7 @@ def flight(seed=0, noise=0.0):
     return u, y + noise * rng.standard_normal(TIME.size)
 
 
+@pytest.mark.slow
 def test_a_true_model_fits_entirely():
     u, y = flight()
     check = jq.verify(MODEL, jq.Record(TIME, u, y), hold="zero")
@@ -66,6 +67,7 @@ def test_a_wrong_gain_shows():
     assert 70 < check.fit_percent < 90 and check.tic > 0.05
 
 
+@pytest.mark.slow
 def test_a_band_leaves_drift_out():
     u, y = flight()
     drift = 8 * np.sin(0.4 * TIME)
@@ -183,6 +185,7 @@ def test_a_drift_does_not_pass_for_a_fast_transient_at_the_start():
     assert np.ptp(wander) < 0.1 * np.std(check.measured - check.simulated)
 
 
+@pytest.mark.slow
 def test_a_fit_is_verified_in_the_band_that_it_used():
     u, y = flight(noise=0.02)
     fit = jq.fit(MODEL, jq.frequency_response(jq.Record(TIME, u, y, hold=DT)), band=(1.0, 30.0))

@@ -36,6 +36,7 @@ def fitted(seed, start, **options):
     return jq.fit(start, frf, **options)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(5))
 def test_intervals_beside_a_zero_of_the_wrong_sign_hold_the_truth(seed):
     fit = fitted(seed, Zero(6.0, 0.5, 0.7, 5.0))
@@ -56,6 +57,7 @@ def test_the_advice_finds_the_truth():
     assert low < TRUTH.zero < high and not fit.remarks
 
 
+@pytest.mark.slow
 def test_a_lag_that_is_zero_is_no_wrong_sign():
     truth, remarks = jq.LaggedIntegrator(80.0, 1e-9, 0.03), []
     for seed in range(10):

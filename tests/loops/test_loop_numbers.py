@@ -22,6 +22,7 @@ def at_gains():
     return analysed(*({"gain": gain} for gain in gains), *half)
 
 
+@pytest.mark.slow
 def test_stability_and_margins_of_10_30_are_those_of_the_record(at_gains):
     np.testing.assert_array_equal(at_gains.stable[:7], [1, 1, 1, 0, 1, 1, 0])
     np.testing.assert_allclose(at_gains.sensitivity_peak[:3], [1.763, 2.078, 7.08], rtol=1e-3)

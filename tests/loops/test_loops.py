@@ -79,6 +79,7 @@ def nonzero(poles):
     return np.sort_complex(poles[np.abs(poles) > 1e-4])
 
 
+@pytest.mark.slow
 def test_the_closed_loop_poles_are_those_of_python_control(loops):
     found, (axis, mind, _) = loops.member(2), system(2)
     closed = feedback(axis[0, 0] * mind[0, 1], 1, sign=1)

@@ -103,6 +103,7 @@ def test_rms_under_a_shaped_spectrum_is_quadrature():
     assert listed.rms == pytest.approx(expected, rel=1e-5)  # a power law between its points
 
 
+@pytest.mark.slow
 def test_measured_rms_is_free_of_what_noise_adds():
     truth = float(rms_response(response_of(MEASURED, error=0.0), 1.0).rms)
     draws = [rms_response(response_of(MEASURED, error=0.25, seed=k), 1.0).rms for k in range(200)]

@@ -9,7 +9,7 @@ from ratios import delayed_integrator, Ratio, ratio
 
 import jaxquad as jq
 from jaxquad.loops import attitude_bandwidth, disturbance_rejection, margins, rms_response
-from jaxquad.loops.qualities._crossings import crossed, first
+from jaxquad.loops.qualities._curve import crossed, first
 
 
 pytestmark = pytest.mark.usefixtures("compiled_quickly")
@@ -89,6 +89,7 @@ def test_wrong_number_of_unstable_poles_is_noticed():
     assert "1 more unstable poles" in str(found)
 
 
+@pytest.mark.slow
 def test_the_gain_margin_of_an_unstable_plant_is_at_frequency_0():
     """10 / (s - 1) with unit feedback is stable for a gain above 0.1."""
     plant = lambda k: jq.TransferFunction(jnp.array([k]), [1.0, -1.0])
@@ -101,6 +102,7 @@ def test_the_gain_margin_of_an_unstable_plant_is_at_frequency_0():
     assert slope == pytest.approx(-0.01, rel=1e-12)
 
 
+@pytest.mark.slow
 def test_a_model_knows_its_unstable_poles():
     plant = jq.models.AttitudeAxis(0.2, 0.12, 0.05, lag=0.05, K_af=-0.01)
     assert margins(plant).unstable_poles == 1

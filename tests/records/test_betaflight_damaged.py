@@ -133,6 +133,7 @@ def test_a_header_alone_and_frames_without_a_key_hold_nothing():
             decode("betaflight", HEADER + body)
 
 
+@pytest.mark.slow
 @FUZZ
 @given(st.lists(st.tuples(st.integers(0, 8 * len(SMALL) - 1)), min_size=1, max_size=30))
 def test_flipped_bits_raise_nothing_but_read_errors(flips):
@@ -142,6 +143,7 @@ def test_flipped_bits_raise_nothing_but_read_errors(flips):
     only_read_errors(bytes(data))
 
 
+@pytest.mark.slow
 @FUZZ
 @given(st.binary(max_size=400), st.integers(0, len(SMALL)), st.integers(0, 400))
 def test_bytes_put_in_the_place_of_others_raise_nothing_but_read_errors(new, at, gone):
@@ -171,6 +173,7 @@ def test_stray_bytes_behind_another_frame_lose_no_more_than_up_to_the_next_key_f
     assert count >= len(ROWS) - (96 - after) - 4
 
 
+@pytest.mark.slow
 def test_a_stray_byte_in_a_real_log_costs_one_interval_at_most(data):
     """At a hundred places, behind frames of both kinds."""
     content = (data / "betaflight_firmware/A_hover.BFL").read_bytes()[:400_000]

@@ -55,6 +55,7 @@ def seconds_of(action):
     return time.process_time() - begin
 
 
+@pytest.mark.slow
 def test_npz_takes_a_time_in_proportion_to_its_members(tmp_path):
     taken = []
     for count in (250, 2000):
@@ -65,6 +66,7 @@ def test_npz_takes_a_time_in_proportion_to_its_members(tmp_path):
     assert taken[1] < 16 * taken[0] + 0.1  # 8 times as many
 
 
+@pytest.mark.slow
 def test_hdf5_of_many_small_sets_is_read(tmp_path):
     h5py = pytest.importorskip("h5py")
     with h5py.File(tmp_path / "log.h5", "w") as file:

@@ -36,6 +36,7 @@ def outcome(path: Path) -> str:
     return "read"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_damage_of_any_kind_raises_read_error_or_nothing(tmp_path, kind):
     pytest.importorskip(PACKAGES.get(kind, "numpy"))

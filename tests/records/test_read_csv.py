@@ -1,4 +1,4 @@
-"""A table of text read by pyarrow is the table, or the complaint, of the reader without it."""
+"""A table of text read by NumPy is the table, or the complaint, of reading it row by row."""
 
 import numpy as np
 import pytest
@@ -8,7 +8,6 @@ from jaxquad.records import ReadError
 from jaxquad.records.formats import READERS
 
 
-pytest.importorskip("pyarrow")
 load = READERS["csv"].load
 MODULE = "jaxquad.records.formats._csv"
 ODD = (
@@ -22,8 +21,7 @@ ODD = (
 
 @pytest.fixture
 def small_blocks(monkeypatch):
-    """As a long file is read: in several blocks, each by pyarrow where it can be."""
-    monkeypatch.setattr(f"{MODULE}._WORTHWHILE", 0)
+    """As a long file is read: in several blocks, each by NumPy where it can be."""
     monkeypatch.setattr(f"{MODULE}._BLOCK", 200)
 
 
@@ -39,13 +37,13 @@ def outcome(path):
 def agree(path, monkeypatch):
     fast = outcome(path)
     with monkeypatch.context() as patch:
-        patch.setattr(f"{MODULE}.parsed_fast", lambda *_: 0)
+        patch.setattr(f"{MODULE}._parse", lambda *_: None)
         return fast == outcome(path)
 
 
 @pytest.mark.parametrize("row", ODD)
 @pytest.mark.parametrize("separator", [",", ";", "\t"])
-def test_odd_rows_are_what_they_are_without_it(tmp_path, monkeypatch, small_blocks, row, separator):
+def test_odd_rows_are_what_they_are_row_by_row(tmp_path, monkeypatch, small_blocks, row, separator):
     plain = [",".join(map(str, each)) for each in np.arange(200).reshape(-1, 4) / 8]
     text = "\n".join(["t,a,b,c", *plain[:30], row, *plain[30:]])
     path = tmp_path / "odd.csv"
@@ -60,25 +58,17 @@ def test_every_double_comes_back_bit_by_bit(tmp_path, monkeypatch):
     rows = [",".join(map(repr, row)) for row in numbers.tolist()]
     path = tmp_path / "doubles.csv"
     path.write_text("\n".join(["a,b,c", *rows]))
-    monkeypatch.setattr(f"{MODULE}.parsed", lambda *_: pytest.fail("pyarrow did not take it"))
+    monkeypatch.setattr(f"{MODULE}._parse_rows", lambda *_: pytest.fail("NumPy did not take it"))
     columns = load(path).tables[""].columns
     np.testing.assert_array_equal(np.stack(list(columns.values()), axis=1), numbers)
 
 
-def test_damaged_tables_are_what_they_are_without_it(tmp_path, monkeypatch, small_blocks):
+def test_damaged_tables_are_what_they_are_row_by_row(tmp_path, monkeypatch, small_blocks):
     _, content = sound_files(["csv"])["csv"]
     path = tmp_path / "damaged.csv"
     for number in range(300):
         path.write_bytes(damaged(content, np.random.default_rng([7, number])))
         assert agree(path, monkeypatch), number
-
-
-def test_without_pyarrow_numpy_reads_the_same(tmp_path, monkeypatch, small_blocks):
-    path = tmp_path / "log.csv"
-    path.write_text("a,b\n" + "\n".join(f"{k},{k / 3!r}" for k in range(500)))
-    fast = outcome(path)
-    monkeypatch.setattr(f"{MODULE}._pyarrow", lambda: None)
-    assert outcome(path) == fast
 
 
 def test_a_header_of_many_names_above_blank_lines_takes_no_memory(tmp_path):

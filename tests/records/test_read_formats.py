@@ -134,6 +134,7 @@ def test_a_missing_package_is_named_with_the_remedy(tmp_path, monkeypatch, kind)
         channels(tmp_path / name)
 
 
+@pytest.mark.slow
 def test_a_chunk_that_unfolds_to_gigabytes_is_stopped(tmp_path):
     pytest.importorskip("rosbags")
     name, content = sound_files(["mcap"])["mcap"]

@@ -29,6 +29,7 @@ def fitted(frf):
     return jq.fit(TRUTH, frf)
 
 
+@pytest.mark.slow
 def test_the_flight_that_is_asked_for_makes_a_loose_parameter_known():
     frf = response_of(TRUTH, error=0.02, seed=3, omega=BELOW)
     fit = fitted(frf)

@@ -60,6 +60,7 @@ class Wide(eqx.Module):
         return jnp.tile(TRUTH.frequency_response(omega).reshape(-1, 1, 1), (1, 2, 4))
 
 
+@pytest.mark.slow
 def test_what_is_not_drawn_is_counted(tmp_path):
     fit, wide = silent(response_of(TRUTH, seed=0)), response_of(Wide(), seed=0)
     page = read_page(write_report(tmp_path / "r.html", fit=fit, frf=wide))

@@ -106,6 +106,7 @@ SECTIONS = {
 }  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SECTIONS)
 def test_a_section_that_raises_says_why_and_costs_no_other(tmp_path, frf, fit, monkeypatch, name):
     record = record_of(("u0", "y0", "r"), ("V", "rad/s", "V"))

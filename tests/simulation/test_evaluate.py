@@ -152,6 +152,7 @@ def test_the_estimate_of_a_matched_controller_is_the_torque_but_for_its_lag():
     assert found.disturbance_rmse[0, 0] == pytest.approx(0.3 / np.sqrt(2) * lag, rel=0.02)
 
 
+@pytest.mark.slow
 def test_the_gradient_is_that_of_central_differences(ensemble):
     loop, happens = ensemble
 
@@ -176,6 +177,7 @@ def test_evaluate_runs_under_jit_and_vmap(paper):
     np.testing.assert_allclose(together, paper.itae[0], rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_the_gradient_of_a_mean_over_vmap_is_that_of_central_differences():
     """Here over inertias, by a bandwidth that they share."""
     loads = {"reference": {0: Step(0.1)}, "disturbance": {0: Pulse(0.1, width=0.1, at=0.1)}}
@@ -192,6 +194,7 @@ def test_the_gradient_of_a_mean_over_vmap_is_that_of_central_differences():
     assert float(jax.grad(mean)(wc)) == pytest.approx(float(numeric), rel=1e-6)
 
 
+@pytest.mark.slow
 def test_what_happens_at_some_samples_only_stays_so_under_vmap():
     """Such as the lock-in's solution at the end of a window, which has a gradient, too."""
     happens = scenario(duration=0.1, axes=1, reference={0: Step(0.1)})

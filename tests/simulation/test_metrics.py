@@ -53,6 +53,7 @@ def test_overshoot_is_that_of_the_damping_ratio(steps):
     np.testing.assert_allclose(steps.overshoot[0], exact, atol=100 * (OMEGA * DT / 2) ** 2 / 2)
 
 
+@pytest.mark.slow
 def test_settling_and_rise_times_are_those_of_python_control(steps):
     fine = np.arange(0, 10, DT / 20)
     for k, zeta in enumerate(ZETA):

@@ -72,6 +72,7 @@ def plain():
     return plain_covariance(WHOLE).reshape(*SHAPE, *SHAPE)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("errors", (ERRORS, WHOLE), ids=("reach", "whole"))
 def test_all_forms_of_the_covariance_are_the_plain_one(errors, plain):
     for first, second in (((0, 0), (0, 0)), ((1, 2), (1, 2)), ((0, 1), (1, 2))):

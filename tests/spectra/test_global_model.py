@@ -89,6 +89,7 @@ def test_variance_covariance_and_projection_of_shared_parameters_agree():
     check_that_errors_agree(estimate(0).errors, 0, 0)
 
 
+@pytest.mark.slow
 def test_errors_of_a_long_record_agree_where_windows_take_few_of_its_bins():
     """Of 10 minutes at 1 kHz: most atoms have no part in the errors of the models."""
     samples, rng = 600_000, np.random.default_rng(0)
@@ -175,6 +176,7 @@ def late(omega=None):
     return np.mean(each, axis=0)
 
 
+@pytest.mark.slow
 def test_what_the_order_of_the_model_cannot_see_biases_no_response():
     """Noise and the same noise of the other sign: their mean shows the bias alone."""
     y, biases = late(), []

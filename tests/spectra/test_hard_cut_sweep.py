@@ -59,6 +59,7 @@ def over_errors(found):
     return omega[known], (np.abs(measured - exact(omega)) / (error * np.abs(measured)))[known]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 3])
 def test_below_a_cut_sweep_the_errors_of_the_joint_estimate_are_claimed(seed):
     found = frequency_response(flown(seed, 0.02), estimator=ESTIMATOR)
@@ -67,6 +68,7 @@ def test_below_a_cut_sweep_the_errors_of_the_joint_estimate_are_claimed(seed):
     assert np.max(off) < 5 and np.sqrt(np.mean(off**2) / 2) < 1.3
 
 
+@pytest.mark.slow
 def test_a_cut_sweep_with_3_s_of_rest_is_no_mode_that_rings():
     omega = 2 * np.pi * np.geomspace(LOW, 12.0, 100)
     for seed in (0, 1):

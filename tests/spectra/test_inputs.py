@@ -113,6 +113,7 @@ def draws():
     return found, responses.mean(axis=0), responses / responses.mean(axis=0) - 1
 
 
+@pytest.mark.slow
 def test_the_random_error_of_both_inputs_is_their_scatter(draws):
     found, _, errors = draws
     predicted = np.stack([np.asarray(f.random_error)[:, 0] for f in found])

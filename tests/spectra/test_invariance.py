@@ -58,6 +58,7 @@ STATIC = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", STATIC)
 def test_a_static_nonlinearity_is_found_and_named(name):
     bend, excite, words = STATIC[name]
@@ -94,6 +95,7 @@ def test_the_change_is_that_between_the_halves():
     assert float(remark.split("by about ")[1].split(" %")[0]) == pytest.approx(20, abs=4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("excite", [levels, tones])
 def test_linear_records_are_not_remarked(excite):
     # White, coloured and growing noise, and a trim; a chance below 1e-4 each, with fixed seeds.

@@ -129,6 +129,7 @@ def test_two_inputs_at_once_and_two_outputs_with_shared_noise():
     )
 
 
+@pytest.mark.slow
 def test_neighbouring_frequencies_share_their_errors():
     found = draws("white noise")
     error = np.stack([np.asarray(each.response)[:, 0, 0] for each in found]) - PLANT
@@ -181,6 +182,7 @@ def test_a_long_delay_taken_out_leaves_wide_windows():
     assert np.median(bins[1]) > 2 * np.median(bins[0])
 
 
+@pytest.mark.slow
 def test_between_the_lines_of_a_multisine_windows_grow_until_they_hold_enough():
     lines = harmonics(1.5, 45.0, period=20.0, lines=30)
     u = multisine(lines, period=20.0, periods=2, sample_rate=RATE, amplitude=1.0).signal

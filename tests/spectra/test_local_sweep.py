@@ -47,6 +47,7 @@ def test_a_sweep_of_90_s_gives_half_the_error_of_composite_windows():
     assert np.degrees(np.sqrt(np.mean(np.angle(ratios) ** 2))) < 1.8
 
 
+@pytest.mark.slow
 def test_a_lightly_damped_resonance_stays_within_its_errors():
     for k in range(5):
         found, ratio = ninety_seconds(0.02, k)

@@ -68,6 +68,7 @@ def check_calibrated(found, exact):
     assert 0.8 < np.min(ratio) and np.max(ratio) < 1.25
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("realisations", [1, 3])
 @pytest.mark.parametrize("input_noise", [0.0, 0.2])
 def test_predicted_errors_are_those_of_repeated_draws(realisations, input_noise):

@@ -82,6 +82,7 @@ def test_a_descent_leaves_no_more_than_it_began_with_and_reaches_the_noise():
     assert found.cost < truth < found.cost * (1 + 5 * parameters / (2 * BINS))
 
 
+@pytest.mark.slow
 def test_the_last_digit_of_a_flight_does_not_choose_its_models(data):
     """Of an order above that of the vehicle: poles and zeros that cancel leave directions open."""
     path = data / "antx_pitch" / "antx_log3_prbs.npz"

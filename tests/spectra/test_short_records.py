@@ -6,7 +6,7 @@ from scipy.signal import lfilter
 
 import jaxquad as jq
 from jaxquad.spectra._estimate import _remarks_on_length
-from jaxquad.spectra._local_estimate import _remark_on_unmoved
+from jaxquad.spectra._local_polynomial import _remark_on_unmoved
 
 
 DT = 0.004
@@ -36,6 +36,7 @@ def remarks(record):
     return [r for r in jq.frequency_response(record).remarks if SAID in r]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("seconds", "seed"), [(0.8, 0), (0.8, 4), (1.6, 3), (1.6, 8)])
 def test_a_second_of_a_closed_loop_is_called_too_short(seconds, seed):
     """Whether or not any frequency has an error below 30 %: the last digits can decide that."""

@@ -17,6 +17,7 @@ def noisy(error=0.02, seed=0):
     return EXACT * (1 + error * (white[0] + 1j * white[1]))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shape", ["row", "pairs"])
 def test_a_fit_to_a_table_finds_the_model_within_its_errors(shape):
     response = noisy()[:, None, None] if shape == "pairs" else noisy()

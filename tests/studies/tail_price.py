@@ -26,8 +26,13 @@ jax.config.update("jax_enable_x64", True)
 from tuning_case import ensemble, EVENTS, flight, loop, objective, STARTS  # noqa: E402
 
 import jaxquad as jq  # noqa: E402
-from jaxquad.tuning._cost import evaluate_cost, SMOOTHING, stack_copies, Subproblem  # noqa: E402
-from jaxquad.tuning._multipliers import initial_multipliers  # noqa: E402
+from jaxquad.tuning._cost import (  # noqa: E402
+    evaluate_cost,
+    initial_multipliers,  # noqa: E402
+    SMOOTHING,
+    stack_copies,
+    Subproblem,
+)
 from jaxquad.tuning._parameters import select_coordinates  # noqa: E402
 from jaxquad.tuning._problem import linear_loops, make_problem, TimeSpan  # noqa: E402
 from jaxquad.tuning._tail import WorstLoops  # noqa: E402
@@ -91,7 +96,7 @@ def _minimise(cost, z, bound: float, worst: WorstLoops, others) -> np.ndarray:
         found = cost(z)
         return float(found.value[0]), np.asarray(found.gradient[0])
 
-    constraints, count = [], len(worst.found)
+    constraints, count = [], len(worst.places)
     if count:
         loops = worst.put_into(others, np.arange(count))
         level = lambda z: bound - np.asarray(peaks(jnp.asarray(z), COORDINATES, loops))[:count]

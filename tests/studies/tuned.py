@@ -257,7 +257,7 @@ def row_of(name: str, design: Design, members: Members) -> list:
     [limit] = design.certificate.distances
     assert limit.beyond_at_most is not None
     proven = f"{100 * limit.beyond_at_most:.2f}"
-    return [*row, f"{limit.found:.2f}, {limit.beyond} of {limit.members}", proven]
+    return [*row, f"{limit.reached:.2f}, {limit.beyond} of {limit.members}", proven]
 
 
 def _interval(count: int, draws: int) -> str:

@@ -5,8 +5,8 @@ import pytest
 from scipy.optimize import minimize
 
 from jaxquad.tuning import LBFGS
+from jaxquad.tuning._cost import Rounds
 from jaxquad.tuning._lbfgs import minimise
-from jaxquad.tuning._multipliers import Rounds
 
 
 ROUGH = LBFGS(evaluations=200, tolerance=1e-12, gradient_tolerance=1e-8, longest_step=10.0)

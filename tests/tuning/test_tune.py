@@ -114,7 +114,7 @@ def test_a_limit_is_kept_and_is_said_to_hold_the_optimum_back():
     found = run(controller, free=free, limits=limits)
     (one,) = found.limits
     # By a reserve of 3 %, to within the 0.2 % of it at which the multipliers are left alone.
-    assert one.met and one.active and 0.95 * 2.3 < one.found < 2.3 * 0.97 * 1.003
+    assert one.met and one.active and 0.95 * 2.3 < one.reached < 2.3 * 0.97 * 1.003
     assert found.active == (one.limit,) and "on the members tuned on, active" in str(found)
 
 

@@ -46,6 +46,7 @@ def test_a_drive_that_cannot_hold_the_disturbance_is_no_performance():
         assert "exceed the 0.0468 N m that the drive has: no controller holds" in text
 
 
+@pytest.mark.slow
 def test_a_controller_that_is_saturated_all_the_time_is_no_performance():
     """It moves at most 0.9 of 5 deg."""
     found = flown(jq.PID(400.0, 80.0, 40.0), limit=0.004, step=5.0)

@@ -51,6 +51,7 @@ def store_gains(folder):
     })  # fmt: skip
 
 
+@pytest.mark.slow
 def test_a_result_has_the_model_the_numbers_and_the_settings(found, folder):
     stored = jq.load_result(folder)
     assert stored.model == found.fit.model and stored.settings == found.settings
@@ -81,6 +82,7 @@ def test_gains_come_back_as_the_controller_that_was_certified(folder):
         assert str(stored).startswith("FAIL STABILITY: 1 of 12 is unstable")
 
 
+@pytest.mark.slow
 def test_a_result_without_a_fit_has_no_numbers(tmp_path):
     settings = IdentifySettings(input="M", output="q")
     found = identify(write_noise(tmp_path / "noise.npz"), settings)

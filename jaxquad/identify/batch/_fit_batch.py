@@ -42,8 +42,9 @@ from ..frequency_domain._mixing import Mixing, mixings_of
 from ..frequency_domain._parameters import Free, Numbers, Parameters, select_parameters, Tie
 from ..frequency_domain._problem import make_problem
 from ..frequency_domain._result import Fit
-from ..frequency_domain._solve import once_if_alike, solution_at, stopped_early
-from ..uncertainty._assess import assess, Counted, discrepancy_at, records_at
+from ..frequency_domain._solve import solution_at, stopped_early
+from ..uncertainty._assess import assess
+from ..uncertainty._error_budget import weighting_at
 from ._normal import Batch, Evaluate, evaluates_singly, Member, normal_equations_of
 
 
@@ -98,10 +99,7 @@ def solve_batch(
     omega = np.asarray(omega)
     where = Batch(model, parameters, hold, _pad(omega))
     _check_pointwise(where, measured.shape[2:])
-    weights = np.asarray(weights)
-    if evaluates_singly(where):
-        weights = once_if_alike(weights)
-    members = _members(np.asarray(measured), weights, mixings)
+    members = _members(np.asarray(measured), np.asarray(weights), mixings)
     if start is None:
         start = np.broadcast_to(
             parameters.start[: parameters.count], (len(measured), parameters.count)
@@ -311,9 +309,7 @@ class BatchFit(eqx.Module):
         problem = problem.weighted([self.weights[k]], mixings)
         message = "" if self.converged[k] else stopped_early(STALLED, steps)
         solution = solution_at(problem, self.z[k], message, steps)
-        records = records_at(problem, [points], solution)
-        found = discrepancy_at(records, [points], solution)
-        return assess(problem, Counted([points], records, None, None, found), solution)
+        return assess(problem, weighting_at(problem, [points], solution), solution)
 
     def __str__(self) -> str:
         lost = int(np.sum(~self.converged))

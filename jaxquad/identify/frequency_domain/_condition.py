@@ -32,11 +32,6 @@ def _same(model: PyTree) -> PyTree:
 UNCHANGED = _ByFunction(_same)  # the condition of a record that was taken on the model as it is
 
 
-def is_unchanged(condition: Condition) -> bool:
-    """Whether it is `UNCHANGED`, or what JAX has made of it."""
-    return isinstance(condition, _ByFunction) and condition.change is _same
-
-
 @pytree_node
 class Changed:
     """A known change of one parameter, in one of the records of a fit.

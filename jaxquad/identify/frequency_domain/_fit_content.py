@@ -186,8 +186,7 @@ def fit_content(fit: "Fit") -> dict[str, object]:
         "parameters": [_parameter(fit, k) for k in range(len(fit.names))],
         "tied": [_tied_content(each) for each in fit.tied],
         "combinations": [
-            {key: value for key, value in combination._asdict().items() if key != "sum_of"}
-            | {"interval_95": combination.interval}
+            combination.content() | {"interval_95": combination.interval}
             for combination in fit.combinations
         ],
         "null_directions": fit.verdict.null_directions,

@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, PyTree
 
-from jaxquad._compile import no_fuse
-from jaxquad._core import Message, on_host, pytree_node
+from jaxquad._compile import evaluate_once, FEW, no_fuse
+from jaxquad._core import Message, Normal, normal_equations, on_host, pytree_node
 from jaxquad.models import evaluate_response
 from jaxquad.spectra import FrequencyResponse
 
@@ -73,7 +73,7 @@ class Problem:
     quantities: tuple[Condition, ...] = eqx.field(static=True)  # that a prior speaks of
     omega: tuple[Float[Numbers, " frequencies"], ...]
     measured: tuple[Complex[Numbers, "frequencies outputs inputs"], ...]
-    weights: tuple[Float[Numbers, "frequencies outputs inputs parts"], ...]  # two, or one of both
+    weights: tuple[Float[Numbers, "frequencies outputs inputs 2"], ...]  # of magnitude and phase
     known: Float[Numbers, "priors 2"]  # value, standard error
     aliases: tuple[Aliases | None, ...] = ()  # of the responses whose input was held
     silent: tuple[tuple[tuple[int, int], ...], ...] = eqx.field(static=True, default=())
@@ -287,10 +287,15 @@ def residuals(z: Float[Array, " n"], problem: Problem) -> Float[Array, " residua
     return jnp.concatenate([*parts, prior_misfits(z, problem)])
 
 
+def problem_normal(z: Float[Array, " parameters"], problem: Problem) -> Normal:
+    """Cost, gradient and Gauss-Newton Hessian of the residuals, from the free parameters `z`."""
+    return evaluate_once(lambda z: normal_equations(residuals, z, problem), least=FEW)(z)
+
+
 def weigh_parts(problem: Problem, k: int, magnitude: Part, phase: Part) -> tuple[Part, Part]:
     """Misfits of record `k`, or slopes of them, as the residuals count them."""
     weight = problem.weights[k]
-    both = zip((magnitude, phase), (weight[..., 0], weight[..., -1]), strict=True)
+    both = zip((magnitude, phase), (weight[..., 0], weight[..., 1]), strict=True)
     return mix_parts(problem.mixings[k], *(p * jnp.moveaxis(each, 0, -1) for p, each in both))
 
 

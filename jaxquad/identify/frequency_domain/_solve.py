@@ -22,9 +22,8 @@ from ._evaluate import (
     misfits_and_slopes,
     take_apart,
 )
-from ._normal import is_plain, problem_normal
 from ._parameters import Numbers
-from ._problem import Problem, residuals
+from ._problem import Problem, problem_normal, residuals
 
 
 _SHORT = 3e4  # residuals times parameters squared: a few ms for a whole descent
@@ -85,7 +84,7 @@ def solve(
             return _solve_at_once(problem.mixed(), z0, max_steps)
         stop = _descend_from(problem.mixed(), z0, solver, max_steps, short=True)
     else:
-        stop = _descend_from(_with_one_weight(problem), z0, solver, max_steps, short=False)
+        stop = _descend_from(problem, z0, solver, max_steps, short=False)
     return solution_at(problem, np.asarray(stop.z), *_message_and_steps(stop))
 
 
@@ -93,18 +92,6 @@ def _message_and_steps(stop: Stop) -> tuple[str, int]:
     """Why the solver stopped before a minimum, if it did, and after how many steps."""
     converged, steps = bool(np.asarray(stop.converged)), int(np.asarray(stop.steps))
     return "" if converged else f"{_reason(stop.reason)} (after {steps} steps)", steps
-
-
-def _with_one_weight(problem: Problem) -> Problem:
-    """Weights of magnitude and phase once, where they are alike and that saves arithmetic."""
-    if not is_plain(problem) or any(each is not None for each in problem.mixings):
-        return problem
-    return problem.weighted([once_if_alike(np.asarray(each)) for each in problem.weights])
-
-
-def once_if_alike(weights: Float[np.ndarray, "*points 2"]) -> Float[np.ndarray, "*points parts"]:
-    """Weights of magnitude and phase, on a last axis of one where they are alike."""
-    return weights[..., :1] if np.array_equal(weights[..., 0], weights[..., 1]) else weights
 
 
 def stopped_early(status: int, steps: int) -> str:

@@ -19,9 +19,8 @@ from jaxquad._core import (
     TOLERANCE,
 )
 
-from ._normal import problem_normal
 from ._parameters import Numbers, Parameters
-from ._problem import Problem, residuals
+from ._problem import Problem, problem_normal, residuals
 from ._solve import least_squares, Solution, solution_at, stopped_early
 
 

@@ -67,6 +67,10 @@ class Combination(NamedTuple):
     unit: str = ""  # where it is known
     sum_of: tuple[str, ...] = ()  # the parameters of a sum
 
+    def content(self) -> dict[str, object]:
+        """Its numbers and its unit, for JSON."""
+        return {name: value for name, value in self._asdict().items() if name != "sum_of"}
+
     @property
     def interval(self) -> tuple[float, float]:
         """The 95 % interval."""
@@ -153,18 +157,21 @@ class Verdict:
         if self.identifiable:
             known = "identifiable: the record determines every free parameter individually"
             return "; ".join([known, *map(str, self.bounds)])
-        if not self.fitted:
-            return f"not identifiable from this record: {'; '.join(self.reasons)}"
-        if self.kind == "no model":
-            reasons = "; ".join(self.reasons)
-            return f"no model of this structure holds, so no parameter is determined: {reasons}"
-        if self.kind == "no minimum":
-            return f"no minimum was found, so no parameter is determined: {'; '.join(self.reasons)}"
+        if self.kind != "not identifiable":
+            return " ".join(self._refusal())
         known = ", ".join(str(combination) for combination in self.combinations)
         it = "it" if len(self.undetermined) == 1 else "them"
         rest = f"only {known}" if known else f"nothing about {it} is determined"
         lost = " and ".join(self.undetermined)
         return f"not identifiable from this record, individually: {lost}; {rest}"
+
+    def _refusal(self) -> tuple[str, str]:
+        """Where there are no numbers: what is the matter, and why."""
+        reasons = "; ".join(self.reasons)
+        if not self.fitted:
+            return "not identifiable", f"from this record: {reasons}"
+        what = "of this structure holds" if self.kind == "no model" else "was found"
+        return self.kind, f"{what}, so no parameter is determined: {reasons}"
 
     def __bool__(self) -> bool:
         return self.identifiable
@@ -173,8 +180,8 @@ class Verdict:
         if self.identifiable:
             return self.summary
         if self.kind != "not identifiable":
-            head = "not identifiable" if self.kind == "too few points" else self.kind
-            lines = [self.summary.replace(head, head.upper(), 1)]
+            kind, why = self._refusal()
+            lines = [f"{kind.upper()} {why}"]
         else:
             lines = [
                 "NOT IDENTIFIABLE from this record, individually: " + ", ".join(self.undetermined),

@@ -15,8 +15,7 @@ from ._basis import (
     shown,
     with_coherence,
 )
-from ._crossings import crossed, first
-from ._curve import ambiguous, Curve, curve_of, Response
+from ._curve import ambiguous, crossed, Curve, curve_of, first, Response
 
 
 def missing_bandwidth(result: "Bandwidth") -> list[str]:
@@ -58,8 +57,8 @@ def _reach(basis: Basis) -> str:
 def doubtful_bandwidth(result: "Bandwidth") -> list[str]:
     """What may be wrong with the numbers that exist."""
     doubts, start = [], float(result.basis.start_phase)
-    given = start + (np.pi / 2 if result.quantity == "rate" else 0.0)
-    if result.branch != "as given" and (abs(given) > np.radians(150) or start > np.radians(90)):
+    input_at = start + (np.pi / 2 if result.quantity == "rate" else 0.0)
+    if result.branch != "as given" and (abs(input_at) > np.radians(150) or start > np.radians(90)):
         doubts.append(
             f"the phase starts at {np.degrees(start):.4g} deg: if that is wrong by 360 deg, give "
             "the true one as phase_at_start=; if the input has the opposite sign, reverse it"
@@ -78,9 +77,9 @@ def doubtful_bandwidth(result: "Bandwidth") -> list[str]:
         doubts.append(
             "gain-limited: ADS-33 warns of pilot-induced oscillation with attitude command"
         )
-    apart = abs(float(result.gain_bandwidth) - float(result.phase_bandwidth))
+    distance = abs(float(result.gain_bandwidth) - float(result.phase_bandwidth))
     errors = result.standard_errors
-    if apart < errors.get("gain_bandwidth", 0.0) + errors.get("phase_bandwidth", 0.0):
+    if distance < errors.get("gain_bandwidth", 0.0) + errors.get("phase_bandwidth", 0.0):
         doubts.append(
             "phase and gain bandwidth agree within their errors: the lesser is biased low"
         )
@@ -140,9 +139,9 @@ def _slope(
     x: Float[Array, " points"], y: Float[Array, " points"], weights: Float[Array, " points"]
 ) -> Float[Array, ""]:
     total = jnp.maximum(jnp.sum(weights), jnp.finfo(x.dtype).tiny)
-    apart = x - jnp.sum(weights * x) / total
-    spread = jnp.sum(weights * apart**2)
-    return jnp.sum(weights * apart * y) / jnp.where(spread > 0, spread, 1.0)
+    centred = x - jnp.sum(weights * x) / total
+    spread = jnp.sum(weights * centred**2)
+    return jnp.sum(weights * centred * y) / jnp.where(spread > 0, spread, 1.0)
 
 
 _PHASE_MARGIN = np.pi / 4

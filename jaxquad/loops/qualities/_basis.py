@@ -94,12 +94,12 @@ def with_coherence(basis: Basis, curve: Curve, places: Mapping[str, ArrayLike]) 
     if curve.coherence is None:
         return basis
     coherence = np.asarray(curve.coherence)
-    beside = {
+    least = {
         name: float(np.min(coherence[around(curve.omega, place)]))
         for name, place in places.items()
         if np.isfinite(place)
     }
-    return eqx.tree_at(lambda b: b.coherence, basis, beside)
+    return eqx.tree_at(lambda b: b.coherence, basis, least)
 
 
 @eqx.filter_jit

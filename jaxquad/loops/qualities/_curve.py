@@ -1,5 +1,7 @@
 """One response, measured or of a model, that can be asked at any frequency."""
 
+from collections.abc import Callable
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -63,7 +65,7 @@ class Curve(eqx.Module):
 
     def __call__(self, omega: Float[Array, " points"]) -> Complex[Array, " points"]:
         """Response at `omega` in rad/s."""
-        return self._given(omega) / imaginary(omega) ** self.integrations
+        return self._before_integrations(omega) / imaginary(omega) ** self.integrations
 
     @property
     def measured(self) -> Interpolated:
@@ -78,12 +80,12 @@ class Curve(eqx.Module):
         There the response as given, before the integrations, has its principal value, or the one
         nearest to `start`.
         """
-        phase = jnp.unwrap(jnp.angle(self._given(self.omega)))
+        phase = jnp.unwrap(jnp.angle(self._before_integrations(self.omega)))
         if start is not None:
             phase = phase + 2 * jnp.pi * jnp.round((start - phase[0]) / (2 * jnp.pi))
         return phase - self.integrations * jnp.pi / 2
 
-    def _given(self, omega: Float[Array, " points"]) -> Complex[Array, " points"]:
+    def _before_integrations(self, omega: Float[Array, " points"]) -> Complex[Array, " points"]:
         output, source = self.pair
         return self.model.frequency_response(omega)[:, output, source]
 
@@ -162,15 +164,15 @@ def _measured(
     o, i = _position("output", output, frf.output_names), _position("input", input, frf.input_names)
     values, error = (np.asarray(x)[:, o, i] for x in (frf.response, frf.random_error))
     wanted = _wanted(np.asarray(frf.omega), omega)
-    known = wanted & np.isfinite(values) & np.isfinite(error) & (values != 0)
-    grid = np.asarray(frf.omega)[known]
+    usable = wanted & np.isfinite(values) & np.isfinite(error) & (values != 0)
+    grid = np.asarray(frf.omega)[usable]
     _require_grid(grid)
-    level, phase = np.log(np.abs(values[known])), np.unwrap(np.angle(values[known]))
+    level, phase = np.log(np.abs(values[usable])), np.unwrap(np.angle(values[usable]))
     with np.errstate(divide="ignore", invalid="ignore"):  # where there is no number
-        shared = frf.relative_covariance(o, i)[np.ix_(known, known)]
+        shared = frf.relative_covariance(o, i)[np.ix_(usable, usable)]
     numbers = (jnp.asarray(x) for x in (grid, level, phase, shared))
-    coherence = jnp.asarray(np.asarray(frf.coherence)[known, o, i])
-    dropped = int(np.sum(wanted & ~known))
+    coherence = jnp.asarray(np.asarray(frf.coherence)[usable, o, i])
+    dropped = int(np.sum(wanted & ~usable))
     return Curve(
         Interpolated(*numbers), jnp.asarray(grid), coherence, (0, 0), integrations, dropped
     )
@@ -227,3 +229,85 @@ def _require_grid(omega: Float[ArrayLike, " frequencies"]) -> None:
             f"omega, from {grid[0]:.4g} to {grid[-1]:.4g} rad/s, must be finite, above 0 and "
             "rising: use numpy.geomspace"
         )
+
+
+_HALVINGS = 60  # from a grid's interval to the last bit of a float64
+
+
+def crossed(values: Float[Array, " frequencies"], direction: str) -> Bool[Array, " intervals"]:
+    """Intervals in which `values` pass zero "falling", "rising" or in "both" directions.
+
+    A curve that lies on zero but for rounding does not cross it.
+    """
+    above = values >= -1e4 * jnp.finfo(values.dtype).eps
+    falls, rises = above[:-1] & ~above[1:], ~above[:-1] & above[1:]
+    both = falls | rises
+    finite = jnp.isfinite(values)
+    return {"falling": falls, "rising": rises, "both": both}[direction] & finite[:-1] & finite[1:]
+
+
+def crossings(
+    residual: Callable[[Float[Array, " points"]], Float[Array, " points"]],
+    omega: Float[Array, " frequencies"],
+    where: Bool[Array, " intervals"],
+    *,
+    rank: Float[Array, " intervals"] | None = None,
+    limit: int = 1,
+) -> Float[Array, " crossings"]:
+    """The roots of `residual` in the intervals `where`, rising in rad/s; `nan` where there is none.
+
+    `residual` treats each frequency by itself. Of more than `limit` roots, those of lowest `rank`
+    are kept, by default the lowest frequencies. Each is bisected to machine accuracy, and its
+    derivatives of any order with respect to what `residual` closes over are those of the implicit
+    function theorem.
+    """
+    rank = jnp.arange(where.size, dtype=omega.dtype) if rank is None else rank
+    chosen = jax.lax.top_k(jnp.where(where, -rank, -jnp.inf), min(limit, where.size))[1]
+    chosen = jnp.sort(jnp.where(where[chosen], chosen, where.size))
+    exists, interval = chosen < where.size, jnp.minimum(chosen, where.size - 1)
+    root = _root(residual, omega[interval], omega[interval + 1])
+    return jnp.where(exists, root, jnp.nan)
+
+
+def first(
+    residual: Callable[[Float[Array, " points"]], Float[Array, " points"]],
+    omega: Float[Array, " frequencies"],
+    where: Bool[Array, " intervals"],
+    rank: Float[Array, " intervals"] | None = None,
+) -> Float[Array, ""]:
+    """The one root of lowest rank, `nan` if there is none."""
+    return crossings(residual, omega, where, rank=rank)[0]
+
+
+def between(
+    residual: Callable[[Float[Array, " points"]], Float[Array, " points"]],
+    low: Float[Array, ""],
+    high: Float[Array, ""],
+) -> Float[Array, ""]:
+    """A root between two frequencies where `residual` has opposite signs."""
+    return _root(residual, low[None], high[None])[0]
+
+
+def _root(
+    residual: Callable[[Float[Array, " points"]], Float[Array, " points"]],
+    low: Float[Array, " points"],
+    high: Float[Array, " points"],
+) -> Float[Array, " points"]:
+    low, high = jax.lax.stop_gradient((low, high))
+
+    def bisect(f, _):
+        sign = f(low) >= 0
+
+        def halve(_, ends):
+            middle = jnp.sqrt(ends[0]) * jnp.sqrt(ends[1])
+            left = (f(middle) >= 0) == sign
+            return jnp.where(left, middle, ends[0]), jnp.where(left, ends[1], middle)
+
+        return jax.lax.fori_loop(0, _HALVINGS, halve, (low, high))[1]
+
+    def divide(slope, y):
+        steep = slope(jnp.ones_like(y))
+        # Where a curve only touches zero the derivative is infinite; unused rows stay 0.
+        return y / jnp.where(steep == 0, jnp.finfo(y.dtype).tiny, steep)
+
+    return jax.lax.custom_root(residual, low, bisect, divide)

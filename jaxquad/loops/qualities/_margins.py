@@ -18,8 +18,7 @@ from ._basis import (
     shown,
     with_coherence,
 )
-from ._crossings import crossed, crossings
-from ._curve import ambiguous, count_unstable_poles, Curve, curve_of, Response
+from ._curve import ambiguous, count_unstable_poles, crossed, crossings, Curve, curve_of, Response
 
 
 _SLACK = 0.3  # of the slope at the lowest frequency, for a number of integrators
@@ -41,15 +40,15 @@ def unstable_roots(
     argument = jnp.unwrap(jnp.angle(values))
     slope = jnp.log(jnp.abs(loop[1] / loop[0])) / jnp.log(omega[1] / omega[0])
     integrators = jnp.maximum(jnp.round(-slope), 0.0)
-    whole = (jnp.abs(slope + integrators) < _SLACK) | (slope > 0)
-    known = (integrators == 0) | (jnp.abs(loop[0]) > 2)
+    is_power = (jnp.abs(slope + integrators) < _SLACK) | (slope > 0)
+    is_large = (integrators == 0) | (jnp.abs(loop[0]) > 2)
     limit = jnp.exp(jax.lax.complex(jnp.zeros_like(slope), -integrators * jnp.pi / 2))
     tilt = jnp.angle(values[0] / limit)
     tilt = tilt - jnp.pi * jnp.round(tilt / jnp.pi)
     growth = argument[-1] - argument[0] + tilt - jnp.angle(values[-1])
     roots = jnp.round(unstable_poles + integrators / 2 - growth / jnp.pi)
     clear = ~jnp.any(ambiguous(argument)) & (jnp.abs(loop[-1]) < 1) & (jnp.abs(tilt) < _TILT)
-    return jax.lax.stop_gradient(jnp.where(clear & known & whole, roots, jnp.nan))
+    return jax.lax.stop_gradient(jnp.where(clear & is_large & is_power, roots, jnp.nan))
 
 
 def remarks_on_roots(roots: float, unstable_poles: int) -> list[str]:

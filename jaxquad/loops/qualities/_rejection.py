@@ -17,8 +17,7 @@ from ._basis import (
     shown,
     with_coherence,
 )
-from ._crossings import between, crossed, first
-from ._curve import count_unstable_poles, Curve, curve_of, Response
+from ._curve import between, count_unstable_poles, crossed, Curve, curve_of, first, Response
 from ._margins import remarks_on_roots, unstable_roots
 
 

@@ -13,29 +13,21 @@ import sys
 from collections.abc import Callable, Iterator, Mapping
 from operator import attrgetter
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple, TYPE_CHECKING
+from typing import Any, BinaryIO, TYPE_CHECKING
 
 import numpy as np
 
 
 if TYPE_CHECKING:
     import h5py
-    import pyarrow
 
 _SPARE = 512 * 2**20  # bytes of address space beside three times the numbers
 Check = Callable[[str, int], None]  # of how many bytes something declares
-Found = tuple[dict[str, dict[str, tuple[np.ndarray, str]]], list[str]]  # values and unit; remarks
+Content = tuple[dict[str, dict[str, tuple[np.ndarray, str]]], list[str]]  # values, unit; remarks
 
 
 class Oversize(Exception):
     """What declares how many bytes too many."""
-
-
-class Library(NamedTuple):
-    """How to read a format: the modules that it needs, and the function that returns its tables."""
-
-    modules: tuple[str, ...]
-    tables: Callable[[str, Check], Found]
 
 
 _MAGIC = b"\x89HDF\r\n\x1a\n"
@@ -47,7 +39,7 @@ def sniff_hdf5(head: bytes, path: Path) -> bool:
     return head.startswith((_MAGIC, b"MATLAB 7.3")) or head[512:520] == _MAGIC
 
 
-def _hdf5_tables(path: str, check: Check) -> Found:
+def _hdf5_tables(path: str, check: Check) -> Content:
     """The numeric datasets as `group.name` with their units, and what was left out.
 
     MATLAB v7.3 files, which are HDF5 with the axes reversed, keep the rows and columns that they
@@ -69,8 +61,20 @@ def _hdf5_tables(path: str, check: Check) -> Found:
             check("the file", size)
             if kind == h5py.h5d.CHUNKED:
                 check(f"a chunk of {name!r}", math.prod(layout.get_chunk()) * dtype.itemsize)
-            unit = _dataset_unit(item)
-            for full, values in _dataset_columns(name, item, dtype).items():
+            unit = ""
+            if h5py.h5a.get_num_attrs(item):
+                attributes = h5py.Dataset(item).attrs
+                named = (attributes.get(key) for key in ("units", "unit"))
+                unit = next((_text(text) for text in named if text is not None), "")
+            if dtype.names:
+                records = np.asarray(h5py.Dataset(item)[()])
+                arrays = {f"{name}.{field}": records[field] for field in dtype.names}
+            else:
+                values = np.empty(item.shape, dtype)
+                item.read(h5py.h5s.ALL, h5py.h5s.ALL, values)
+                values = values.T if h5py.h5a.exists(item, b"MATLAB_class") else values
+                arrays = {name: values.reshape(-1) if 1 in values.shape else values}
+            for full, values in arrays.items():
                 if full in columns:
                     remarks.append(f"two datasets are called {full!r}: the later one is used")
                 columns[full] = values, unit
@@ -97,50 +101,18 @@ def _datasets(file: "h5py.h5f.FileID") -> Iterator[tuple[str, "h5py.h5d.DatasetI
         item = h5o.open(file, name)
         if not isinstance(item, h5py.h5d.DatasetID) or name.startswith(b"#"):
             continue
-        dtype = item.dtype
-        if _is_numeric(item, dtype):
-            yield name.decode("utf-8", "replace").replace("/", "."), item, dtype
-
-
-def _is_numeric(item: "h5py.h5d.DatasetID", dtype: np.dtype) -> bool:
-    import h5py
-
-    shape = item.shape
-    if shape is None or not 1 <= len(shape) <= 2 or 0 in shape:
-        return False
-    if not (dtype.kind in "fiub" or (dtype.names and len(shape) == 1)):
-        return False
-    if not h5py.h5a.get_num_attrs(item):
-        return True
-    attributes = h5py.Dataset(item).attrs
-    kind = _text(attributes.get("MATLAB_class", b""))
-    matlab = kind.startswith(("int", "uint")) or kind in _MATLAB_NUMBERS
-    return (matlab or not kind) and "MATLAB_empty" not in attributes
-
-
-def _dataset_columns(
-    name: str, item: "h5py.h5d.DatasetID", dtype: np.dtype
-) -> dict[str, np.ndarray]:
-    import h5py
-
-    if dtype.names:
-        records = np.asarray(h5py.Dataset(item)[()])
-        return {f"{name}.{field}": records[field] for field in dtype.names}
-    values = np.empty(item.shape, dtype)
-    item.read(h5py.h5s.ALL, h5py.h5s.ALL, values)
-    if h5py.h5a.exists(item, b"MATLAB_class"):
-        values = values.T
-    return {name: values.reshape(-1) if 1 in values.shape else values}
-
-
-def _dataset_unit(item: "h5py.h5d.DatasetID") -> str:
-    import h5py
-
-    if not h5py.h5a.get_num_attrs(item):
-        return ""
-    attributes = h5py.Dataset(item).attrs
-    named = (attributes.get(key) for key in ("units", "unit"))
-    return next((_text(each) for each in named if each is not None), "")
+        shape, dtype = item.shape, item.dtype
+        if shape is None or not 1 <= len(shape) <= 2 or 0 in shape:
+            continue
+        if not (dtype.kind in "fiub" or (dtype.names and len(shape) == 1)):
+            continue
+        if h5py.h5a.get_num_attrs(item):
+            attributes = h5py.Dataset(item).attrs
+            kind = _text(attributes.get("MATLAB_class", b""))
+            matlab = kind.startswith(("int", "uint")) or kind in _MATLAB_NUMBERS
+            if not (matlab or not kind) or "MATLAB_empty" in attributes:
+                continue
+        yield name.decode("utf-8", "replace").replace("/", "."), item, dtype
 
 
 def _text(value: object) -> str:
@@ -156,47 +128,35 @@ def sniff_parquet(head: bytes, path: Path) -> bool:
     return head.startswith(b"PAR1")
 
 
-def _parquet_tables(path: str, check: Check) -> Found:
-    """The numeric columns with their units; time stamps and durations in s."""
+def _parquet_tables(path: str, check: Check) -> Content:
+    """The numeric columns with their units; time stamps and durations in s.
+
+    Where values are missing, integers become floats with NaN.
+    """
     import pyarrow.parquet
 
+    types = pyarrow.types
+    is_time = lambda kind: types.is_timestamp(kind) or types.is_duration(kind)
+    numeric = (types.is_integer, types.is_floating, types.is_boolean, is_time)
     with pyarrow.parquet.ParquetFile(path) as file:
-        wanted = [field for field in file.schema_arrow if _is_number(field.type)]
+        wanted = [f for f in file.schema_arrow if any(is_kind(f.type) for is_kind in numeric)]
         names = [field.name for field in wanted]
         if len(set(names)) < len(names):
             raise ValueError(f"two columns are called {max(names, key=names.count)!r}: rename one")
         check("the table", 8 * len(wanted) * file.metadata.num_rows)
         table = file.read(columns=names, use_threads=False)
-    columns = {field.name: (_field_values(table, field), _field_unit(field)) for field in wanted}
+    columns = {}
+    for field in wanted:
+        column = table.column(field.name)
+        if is_time(field.type):
+            seconds = column.cast(pyarrow.int64()).to_numpy() / _PER_SECOND[field.type.unit]
+            columns[field.name] = seconds, "s"
+        else:
+            metadata = field.metadata or {}
+            units = (metadata.get(key) for key in (b"units", b"unit"))
+            unit = next((text.decode("utf-8", "replace") for text in units if text is not None), "")
+            columns[field.name] = column.to_numpy(), unit
     return {"": columns}, []
-
-
-def _is_number(kind: "pyarrow.DataType") -> bool:
-    import pyarrow
-
-    types = pyarrow.types
-    number = types.is_integer(kind) or types.is_floating(kind) or types.is_boolean(kind)
-    return number or types.is_timestamp(kind) or types.is_duration(kind)
-
-
-def _field_values(table: "pyarrow.Table", field: "pyarrow.Field") -> np.ndarray:
-    """Where values are missing, integers become floats with NaN."""
-    import pyarrow
-
-    column = table.column(field.name)
-    if pyarrow.types.is_timestamp(field.type) or pyarrow.types.is_duration(field.type):
-        return column.cast(pyarrow.int64()).to_numpy() / _PER_SECOND[field.type.unit]
-    return column.to_numpy()
-
-
-def _field_unit(field: "pyarrow.Field") -> str:
-    import pyarrow
-
-    if pyarrow.types.is_timestamp(field.type) or pyarrow.types.is_duration(field.type):
-        return "s"
-    metadata = field.metadata or {}
-    named = (metadata.get(key) for key in (b"units", b"unit"))
-    return next((each.decode("utf-8", "replace") for each in named if each is not None), "")
 
 
 _MCAP, _SQLITE = b"\x89MCAP0\r\n", b"SQLite format 3\0"
@@ -212,7 +172,7 @@ def sniff_bag(head: bytes, path: Path) -> bool:
     return head.startswith((_MCAP, _SQLITE))
 
 
-def _bag_tables(path: str, check: Check) -> Found:
+def _bag_tables(path: str, check: Check) -> Content:
     """The numbers of each topic with their units and a column `time` (s), and what was left out.
 
     The table `/imu/data` has the columns `angular_velocity.x`, ... Its time is that of the
@@ -226,25 +186,22 @@ def _bag_tables(path: str, check: Check) -> Found:
     size = 0
     # Some bags do not say how their messages are laid out.
     with AnyReader([Path(path)], default_typestore=get_typestore(Stores.LATEST)) as reader:
-        known = [each for each in reader.connections if each.msgtype in reader.typestore.types]
-        unknown = {each.msgtype for each in reader.connections} - {each.msgtype for each in known}
-        for connection, recorded, raw in reader.messages(known) if known else ():
+        defined = [x for x in reader.connections if x.msgtype in reader.typestore.types]
+        unknown = {x.msgtype for x in reader.connections} - {x.msgtype for x in defined}
+        for connection, recorded, raw in reader.messages(defined) if defined else ():
             message = reader.deserialize(raw, connection.msgtype)
             topic = topics.setdefault(connection.topic, _Topic(message, reader.start_time))
             size += topic.add(recorded, message)
             check("the bag", size)
-    found = {name: topic.columns() for name, topic in topics.items() if topic.stamps}
-    return found, [*_bag_remarks(unknown, topics)]
-
-
-def _bag_remarks(unknown: set[str], topics: dict[str, "_Topic"]) -> Iterator[str]:
-    for kind in sorted(unknown):
-        yield f"messages of the unknown type {kind!r} were left out"
+    remarks = [f"messages of the unknown type {kind!r} were left out" for kind in sorted(unknown)]
     for name, topic in topics.items():
         if topic.odd:
-            yield f"{topic.odd} messages of {name!r} whose arrays have another size were left out"
+            remarks.append(
+                f"{topic.odd} messages of {name!r} whose arrays have another size were left out"
+            )
         if topic.stamps and not topic.stamped:
-            yield f"{name!r} has no header: the time of recording is used"
+            remarks.append(f"{name!r} has no header: the time of recording is used")
+    return {name: topic.columns() for name, topic in topics.items() if topic.stamps}, remarks
 
 
 class _Topic:
@@ -305,11 +262,11 @@ def _leaves(message: Any, prefix: str, depth: int) -> Iterator[tuple[str, Any]]:
             yield path, value
 
 
-LIBRARIES: Mapping[str, Library] = {
-    "hdf5": Library(("h5py",), _hdf5_tables),
-    "parquet": Library(("pyarrow", "pyarrow.parquet"), _parquet_tables),
-    "rosbag": Library(("rosbags.highlevel", "rosbags.typesys"), _bag_tables),
-}
+LIBRARIES: Mapping[str, tuple[tuple[str, ...], Callable[[str, Check], Content]]] = {
+    "hdf5": (("h5py",), _hdf5_tables),
+    "parquet": (("pyarrow", "pyarrow.parquet"), _parquet_tables),
+    "rosbag": (("rosbags.highlevel", "rosbags.typesys"), _bag_tables),
+}  # the modules that a format needs, and the function that returns its tables and remarks
 
 
 def answer(kind: str, path: str, limit: int, stream: BinaryIO) -> None:
@@ -320,7 +277,7 @@ def answer(kind: str, path: str, limit: int, stream: BinaryIO) -> None:
             raise Oversize(what, declared)
 
     try:
-        tables, remarks = LIBRARIES[kind].tables(path, check)
+        tables, remarks = LIBRARIES[kind][1](path, check)
     except Oversize as error:
         stream.write(json.dumps({"oversize": error.args}).encode() + b"\n")
         return
@@ -341,29 +298,23 @@ def answer(kind: str, path: str, limit: int, stream: BinaryIO) -> None:
         stream.write(np.ascontiguousarray(array).data.cast("B") if array.size else b"")
 
 
-def _limit_memory(limit: int) -> None:
-    try:
-        import resource
-    except ImportError:  # There is no such thing on Windows.
-        return
-    with open("/proc/self/statm") as file:
-        held = int(file.read().split()[0]) * resource.getpagesize()
-    most = held + 3 * limit + _SPARE
-    resource.setrlimit(resource.RLIMIT_AS, (most, most))
-    resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
-
-
 def main() -> None:
     kind, path, limit = sys.argv[1], sys.argv[2], int(sys.argv[3])
     try:
         # Before memory is limited: some libraries reserve gigabytes of addresses.
-        for module in LIBRARIES[kind].modules:
+        for module in LIBRARIES[kind][0]:
             importlib.import_module(module)
     except ImportError as error:
         sys.stdout.buffer.write(json.dumps({"missing": str(error)}).encode() + b"\n")
         return
     if sys.platform == "linux":
-        _limit_memory(limit)
+        import resource
+
+        with open("/proc/self/statm") as file:
+            used = int(file.read().split()[0]) * resource.getpagesize()
+        most = used + 3 * limit + _SPARE
+        resource.setrlimit(resource.RLIMIT_AS, (most, most))
+        resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
     answer(kind, path, limit, sys.stdout.buffer)
 
 

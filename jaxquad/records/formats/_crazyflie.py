@@ -24,7 +24,7 @@ _WINDOW = 60  # s: the most between the two events with which reading goes on
 _TRIES = 200_000  # places looked at after damage, in one file
 
 
-class Kind(NamedTuple):
+class _Kind(NamedTuple):
     """One type of event."""
 
     number: int
@@ -32,42 +32,38 @@ class Kind(NamedTuple):
     layout: np.dtype  # event id, time stamp, then the variables in order
 
 
-class Events(NamedTuple):
-    """Where the events of each type begin, and the stretches (offset, bytes) in between."""
+def _events(
+    data: bytes, kinds: dict[int, _Kind], begin: int, end: int, per_second: float
+) -> tuple[dict[int, Int[np.ndarray, " events"]], list[tuple[int, int]]]:
+    """Where the events of each type begin, and the stretches (offset, bytes) in between.
 
-    offsets: dict[int, Int[np.ndarray, " events"]]
-    skipped: list[tuple[int, int]]
-
-
-def events(data: bytes, kinds: dict[int, Kind], begin: int, end: int, per_second: float) -> Events:
-    """Walk from event to event up to `end`; after damage, on to the next two that fit together.
-
-    The event before a place where none of a known type begins has lost or gained bytes itself,
-    and is left out.
+    Walks from event to event up to `end`; after damage, on to the next two that fit together. The
+    event before a place where none of a known type begins has lost or gained bytes itself, and is
+    left out.
     """
     sizes = {number: kind.layout.itemsize for number, kind in kinds.items()}
-    found: dict[int, list[int]] = {number: [] for number in kinds}
+    offsets: dict[int, list[int]] = {number: [] for number in kinds}
     skipped: list[tuple[int, int]] = []
     last: list[int] = []
-    at, tries = begin, _TRIES
+    at, tries, window = begin, _TRIES, int(_WINDOW * per_second)
     smallest = min(sizes.values())
     while at + smallest <= end:
         number = data[at] | data[at + 1] << 8
         size = sizes.get(number)
         if size is not None and at + size <= end:
-            last = found[number]
+            last = offsets[number]
             last.append(at)
             at += size
             continue
         bad = last.pop() if size is None and last else at
-        at, tries = _next(data, kinds, bad, end, int(_WINDOW * per_second), tries)
+        at, tries = _resume(data, kinds, bad, end, window, tries)
         skipped.append((bad, at - bad))
         last = []
-    return Events({number: np.array(each, int) for number, each in found.items()}, skipped)
+    return {number: np.array(places, int) for number, places in offsets.items()}, skipped
 
 
-def _next(
-    data: bytes, kinds: dict[int, Kind], at: int, end: int, window: int, tries: int
+def _resume(
+    data: bytes, kinds: dict[int, _Kind], at: int, end: int, window: int, tries: int
 ) -> tuple[int, int]:
     """Where two events follow each other with stamps that go on, else `end`; tries left."""
     for place in range(at + 1, end):
@@ -84,7 +80,7 @@ def _next(
     return end, tries
 
 
-def _stamp(data: bytes, kinds: dict[int, Kind], at: int, end: int) -> int | None:
+def _stamp(data: bytes, kinds: dict[int, _Kind], at: int, end: int) -> int | None:
     """The time stamp of the event at `at`, None where there is no whole event of a known type."""
     kind = kinds.get(data[at] | data[at + 1] << 8) if at + 1 < end else None
     if kind is None or at + kind.layout.itemsize > end:
@@ -102,44 +98,16 @@ _MOST_KINDS, _MOST_VARIABLES, _LONGEST_NAME = 256, 1000, 256
 _UNITS = {"acc": "g", "gyro": "deg/s"}
 
 
-class _Description(NamedTuple):
-    """What the head of the file says of the events after it."""
-
-    kinds: dict[int, Kind]
-    begin: int  # offset of the first event
-    per_second: float
-
-
 def sniff(head: bytes, path: Path) -> bool:
     return len(head) >= 9 and head[0] == MAGIC and head[1:3] in (b"\x01\0", b"\x02\0")
 
 
 def load(path: Path) -> Log:
-    """The events of a file, a table for each type; one type alone is the table `""`."""
-    return decode(path.read_bytes())
+    """The events of a file, a table for each type; one type alone is the table `""`.
 
-
-def decode(data: bytes) -> Log:
-    """The events in the bytes of a file. Raises ReadError where its head is damaged."""
-    head = _description(data)
-    end, remarks = len(data) - 4, []
-    if zlib.crc32(memoryview(data)[:end]) != int.from_bytes(data[end:], "little"):
-        remarks.append("the checksum is wrong: the log was cut off or damaged")
-        end = len(data)
-    found = events(data, head.kinds, head.begin, end, head.per_second)
-    tables = {
-        kind.name: _table(data, kind, found.offsets[number], head.per_second)
-        for number, kind in head.kinds.items()
-        if found.offsets[number].size
-    }
-    if not tables:
-        raise ReadError("the log holds no event of the types it describes", offset=head.begin)
-    if len(head.kinds) == 1:
-        tables = {"": next(iter(tables.values()))}
-    return Log(tables, (*remarks, *_skipped(found.skipped)), "crazyflie")
-
-
-def _description(data: bytes) -> _Description:
+    Raises ReadError where the head of the file is damaged.
+    """
+    data = path.read_bytes()
     version, count = struct.unpack_from("<HH", data, 1) if len(data) >= 9 else (0, 0)
     if version not in _STAMP or data[0] != MAGIC:
         raise ReadError("not a Crazyflie log of version 1 or 2 (0xBC 01 00, 0xBC 02 00)", offset=0)
@@ -149,17 +117,41 @@ def _description(data: bytes) -> _Description:
             f"damaged",
             offset=3,
         )
-    kinds: dict[int, Kind] = {}
-    at = 5
+    stamp, per_second = _STAMP[version]
+    kinds: dict[int, _Kind] = {}
+    begin = 5
     for _ in range(count):
-        kind, following = _kind(data, at, _STAMP[version][0])
-        if kind.number in kinds or kind.name in (each.name for each in kinds.values()):
-            raise ReadError(f"the event {kind.name!r} is described twice", offset=at)
-        kinds[kind.number], at = kind, following
-    return _Description(kinds, at, _STAMP[version][1])
+        kind, following = _kind(data, begin, stamp)
+        if kind.number in kinds or kind.name in (other.name for other in kinds.values()):
+            raise ReadError(f"the event {kind.name!r} is described twice", offset=begin)
+        kinds[kind.number], begin = kind, following
+    end, remarks = len(data) - 4, []
+    if zlib.crc32(memoryview(data)[:end]) != int.from_bytes(data[end:], "little"):
+        remarks.append("the checksum is wrong: the log was cut off or damaged")
+        end = len(data)
+    offsets, skipped = _events(data, kinds, begin, end, per_second)
+    if skipped:
+        size = sum(stretch for _, stretch in skipped)
+        remarks.append(
+            f"{size} bytes in {len(skipped)} places are not events of a known type and were "
+            f"skipped, the first at byte {skipped[0][0]}"
+        )
+    tables = {}
+    for number, kind in kinds.items():
+        if offsets[number].size:
+            rows = _events_of(data, kind, offsets[number])
+            names = [name for name in kind.layout.names or () if name not in (_ID, _TIME)]
+            units = {name: unit for name in names if (unit := _UNITS.get(name.partition(".")[0]))}
+            time = unwrap(rows[_TIME])[0] / per_second
+            tables[kind.name] = Table({name: rows[name] for name in names}, time, units)
+    if not tables:
+        raise ReadError("the log holds no event of the types it describes", offset=begin)
+    if len(kinds) == 1:
+        tables = {"": next(iter(tables.values()))}
+    return Log(tables, tuple(remarks), "crazyflie")
 
 
-def _kind(data: bytes, at: int, stamp: str) -> tuple[Kind, int]:
+def _kind(data: bytes, at: int, stamp: str) -> tuple[_Kind, int]:
     number, at = _short(data, at)
     name, at = _text(data, at)
     count, at = _short(data, at)
@@ -180,7 +172,7 @@ def _kind(data: bytes, at: int, stamp: str) -> tuple[Kind, int]:
                 offset=begin,
             )
         layout[variable[1]] = np.dtype(variable[2]).newbyteorder("<").str
-    return Kind(number, name, np.dtype(list(layout.items()))), at
+    return _Kind(number, name, np.dtype(list(layout.items()))), at
 
 
 def _short(data: bytes, at: int) -> tuple[int, int]:
@@ -197,24 +189,10 @@ def _text(data: bytes, at: int) -> tuple[str, int]:
     return text, end + 1
 
 
-def _table(data: bytes, kind: Kind, offsets: np.ndarray, per_second: float) -> Table:
+def _events_of(data: bytes, kind: _Kind, offsets: np.ndarray) -> np.ndarray:
+    """The events of one type as a structured array: a view where nothing is between them."""
     size = kind.layout.itemsize
     if (np.diff(offsets) == size).all():
-        rows = np.frombuffer(data, kind.layout, offsets.size, int(offsets[0]))
-    else:
-        raw = np.frombuffer(data, np.uint8)
-        rows = raw[offsets[:, None] + np.arange(size)].view(kind.layout)[:, 0]
-    names = [name for name in kind.layout.names or () if name not in (_ID, _TIME)]
-    units = {name: unit for name in names if (unit := _UNITS.get(name.partition(".")[0]))}
-    counter, _ = unwrap(rows[_TIME])
-    return Table({name: rows[name] for name in names}, counter / per_second, units)
-
-
-def _skipped(stretches: list[tuple[int, int]]) -> list[str]:
-    if not stretches:
-        return []
-    size = sum(each for _, each in stretches)
-    return [
-        f"{size} bytes in {len(stretches)} places are not events of a known type and were "
-        f"skipped, the first at byte {stretches[0][0]}"
-    ]
+        return np.frombuffer(data, kind.layout, offsets.size, int(offsets[0]))
+    buffer = np.frombuffer(data, np.uint8)
+    return buffer[offsets[:, None] + np.arange(size)].view(kind.layout)[:, 0]

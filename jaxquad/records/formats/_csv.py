@@ -1,116 +1,15 @@
 import csv
-import functools as ft
+import io
 from collections.abc import Iterator
 from pathlib import Path
-from types import ModuleType
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from .._clock import FEWEST
 from .._errors import ReadError
 from .._log import columns_of, Log, Table
-
-
-_WORTHWHILE = 1 << 20  # bytes: below, the import takes longer than the parsing
-_PART = 1 << 20  # bytes, of a thread; larger ones leave the cache
-_NUMBERS = b"0123456789+-.eEnNaAiIfF \t\n"  # with nan and inf
-
-
-def parsed_fast(
-    block: bytes, separator: str | None, into: Float[np.ndarray, "columns rows"]
-) -> int:
-    """Write the numbers of whole lines into the first rows; returns how many rows they were.
-
-    0 where they may be anything else, or without pyarrow. It gets no text but digits, signs and
-    separators, so it runs in this process.
-    """
-    if separator is None or len(block) < _WORTHWHILE:
-        return 0
-    if block.translate(None, _NUMBERS + separator.encode()):
-        return 0
-    arrow = _pyarrow()
-    if arrow is None:
-        return 0
-    names = [str(i) for i in range(len(into))]
-    csv = arrow.csv
-    try:
-        table = csv.read_csv(
-            arrow.BufferReader(block),
-            csv.ReadOptions(column_names=names, block_size=_PART),
-            csv.ParseOptions(delimiter=separator, quote_char=False, double_quote=False),
-            csv.ConvertOptions(
-                column_types=dict.fromkeys(names, arrow.float64()),
-                null_values=[],
-                check_utf8=False,
-            ),
-        )
-    except arrow.ArrowException:  # Says less of what is wrong than reading row by row does.
-        return 0
-    for row, column in zip(into, table.columns, strict=True):
-        place = 0
-        for chunk in column.chunks:
-            row[place : place + len(chunk)] = chunk.to_numpy()
-            place += len(chunk)
-    return table.num_rows
-
-
-@ft.cache
-def _pyarrow() -> ModuleType | None:
-    try:
-        import pyarrow
-        import pyarrow.csv
-    except ImportError:
-        return None
-    return pyarrow
-
-
-_PLAIN = np.zeros(256, dtype=bool)
-_PLAIN[list(b"0123456789+-.eEnNaAiIfF")] = True  # numbers, nan, inf
-
-
-def parsed(
-    block: bytes, separator: str | None, columns: int
-) -> Float[np.ndarray, "rows columns"] | None:
-    """The numbers of whole lines; None where they are not one plain number per cell."""
-    block = block.rstrip(b"\n")
-    if not block:
-        return np.empty((0, columns))
-    text = np.frombuffer(block, np.uint8)
-    blank = (text == ord(" ")) | (text == ord("\t"))
-    line_end = text == ord("\n")
-    mark = np.zeros_like(blank) if separator is None else text == ord(separator)
-    if not (_PLAIN[text] | blank | line_end | mark).all():
-        return None
-    if not _is_regular(blank & ~mark, line_end, mark, separator is None, columns):
-        return None
-    spaced = block if separator is None else block.replace(separator.encode(), b" ")
-    try:
-        numbers = np.fromstring(spaced.decode(), sep=" ")
-    except ValueError:  # Letters of numbers that make none.
-        return None
-    rows = int(line_end.sum()) + 1
-    return numbers.reshape(rows, columns) if numbers.size == rows * columns else None
-
-
-def _is_regular(
-    blank: Bool[np.ndarray, " bytes"],
-    line_end: Bool[np.ndarray, " bytes"],
-    mark: Bool[np.ndarray, " bytes"],
-    by_blanks: bool,
-    columns: int,
-) -> bool:
-    """Whether every line has so many cells, and each of them one word."""
-    solid = ~(blank | line_end | mark)
-    begins = solid & ~np.concatenate([[False], solid[:-1]])
-    words = np.cumsum(begins, dtype=np.int32)
-    stops = np.flatnonzero(line_end if by_blanks else line_end | mark)
-    per_cell = np.diff(words[stops], prepend=0, append=words[-1])
-    if (per_cell != (columns if by_blanks else 1)).any():
-        return False
-    line_words = np.diff(words[np.flatnonzero(line_end)], prepend=0, append=words[-1])
-    return bool((line_words == columns).all())
 
 
 Line = tuple[int, str]  # number in the file from 1, text
@@ -178,7 +77,10 @@ def _rows(content: bytes, header: _Header) -> Float[np.ndarray, "columns rows"]:
     values, rows = np.empty((len(names), _most_rows(content, place, len(names)))), 0
     for begin, end in _blocks(content, place):
         block = content[begin:end]
-        rows += _fill(values[:, rows:], block, number, names, separator)
+        table = _parse(block, separator, len(names))
+        table = _parse_rows(block, number, names, separator) if table is None else table
+        values[:, rows : rows + len(table)] = table.T
+        rows += len(table)
         number += block.count(b"\n")
     if not rows:
         raise ReadError(f"the file has only a header ({', '.join(names)}) and no row of numbers")
@@ -223,22 +125,6 @@ def _topics(content: bytes, header: _Header, error: _BlankCell) -> Log:
 def _most_rows(content: bytes, place: int, columns: int) -> int:
     """A row takes two bytes for each cell at least, however many line ends there are."""
     return min(content.count(b"\n", place) + 1, (len(content) - place + 1) // (2 * columns))
-
-
-def _fill(
-    values: Float[np.ndarray, "columns rows"],
-    block: bytes,
-    first: int,
-    names: list[str],
-    separator: str | None,
-) -> int:
-    """Write a block's rows by the fastest way that can be; returns their number."""
-    if rows := parsed_fast(block, separator, values):
-        return rows
-    table = parsed(block, separator, len(names))
-    table = _parse_rows(block, first, names, separator) if table is None else table
-    values[:, : len(table)] = table.T
-    return len(table)
 
 
 def _as_utf8(content: bytes) -> bytes:
@@ -319,6 +205,20 @@ def split(text: str, separator: str | None) -> list[str]:
     else:
         cells = text.split(separator)
     return [cell.strip() for cell in cells]
+
+
+def _parse(
+    block: bytes, separator: str | None, columns: int
+) -> Float[np.ndarray, "rows columns"] | None:
+    """The numbers of whole lines; None where they are not one plain number per cell."""
+    if not block.strip():
+        return np.empty((0, columns))
+    try:
+        text = io.StringIO(block.decode())
+        table = np.loadtxt(text, delimiter=separator, comments=None, ndmin=2)
+    except ValueError:  # says less of what is wrong than reading row by row does
+        return None
+    return table if table.shape[1] == columns else None
 
 
 def _parse_rows(

@@ -16,17 +16,8 @@ from .._log import add_columns, check_size, Log, Table
 
 _HEADER = 128
 _TYPES = {
-    1: "i1",
-    2: "u1",
-    3: "i2",
-    4: "u2",
-    5: "i4",
-    6: "u4",
-    7: "f4",
-    9: "f8",
-    12: "i8",
-    13: "u8",
-}
+    1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8",
+}  # fmt: skip
 _MATRIX, _COMPRESSED = 14, 15
 _STRUCT = 2
 _CLASSES = {
@@ -73,7 +64,7 @@ def load(path: Path) -> Log:
     remarks: list[str] = []
     budget = _Budget(len(content))
     for element in _elements(memoryview(content), order, _HEADER, 0):
-        variable = _inflated(element, order, budget)
+        variable = _inflate(element, order, budget) if element.kind == _COMPRESSED else element
         if variable.kind == _MATRIX:
             add_columns(arrays, _variable(variable, order, "", 0, budget), remarks)
     return Log({"": Table(arrays)}, tuple(remarks))
@@ -104,9 +95,7 @@ def _elements(content: memoryview, order: str, place: int, base: int) -> Iterato
         )
 
 
-def _inflated(element: _Element, order: str, budget: _Budget) -> _Element:
-    if element.kind != _COMPRESSED:
-        return element
+def _inflate(element: _Element, order: str, budget: _Budget) -> _Element:
     inflater = zlib.decompressobj()
     try:
         tag = inflater.decompress(element.body, 8)
@@ -142,52 +131,39 @@ def _variable(
     kind, is_complex = flags & 0xFF, flags & 0x0800
     count = int(np.prod(shape.astype(object)))
     if kind == _STRUCT and depth < _DEEPEST and len(parts) >= 5 and 1 <= count <= _MOST_STRUCTS:
-        return _structs(parts, order, name, count, depth, budget)
+        # The fields of a struct, or of an array of structs, one struct after the other.
+        size = parts[3].body[:4]
+        width = int(np.frombuffer(size, f"{order}i4")[0]) if len(size) == 4 else 0
+        table = bytes(parts[4].body) if width > 0 else b""
+        names = [
+            table[i : i + width].split(b"\0")[0].decode("latin-1")
+            for i in range(0, len(table), max(width, 1))
+        ]
+        owners = [f"{name}[{k}]" if count > 1 else name for k in range(count)]
+        paths = [f"{owner}.{field}" for owner in owners for field in names]
+        arrays: dict[str, np.ndarray] = {}
+        for path, part in zip(paths, parts[5:], strict=False):
+            if part.kind == _MATRIX:  # which has no name of its own
+                arrays |= _variable(part, order, path, depth + 1, budget)
+        return arrays
     if kind not in _CLASSES or is_complex or len(parts) < 4:
         return {}
-    # Numbers are stored in the smallest type that fits, regardless of their class.
-    numbers = _numbers(parts[3], order, name)
-    budget.take(numbers.size * np.dtype(_CLASSES[kind]).itemsize, matrix.offset)
-    return {name: _squeezed(numbers.astype(_CLASSES[kind]), shape, name, matrix.offset)}
-
-
-def _structs(
-    parts: list[_Element], order: str, name: str, count: int, depth: int, budget: _Budget
-) -> dict[str, np.ndarray]:
-    """The fields of a struct, or of an array of structs, one struct after the other."""
-    width = int(np.frombuffer(parts[3].body[:4], f"{order}i4")[0]) if len(parts[3].body) >= 4 else 0
-    if width <= 0:
-        return {}
-    table = bytes(parts[4].body)
-    names = [
-        table[i : i + width].split(b"\0")[0].decode("latin-1") for i in range(0, len(table), width)
-    ]
-    arrays: dict[str, np.ndarray] = {}
-    fields = [(f"{name}[{k}]" if count > 1 else name, n) for k in range(count) for n in names]
-    for (owner, field), part in zip(fields, parts[5:], strict=False):
-        if part.kind == _MATRIX:
-            # A field's matrix has no name of its own.
-            arrays |= _variable(part, order, f"{owner}.{field}", depth + 1, budget)
-    return arrays
-
-
-def _numbers(part: _Element, order: str, name: str) -> np.ndarray:
-    if part.kind not in _TYPES:
+    content, offset = parts[3].body, parts[3].offset
+    if parts[3].kind not in _TYPES:
         raise ReadError(
-            f"the variable {name!r} has the unknown type {part.kind}", offset=part.offset
+            f"the variable {name!r} has the unknown type {parts[3].kind}", offset=offset
         )
-    dtype = np.dtype(order + _TYPES[part.kind])
-    if len(part.body) % dtype.itemsize:
-        raise ReadError(f"the variable {name!r} ends within a number", offset=part.offset)
-    return np.frombuffer(part.body, dtype)
-
-
-def _squeezed(values: np.ndarray, shape: np.ndarray, name: str, offset: int) -> np.ndarray:
-    count = int(np.prod(shape.astype(object))) if shape.size else 0
-    if count != values.size or (shape < 0).any() or shape.size > 32:
+    # Numbers are stored in the smallest type that fits, regardless of their class.
+    dtype = np.dtype(order + _TYPES[parts[3].kind])
+    if len(content) % dtype.itemsize:
+        raise ReadError(f"the variable {name!r} ends within a number", offset=offset)
+    numbers = np.frombuffer(content, dtype)
+    budget.take(numbers.size * np.dtype(_CLASSES[kind]).itemsize, matrix.offset)
+    values = numbers.astype(_CLASSES[kind])
+    if (count if shape.size else 0) != values.size or (shape < 0).any() or shape.size > 32:
         raise ReadError(
             f"the variable {name!r} declares the shape {shape[:32].tolist()}, but holds "
             f"{values.size} numbers",
-            offset=offset,
+            offset=matrix.offset,
         )
-    return values.reshape(shape, order="F").squeeze()
+    return {name: values.reshape(shape, order="F").squeeze()}

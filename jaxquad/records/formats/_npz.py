@@ -1,7 +1,7 @@
 import io
 import zipfile
 from pathlib import Path
-from typing import Protocol, runtime_checkable
+from typing import IO
 
 import numpy as np
 
@@ -10,13 +10,6 @@ from .._log import add_columns, check_size, Log, Table
 
 
 _MAGIC = b"\x93NUMPY"
-
-
-@runtime_checkable
-class Stream(Protocol):
-    """A binary file that can be read."""
-
-    def read(self, size: int = -1, /) -> bytes: ...
 
 
 def sniff(head: bytes, path: Path) -> bool:
@@ -29,27 +22,25 @@ def load(path: Path) -> Log:
         magic = stream.read(len(_MAGIC))
         stream.seek(0)
         if magic == _MAGIC:
-            return Log({"": Table(_named("data", read_array("data", stream, path.stat().st_size)))})
+            array = _read_array("data", stream, path.stat().st_size)
+            return Log({"": Table(_named("data", array))})
         if not magic.startswith(b"PK"):
             raise ReadError("not a NumPy array, nor an archive of arrays", offset=0)
         size = path.stat().st_size
-        with _opened(stream, size) as archive:
+        try:
+            archive = zipfile.ZipFile(stream)
+        # On damaged archives zipfile raises almost anything, here and below.
+        except Exception as error:
+            reason = f"{type(error).__name__}: {error}"
+            raise ReadError(f"the archive is cut off or damaged ({reason})", offset=size) from error
+        arrays: dict[str, np.ndarray] = {}
+        remarks: list[str] = []
+        with archive:
             members = [member for member in archive.infolist() if not member.filename.endswith("/")]
             check_size("the archive", sum(member.file_size for member in members), size)
-            arrays: dict[str, np.ndarray] = {}
-            remarks: list[str] = []
             for member in members:
                 add_columns(arrays, _member(archive, member), remarks)
-        return Log({"": Table(arrays)}, tuple(remarks))
-
-
-def _opened(stream: io.BufferedIOBase, size: int) -> zipfile.ZipFile:
-    try:
-        return zipfile.ZipFile(stream)
-    # On damaged archives zipfile raises almost anything, here and below.
-    except Exception as error:
-        reason = f"{type(error).__name__}: {error}"
-        raise ReadError(f"the archive is cut off or damaged ({reason})", offset=size) from error
+    return Log({"": Table(arrays)}, tuple(remarks))
 
 
 def _member(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> dict[str, np.ndarray]:
@@ -59,7 +50,7 @@ def _member(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> dict[str, np.n
             if stream.read(len(_MAGIC)) != _MAGIC:
                 return {}
             stream.seek(0)
-            return _named(name, read_array(name, stream, member.file_size))
+            return _named(name, _read_array(name, stream, member.file_size))
     except ReadError:
         raise
     except Exception as error:
@@ -76,9 +67,20 @@ def _named(name: str, array: np.ndarray) -> dict[str, np.ndarray]:
     return {field: array[field] for field in fields} if fields else {name: array}
 
 
-def read_array(name: str, stream: Stream, size: int) -> np.ndarray:
+def _read_array(name: str, stream: io.BufferedIOBase | IO[bytes], size: int) -> np.ndarray:
     """The array of a .npy stream of `size` bytes, which holds at least what its header declares."""
-    shape, fortran, dtype = _header(name, stream)
+    read = np.lib.format.read_array_header_1_0, np.lib.format.read_array_header_2_0
+    try:
+        version = np.lib.format.read_magic(stream)
+        header = read[version[0] > 1](stream) if version in ((1, 0), (2, 0), (3, 0)) else None
+    # The header is a piece of Python: what is wrong with it shows as almost anything.
+    except Exception as error:
+        raise ReadError(
+            f"the header of the array {name!r} is cut off or damaged ({type(error).__name__})"
+        ) from error
+    if header is None:
+        raise ReadError(f"the array {name!r} has npy version {version}: only 1 to 3 are read")
+    shape, fortran, dtype = header
     if dtype.hasobject:
         raise ReadError(
             f"the array {name!r} is pickled, and reading it could run code: save it as numbers"
@@ -94,17 +96,3 @@ def read_array(name: str, stream: Stream, size: int) -> np.ndarray:
         raise ReadError(f"the array {name!r} has {len(content)} of {declared} bytes: it is cut off")
     stream.read(1)  # The end of an archive's member is where its checksum is looked at.
     return np.frombuffer(content, dtype).reshape(shape, order="F" if fortran else "C")
-
-
-def _header(name: str, stream: Stream) -> tuple[tuple[int, ...], bool, np.dtype]:
-    read = np.lib.format.read_array_header_1_0, np.lib.format.read_array_header_2_0
-    try:
-        version = np.lib.format.read_magic(stream)
-        if version in ((1, 0), (2, 0), (3, 0)):
-            return read[version[0] > 1](stream)
-    # The header is a piece of Python: what is wrong with it shows as almost anything.
-    except Exception as error:
-        raise ReadError(
-            f"the header of the array {name!r} is cut off or damaged ({type(error).__name__})"
-        ) from error
-    raise ReadError(f"the array {name!r} has npy version {version}: only 1 to 3 are read")

@@ -14,7 +14,7 @@ import json
 import subprocess
 import sys
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import NamedTuple
 
@@ -36,11 +36,10 @@ from . import (
 )
 
 
-HEAD = 4096  # bytes that `sniff` gets
+_HEAD = 4096  # bytes that `sniff` gets
 _LISTED = 8  # remarks shown one by one
 _CHILD = Path(__file__).with_name("_by_library.py")
 PATIENCE = 20.0  # s, beside what the size of the file allows
-_Listed = tuple[str, str, str, Sequence[int], str]  # table, column, dtype, shape, unit
 
 
 def _in_child(name: str, kind: str, *, per_megabyte: float = 0.1) -> Callable[[Path], Log]:
@@ -53,31 +52,8 @@ def _in_child(name: str, kind: str, *, per_megabyte: float = 0.1) -> Callable[[P
 
 
 def _load_in_child(name: str, kind: str, per_megabyte: float, path: Path) -> Log:
-    stored = sum(each.stat().st_size for each in _files(path))
-    header, _, content = _answer(name, path, kind, stored, per_megabyte).partition(b"\n")
-    found = json.loads(header)
-    if "missing" in found:
-        raise ReadError(
-            f"reading {kind} needs a further library ({found['missing']}): "
-            f'pip install "jaxquad[logs]"'
-        )
-    if "oversize" in found:
-        what, declared = found["oversize"]
-        raise ReadError(oversize(what, declared, stored))
-    if "error" in found:
-        raise ReadError(
-            f"cannot be read as {kind}: the file is cut off or damaged "
-            f"({printable(found['error'])})"
-        )
-    arrays = [tuple(each) for each in found["arrays"]]
-    return Log(_tables(arrays, content), tuple(found["remarks"]))
-
-
-def _files(path: Path) -> list[Path]:
-    return [each for each in path.iterdir() if each.is_file()] if path.is_dir() else [path]
-
-
-def _answer(name: str, path: Path, kind: str, stored: int, per_megabyte: float) -> bytes:
+    files = [file for file in path.iterdir() if file.is_file()] if path.is_dir() else [path]
+    stored = sum(file.stat().st_size for file in files)
     words = [str(_CHILD), name, str(path.absolute()), str(allowance(stored))]
     patience = PATIENCE + per_megabyte * stored / 1e6
     try:
@@ -96,23 +72,35 @@ def _answer(name: str, path: Path, kind: str, stored: int, per_megabyte: float) 
             f"cannot be read as {kind}: the library that decodes it crashed (exit status "
             f"{child.returncode}{said}). The file is probably damaged"
         )
-    return child.stdout
-
-
-def _tables(arrays: Sequence[_Listed], content: bytes) -> dict[str, Table]:
+    header, _, content = child.stdout.partition(b"\n")
+    answer = json.loads(header)
+    if "missing" in answer:
+        raise ReadError(
+            f"reading {kind} needs a further library ({answer['missing']}): "
+            f'pip install "jaxquad[logs]"'
+        )
+    if "oversize" in answer:
+        what, declared = answer["oversize"]
+        raise ReadError(oversize(what, declared, stored))
+    if "error" in answer:
+        raise ReadError(
+            f"cannot be read as {kind}: the file is cut off or damaged "
+            f"({printable(answer['error'])})"
+        )
     columns: dict[str, dict[str, np.ndarray]] = {}
     units: dict[str, dict[str, str]] = {}
     place = 0
-    for table, name, dtype, shape, unit in arrays:
+    for table, column, dtype, shape, unit in answer["arrays"]:
         count = int(np.prod(shape, dtype=object))
         values = np.frombuffer(content, dtype, count, place).reshape(shape)
-        columns.setdefault(table, {})[name] = values
-        units.setdefault(table, {})[name] = unit
+        columns.setdefault(table, {})[column] = values
+        units.setdefault(table, {})[column] = unit
         place += values.nbytes
-    return {
+    tables = {
         table: Table(named, named.pop("time") if table else None, units[table])
         for table, named in columns.items()
     }
+    return Log(tables, tuple(answer["remarks"]))
 
 
 class Reader(NamedTuple):
@@ -197,7 +185,18 @@ def load_log(path: str | Path) -> Log:
             f"{printable(str(path))}: the file cannot be opened "
             f"({type(error).__name__}: {printable(str(error))})."
         ) from error
-    log = _load_guarded(reader, path)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            log = reader.load(path)
+    except ReadError as error:
+        raise located(error, path) from error.__cause__
+    # A damaged file makes zipfile, zlib, numpy, HDF5 and their like raise almost anything.
+    except Exception as error:
+        raise ReadError(
+            f"{path}: cannot be read as {reader.kind}: the file is cut off or damaged "
+            f"({type(error).__name__}: {printable(str(error))})."
+        ) from error
     remarks = list(log.remarks[:_LISTED])
     if len(log.remarks) > _LISTED:
         remarks.append(f"{len(log.remarks) - _LISTED} more remarks of this kind")
@@ -208,7 +207,13 @@ def load_log(path: str | Path) -> Log:
 
 def _choose_reader(path: Path) -> Reader:
     """By the first bytes of the file, else by the ending of its name."""
-    head = _head(path)
+    require_file(path)
+    head = b""
+    if not path.is_dir():
+        with path.open("rb") as file:
+            head = file.read(_HEAD)
+        if not head:
+            raise ReadError(f"{path}: the file is empty.", offset=0)
     suffix = path.suffix.lower()
     readers = [*(log.reader for log in registered_logs() if log.reader), *READERS.values()]
     by_content = (reader for reader in readers if reader.sniff(head, path))
@@ -217,11 +222,11 @@ def _choose_reader(path: Path) -> Reader:
     if reader is None:
         if path.is_dir():
             raise ReadError(f"{path} is a folder, and no bag of ROS 2: name the file in it.")
-        known = ", ".join(each for reader in READERS.values() for each in reader.suffixes)
+        suffixes = ", ".join(ending for reader in READERS.values() for ending in reader.suffixes)
         ending = f"ending {suffix!r}" if suffix else "name, which has no ending,"
         raise ReadError(
             f"{path}: unknown file format: neither the first bytes nor the {ending} are those of "
-            f"a known one ({known}). Convert the file«, or build a jq.Record from its arrays»."
+            f"a known one ({suffixes}). Convert the file«, or build a jq.Record from its arrays»."
         )
     return reader
 
@@ -232,29 +237,3 @@ def require_file(path: str | Path) -> None:
     if not (path.is_dir() or path.is_file()):
         missing = f"there is no such file in {path.resolve().parent}"
         raise ReadError(f"{path}: {'it is not a regular file' if path.exists() else missing}.")
-
-
-def _head(path: Path) -> bytes:
-    require_file(path)
-    if path.is_dir():
-        return b""
-    with path.open("rb") as file:
-        head = file.read(HEAD)
-    if not head:
-        raise ReadError(f"{path}: the file is empty.", offset=0)
-    return head
-
-
-def _load_guarded(reader: Reader, path: Path) -> Log:
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            return reader.load(path)
-    except ReadError as error:
-        raise located(error, path) from error.__cause__
-    # A damaged file makes zipfile, zlib, numpy, HDF5 and their like raise almost anything.
-    except Exception as error:
-        raise ReadError(
-            f"{path}: cannot be read as {reader.kind}: the file is cut off or damaged "
-            f"({type(error).__name__}: {printable(str(error))})."
-        ) from error

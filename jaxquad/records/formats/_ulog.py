@@ -4,7 +4,7 @@ import bisect
 import dataclasses
 import re
 import struct
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import NamedTuple
 
@@ -14,7 +14,7 @@ from .._errors import ReadError
 from .._log import changes_of, describe_skips, Log, Table
 
 
-LARGEST = 65_535  # bytes of a message: its length is a 16-bit number
+_LARGEST = 65_535  # bytes of a message: its length is a 16-bit number
 _DEEPEST = 16  # formats within formats
 _MOST_COLUMNS = 50_000  # of all topics together; a large log has some 8000
 _WIDEST = 5000  # columns of one topic; the widest of PX4 has some 400
@@ -33,10 +33,9 @@ Formats = Mapping[str, tuple[Field, ...]]
 
 
 @dataclasses.dataclass
-class Topic:
+class _Topic:
     """One subscription: how its messages are laid out, and where their bytes begin."""
 
-    label: str
     dtype: np.dtype
     units: dict[str, str]
     offsets: list[int] = dataclasses.field(default_factory=list)
@@ -46,12 +45,12 @@ class Topic:
 
 
 @dataclasses.dataclass
-class Messages:
+class _Messages:
     """What the messages of a log have said so far."""
 
     formats: dict[str, tuple[Field, ...]] = dataclasses.field(default_factory=dict)
-    current: dict[int, Topic] = dataclasses.field(default_factory=dict)  # by message number
-    topics: dict[str, Topic] = dataclasses.field(default_factory=dict)  # by label
+    current: dict[int, _Topic] = dataclasses.field(default_factory=dict)  # by message number
+    topics: dict[str, _Topic] = dataclasses.field(default_factory=dict)  # by label
     layouts: dict[str, np.dtype] = dataclasses.field(default_factory=dict)  # by format
     appended: list[int] = dataclasses.field(default_factory=list)  # offsets of further parts
     dropouts: list[int] = dataclasses.field(default_factory=list)  # ms
@@ -63,10 +62,10 @@ class Messages:
 
     def limit(self, place: int, end: int) -> int:
         """Where the part of the file that holds `place` ends."""
-        return min((each for each in self.appended if place < each < end), default=end)
+        return min((begin for begin in self.appended if place < begin < end), default=end)
 
 
-MAGIC = b"ULog\x01\x12\x35"
+_MAGIC = b"ULog\x01\x12\x35"
 _BEGIN = 16  # bytes of file header
 _KINDS = frozenset(b"BFIMPQARDLCSO")
 _DATA = ord("D")
@@ -75,7 +74,7 @@ _SPARE = 64  # bytes that a message may be longer than its fields
 
 
 def sniff(head: bytes, path: Path) -> bool:
-    return head.startswith(MAGIC)
+    return head.startswith(_MAGIC)
 
 
 def load(path: Path) -> Log:
@@ -86,28 +85,43 @@ def load(path: Path) -> Log:
     messages, skipped, place = _scan(data)
     if not messages.topics:
         raise ReadError("the file logs no topic: it is cut off or damaged", offset=place)
-    remarks = describe_skips(skipped, place, len(data)) + _remarks(messages)
-    tables = {name: _table(data, each) for name, each in messages.topics.items() if each.offsets}
+    tables = {}
+    for name, topic in messages.topics.items():
+        if topic.offsets:
+            buffer = np.frombuffer(data, np.uint8)
+            windows = np.lib.stride_tricks.sliding_window_view(buffer, topic.length)
+            rows = windows[np.array(topic.offsets)].view(topic.dtype)[:, 0]
+            shown = [name for name in topic.dtype.names or () if "_padding" not in name]
+            columns = {name: rows[name] for name in shown if name != "timestamp"}
+            tables[name] = Table(columns, rows["timestamp"] * 1e-6, topic.units)
+    remarks = [*describe_skips(skipped, place, len(data)), *messages.notes]
+    if messages.stray:
+        remarks.append(f"{messages.stray} messages of unknown topics were left out")
+    if lost := messages.dropouts:
+        remarks.append(
+            f"the logger lost data {len(lost)} times, {sum(lost)} ms in all, the longest dropout "
+            f"{max(lost)} ms: samples are missing there"
+        )
     changes = changes_of(messages.stamped, lambda place: _time_before(data, messages, place))
     return Log(tables, tuple(remarks), "px4", messages.settings, changes)
 
 
-def _time_before(data: bytes, messages: Messages, place: int) -> float | None:
+def _time_before(data: bytes, messages: _Messages, place: int) -> float | None:
     """The time of the last data message before a byte of the file; None before the first."""
-    found, last = None, -1
+    latest, last = None, -1
     for topic in messages.topics.values():
         k = bisect.bisect_left(topic.offsets, place)
         if k and topic.offsets[k - 1] > last:
-            found, last = topic, topic.offsets[k - 1]
-    if found is None:
+            latest, last = topic, topic.offsets[k - 1]
+    if latest is None:
         return None
-    stamp = last + (found.dtype.fields or {})["timestamp"][1]
+    stamp = last + (latest.dtype.fields or {})["timestamp"][1]
     return 1e-6 * int.from_bytes(data[stamp : stamp + 8], "little")
 
 
-def _scan(data: bytes) -> tuple[Messages, list[tuple[int, int]], int]:
+def _scan(data: bytes) -> tuple[_Messages, list[tuple[int, int]], int]:
     """What the messages say, the damaged blocks that were skipped, and where they end."""
-    messages, skipped = Messages(), []
+    messages, skipped = _Messages(), []
     current = messages.current
     place, limit = _BEGIN, len(data)
     while place + 3 <= len(data):
@@ -122,7 +136,7 @@ def _scan(data: bytes) -> tuple[Messages, list[tuple[int, int]], int]:
         if after > limit < len(data):
             place, limit = limit, messages.limit(limit, len(data))
         elif after <= limit and _follows(data, after, kind):
-            interpret(kind, data[place + 3 : after], place, messages)
+            _interpret(kind, data[place + 3 : after], place, messages)
             limit = messages.limit(after, len(data))
             place = after
         else:
@@ -139,7 +153,7 @@ def _follows(data: bytes, after: int, kind: int) -> bool:
     return kind in _KINDS and (after + 3 > len(data) or data[after + 2] in _KINDS)
 
 
-def _resumed(data: bytes, place: int, messages: Messages) -> int:
+def _resumed(data: bytes, place: int, messages: _Messages) -> int:
     """Where the next data message begins that fits its topic and that another one follows."""
     while (kind := data.find(b"D", place + 2)) >= 0 and kind + 3 <= len(data):
         place = kind - 2
@@ -152,27 +166,6 @@ def _resumed(data: bytes, place: int, messages: Messages) -> int:
     return len(data)
 
 
-def _table(data: bytes, topic: Topic) -> Table:
-    windows = np.lib.stride_tricks.sliding_window_view(np.frombuffer(data, np.uint8), topic.length)
-    rows = windows[np.array(topic.offsets)].view(topic.dtype)[:, 0]
-    shown = [name for name in topic.dtype.names or () if "_padding" not in name]
-    columns = {name: rows[name] for name in shown if name != "timestamp"}
-    return Table(columns, rows["timestamp"] * 1e-6, topic.units)
-
-
-def _remarks(messages: Messages) -> list[str]:
-    remarks = list(messages.notes)
-    if messages.stray:
-        remarks.append(f"{messages.stray} messages of unknown topics were left out")
-    lost: Sequence[int] = messages.dropouts
-    if lost:
-        remarks.append(
-            f"the logger lost data {len(lost)} times, {sum(lost)} ms in all, the longest dropout "
-            f"{max(lost)} ms: samples are missing there"
-        )
-    return remarks
-
-
 _BASIC = {
     "int8_t": "i1", "uint8_t": "u1", "int16_t": "<i2", "uint16_t": "<u2", "int32_t": "<i4",
     "uint32_t": "<u4", "int64_t": "<i8", "uint64_t": "<u8", "float": "<f4", "double": "<f8",
@@ -181,18 +174,7 @@ _BASIC = {
 _FIELD = re.compile(r"(\w+)(?:\[(\d{1,9})\])? (\w+)", re.ASCII)
 
 
-def parse_format(text: str, offset: int) -> tuple[str, tuple[Field, ...]]:
-    """`name:type field;type[4] field;` as the name and the fields. Raises ReadError."""
-    name, colon, body = text.partition(":")
-    parts = [part.strip() for part in body.split(";") if part.strip()]
-    matches = [_FIELD.fullmatch(part) for part in parts]
-    if not name or not colon or not parts or not all(matches):
-        raise ReadError(f"{text[:60]!r} is not a definition of a format", offset=offset)
-    fields = [Field(m[1], None if m[2] is None else int(m[2]), m[3]) for m in matches if m]
-    return name, tuple(fields)
-
-
-def layout(name: str, formats: Formats, offset: int, *, most: int = LARGEST) -> np.dtype:
+def _layout(name: str, formats: Formats, offset: int, most: int) -> np.dtype:
     """The bytes of one message as columns; those of a nested format are `field.column`.
 
     Padding at the end is left out, as the logger leaves it out. Raises ReadError, also for
@@ -203,7 +185,7 @@ def layout(name: str, formats: Formats, offset: int, *, most: int = LARGEST) -> 
     for column, kind in _columns(name, "", formats, offset, 0):
         fields.append((column, kind))
         size += np.dtype(kind).itemsize
-        if size > LARGEST or len(fields) > most:
+        if size > _LARGEST or len(fields) > most:
             raise ReadError(f"the format {name!r} is implausibly long", offset=offset)
     while fields and fields[-1][0].rpartition(".")[2].startswith("_padding"):
         fields.pop()
@@ -221,7 +203,7 @@ def _columns(
         why = "contains itself" if name in formats else "is not defined"
         raise ReadError(f"the format {name!r} {why}", offset=offset)
     for field in formats[name]:
-        if (field.count or 0) > LARGEST:
+        if (field.count or 0) > _LARGEST:
             raise ReadError(f"{name}.{field.name} has {field.count} elements", offset=offset)
         column = prefix + field.name
         if field.kind in _BASIC:
@@ -252,38 +234,55 @@ _KNOWN = {
 _ENDINGS = {"_m_s2": "m/s^2", "_m_s": "m/s", "_rad": "rad", "_rad_s": "rad/s", "_v": "V", "_a": "A"}
 
 
-def units_of(topic: str, columns: Iterable[str]) -> dict[str, str]:
+def _units_of(topic: str, columns: Iterable[str]) -> dict[str, str]:
     """The unit of each column whose unit is known, by topic or by the ending of its name."""
-    known = dict(_KNOWN.get(topic, {}))
+    units = dict(_KNOWN.get(topic, {}))
     for name in columns:
         for ending, unit in _ENDINGS.items():
             if name.endswith(ending):
-                known.setdefault(name, unit)
-    return known
+                units.setdefault(name, unit)
+    return units
 
 
 _APPENDED = 1  # the one incompatible flag that is understood
 _NUMBERS = {"float": "<f", "int32_t": "<i", "uint32_t": "<I", "uint64_t": "<Q", "double": "<d"}
 
 
-def interpret(kind: int, body: bytes, place: int, messages: Messages) -> None:
+def _interpret(kind: int, body: bytes, place: int, messages: _Messages) -> None:
     """Interpret one message that is not data; a damaged one is left out with a remark.
 
     Raises ReadError for a file that needs a newer reader.
     """
     letter = chr(kind)
     if letter == "B":
-        _flags(body, place, messages)
+        if len(body) < 40:
+            raise ReadError("the flags of the file are cut off", offset=place)
+        incompatible = int.from_bytes(body[8:16], "little")
+        if incompatible & ~_APPENDED:
+            raise ReadError(
+                f"the file needs a newer reader: its incompatible flags are {incompatible:#x}",
+                offset=place,
+            )
+        if incompatible & _APPENDED:
+            messages.appended += sorted(filter(None, struct.unpack_from("<3Q", body, 16)))
         return
     try:
         if letter == "F":
-            _define(body, place, messages)
+            _define(body.decode(), place, messages)
         elif letter == "A":
             _subscribe(body, place, messages)
         elif letter == "R":
             messages.current.pop(*struct.unpack_from("<H", body), None)
         elif letter in "IP":
-            _setting(letter, body, place, messages)
+            kind_of_value, _, name = body[1 : 1 + body[0]].decode().partition(" ")
+            value = body[1 + body[0] :]
+            if kind_of_value.startswith("char["):
+                messages.settings[name] = value.decode("utf-8", "replace")
+            elif kind_of_value in _NUMBERS:
+                number = struct.unpack_from(_NUMBERS[kind_of_value], value)[0]
+                messages.settings[name] = f"{number:.9g}"
+                if letter == "P" and len(messages.stamped) < _MOST_PARAMETERS:
+                    messages.stamped.append((place, name, messages.settings[name]))
         elif letter == "O":
             messages.dropouts += struct.unpack_from("<H", body)
         elif letter == "D":
@@ -294,33 +293,26 @@ def interpret(kind: int, body: bytes, place: int, messages: Messages) -> None:
             messages.notes.append(f"message {letter} at byte {place} was left out: {reason}")
 
 
-def _flags(body: bytes, place: int, messages: Messages) -> None:
-    if len(body) < 40:
-        raise ReadError("the flags of the file are cut off", offset=place)
-    incompatible = int.from_bytes(body[8:16], "little")
-    if incompatible & ~_APPENDED:
-        raise ReadError(
-            f"the file needs a newer reader: its incompatible flags are {incompatible:#x}",
-            offset=place,
-        )
-    if incompatible & _APPENDED:
-        messages.appended += sorted(filter(None, struct.unpack_from("<3Q", body, 16)))
-
-
-def _define(body: bytes, place: int, messages: Messages) -> None:
-    name, fields = parse_format(body.decode(), place)
+def _define(text: str, place: int, messages: _Messages) -> None:
+    """Take `name:type field;type[4] field;`."""
+    name, colon, body = text.partition(":")
+    parts = [part.strip() for part in body.split(";") if part.strip()]
+    matches = [_FIELD.fullmatch(part) for part in parts]
+    if not name or not colon or not parts or not all(matches):
+        raise ReadError(f"{text[:60]!r} is not a definition of a format", offset=place)
+    fields = tuple(Field(m[1], None if m[2] is None else int(m[2]), m[3]) for m in matches if m)
     if messages.formats.setdefault(name, fields) != fields:
         raise ReadError(f"the format {name!r} is defined twice, differently", offset=place)
 
 
-def _subscribe(body: bytes, place: int, messages: Messages) -> None:
+def _subscribe(body: bytes, place: int, messages: _Messages) -> None:
     instance, number = struct.unpack_from("<BH", body)
     messages.current.pop(number, None)
     name = body[3:].decode()
     if name in messages.formats and name not in messages.layouts:
         most = min(_WIDEST, messages.columns_left)
         messages.columns_left -= most  # What fails has cost as much time as what is too wide.
-        dtype = layout(name, messages.formats, place, most=most)
+        dtype = _layout(name, messages.formats, place, most)
         messages.columns_left += most - len(dtype.names or ())
         messages.layouts[name] = dtype
     if name not in messages.layouts:
@@ -329,18 +321,5 @@ def _subscribe(body: bytes, place: int, messages: Messages) -> None:
     if "timestamp" not in (dtype.names or ()) or dtype["timestamp"] != np.dtype("<u8"):
         raise ReadError(f"the format {name!r} has no timestamp", offset=place)
     label = f"{name}[{instance}]" if instance else name
-    topic = messages.topics.setdefault(
-        label, Topic(label, dtype, units_of(name, dtype.names or ()))
-    )
-    messages.current[number] = topic
-
-
-def _setting(letter: str, body: bytes, place: int, messages: Messages) -> None:
-    kind, _, name = body[1 : 1 + body[0]].decode().partition(" ")
-    value = body[1 + body[0] :]
-    if kind.startswith("char["):
-        messages.settings[name] = value.decode("utf-8", "replace")
-    elif kind in _NUMBERS:
-        messages.settings[name] = f"{struct.unpack_from(_NUMBERS[kind], value)[0]:.9g}"
-        if letter == "P" and len(messages.stamped) < _MOST_PARAMETERS:
-            messages.stamped.append((place, name, messages.settings[name]))
+    topic = _Topic(dtype, _units_of(name, dtype.names or ()))
+    messages.current[number] = messages.topics.setdefault(label, topic)
