@@ -14,7 +14,7 @@ from jaxtyping import Complex, Float, Int, Real
 from jaxquad.records import Record
 
 from ._checks import in_hertz
-from ._nonlinearity import (
+from ._harmonics import (
     fast_length,
     interpolated,
     local_mean,
