@@ -19,7 +19,7 @@ from ._checks import (
 from ._estimators import Composite, JointInputOutput, LocalPolynomial, Periodic, Welch
 from ._feedback import remarks_on_feedback
 from ._frequency_response import FrequencyResponse
-from ._invariance import remarks_on_linearity
+from ._linearity import remarks_on_linearity
 from ._local_polynomial import estimate_local_polynomial, LocalEstimate
 from ._periodic import estimate_periodic, PeriodicEstimate
 from ._remarks import Remark, Remarks

@@ -21,8 +21,8 @@ from ._estimators import Composite, Welch
 from ._feedback import remarks_on_feedback
 from ._fourier_sums import fourier_sums, Taper
 from ._frequency_response import FrequencyResponse
-from ._invariance import remarks_on_linearity
 from ._leakage import cross_products, shows_leakage, Slopes
+from ._linearity import remarks_on_linearity
 from ._noise import covariance_of_windows, smoothed
 from ._remarks import Remark, Remarks
 from ._windows import coefficients, lattice_windows, Layout, segment_starts
