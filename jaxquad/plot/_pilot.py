@@ -8,8 +8,16 @@ import numpy as np
 from jaxquad.identify import GainBand
 
 from ._curves import FlownAgain, Spectrum, StepBand, ThrottleCurve
-from ._labels import few_ticks, look_of, plain_ticks
-from ._panels import arrange, Given, legend_of, Panels, stacked
+from ._panels import (
+    arrange,
+    AxesLike,
+    few_ticks,
+    legend_of,
+    look_of,
+    Panels,
+    plain_ticks,
+    stacked,
+)
 
 
 _POINTS = 200
@@ -29,7 +37,7 @@ class Filters(Protocol):
 
 
 def filters_figure(
-    chains: Mapping[str, Sequence[Filters]], *, ax: Given = None, title: str = ""
+    chains: Mapping[str, Sequence[Filters]], *, ax: AxesLike = None, title: str = ""
 ) -> Panels:
     """Draw magnitude and delay of filters over the frequency.
 
@@ -61,7 +69,7 @@ def filters_figure(
 
 def spectra_figure(
     gyro: Mapping[str, Spectrum], derivative: Mapping[str, Spectrum], *, unit: str = "",
-    ax: Given = None, title: str = "",
+    ax: AxesLike = None, title: str = "",
 ) -> Panels:  # fmt: skip
     """Draw the gyro's noise and the D term's, before and behind filters.
 
@@ -98,7 +106,7 @@ def spectra_figure(
 
 
 def steps_figure(
-    steps: Mapping[str, StepBand], *, label: str = "rate after a step of 1", ax: Given = None,
+    steps: Mapping[str, StepBand], *, label: str = "rate after a step of 1", ax: AxesLike = None,
     title: str = "",
 ) -> Panels:  # fmt: skip
     """Draw step responses with the band of the plants that are possible.
@@ -127,7 +135,7 @@ def steps_figure(
     return _finished(panels, (2.8,), title)
 
 
-def again_figure(flight: FlownAgain, *, ax: Given = None, title: str = "") -> Panels:
+def again_figure(flight: FlownAgain, *, ax: AxesLike = None, title: str = "") -> Panels:
     """Draw a part of a flight, logged and simulated, and what is between them.
 
     **Arguments:**
@@ -153,7 +161,7 @@ def again_figure(flight: FlownAgain, *, ax: Given = None, title: str = "") -> Pa
 
 def b0_figure(
     levels: GainBand, taken: Mapping[str, ThrottleCurve], *, curve: GainBand | None = None,
-    ax: Given = None, title: str = "",
+    ax: AxesLike = None, title: str = "",
 ) -> Panels:  # fmt: skip
     """Draw b0 over the throttle: of a log with its 95 % band, and as a firmware takes it.
 
@@ -187,7 +195,7 @@ def b0_figure(
 
 
 def balance_figure(
-    terms: Mapping[str, float], *, unit: str = "", ax: Given = None, title: str = ""
+    terms: Mapping[str, float], *, unit: str = "", ax: AxesLike = None, title: str = ""
 ) -> Panels:
     """Draw how large P, I, D and F were, as bars of their root mean squares.
 
