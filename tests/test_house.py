@@ -51,3 +51,11 @@ def test_what_knows_the_compilers_has_one_door():
     for path in outside:
         names = {".".join(name[:2]) for name in imports(path)}
         assert "jaxquad._xla" not in names, f"{path} imports jaxquad._xla"
+
+
+def test_no_file_but_its_own_asks_whether_a_firmware_is_the_one():
+    firmwares = {"ardupilot", "px4", "betaflight", "crazyflie"}
+    for path in (path for path in FILES if not {*firmwares, "formats"} & {*path.parts}):
+        for node in ast.walk(ast.parse(path.read_text())):
+            words = [x.value for x in ast.walk(node) if isinstance(x, ast.Constant)]
+            assert not (isinstance(node, ast.Compare) and firmwares & {*words}), (path, node.lineno)

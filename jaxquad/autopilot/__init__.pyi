@@ -3,13 +3,6 @@ from ._adrc_loops import Flown as Flown, gyro_filters as gyro_filters
 from ._adrc_result import ADRCAutopilot as ADRCAutopilot, doubted_throttle as doubted_throttle
 from ._adrc_stages import ADRCStage as ADRCStage, ADRCTargets as ADRCTargets
 from ._axes_proposal import AxesProposal as AxesProposal
-from ._choices import (
-    change_filters as change_filters,
-    filter_choices as filter_choices,
-    FilterChoice as FilterChoice,
-    FilterOption as FilterOption,
-    flown_loop as flown_loop,
-)
 from ._files import (
     change_table as change_table,
     parameter_file as parameter_file,
@@ -18,6 +11,11 @@ from ._files import (
     propose_changes as propose_changes,
     WordChange as WordChange,
     write_parameter_files as write_parameter_files,
+)
+from ._filter_choices import (
+    change_filters as change_filters,
+    filter_choices as filter_choices,
+    flown_loop as flown_loop,
 )
 from ._filters import (
     ardupilot_notch as ardupilot_notch,
@@ -33,18 +31,23 @@ from ._filters import (
     PT3 as PT3,
     Section as Section,
 )
+from ._firmware import (
+    Channels as Channels,
+    FilterChoice as FilterChoice,
+    FilterOption as FilterOption,
+    Firmware as Firmware,
+    firmware_named as firmware_named,
+    HOVER as HOVER,
+    LowPass as LowPass,
+    Numbers as Numbers,
+    OuterLoop as OuterLoop,
+    Parameter as Parameter,
+    register as register,
+    rows_of_axes as rows_of_axes,
+)
 from ._flight_channels import (
     FlightChannels as FlightChannels,
-    HOVER as HOVER,
     read_channels_if_any as read_channels_if_any,
-)
-from ._flown import (
-    ardupilot_loop as ardupilot_loop,
-    betaflight_loop as betaflight_loop,
-    FlownArduPilot as FlownArduPilot,
-    FlownBetaflight as FlownBetaflight,
-    FlownLoop as FlownLoop,
-    px4_loop as px4_loop,
 )
 from ._flown_autopilot import (
     FlownAutopilot as FlownAutopilot,
@@ -73,9 +76,13 @@ from ._gains import (
 )
 from ._law import (
     AngleLoop as AngleLoop,
+    filter_gyro as filter_gyro,
     FirmwareLoop as FirmwareLoop,
+    FlownLoop as FlownLoop,
+    gyro_rest as gyro_rest,
     LoopState as LoopState,
     pick_axis as pick_axis,
+    RateLoop as RateLoop,
 )
 from ._law_check import check_law as check_law
 from ._loop_check import check_loop as check_loop
@@ -89,49 +96,47 @@ from ._page import (
 from ._parameters import (
     check_ranges as check_ranges,
     find_parameter as find_parameter,
-    Firmware as Firmware,
     firmware_of as firmware_of,
     list_parameters as list_parameters,
-    Parameter as Parameter,
     PARAMETERS as PARAMETERS,
     store_parameters as store_parameters,
     with_parameters as with_parameters,
 )
 from ._proposal import AutopilotProposal as AutopilotProposal
 from ._rate_design import design_gains as design_gains
-from ._rate_gains import gyro_chains as gyro_chains
-from ._recipe import what_to_fly as what_to_fly
 from ._replay import (
     fly_again as fly_again,
     HeldPlant as HeldPlant,
-    replay_terms as replay_terms,
-)
-from ._reproduce import (
     hold_response as hold_response,
     predict_loop as predict_loop,
-    without_gyro_filters as without_gyro_filters,
+    replay_terms as replay_terms,
 )
 from ._reproduce_flight import (
     FlownController as FlownController,
     reproduce_flight as reproduce_flight,
     Reproduction as Reproduction,
 )
+from .ardupilot._firmware import ardupilot_loop as ardupilot_loop, FlownArduPilot as FlownArduPilot
 from .ardupilot._harmonic_notch import (
     ardupilot_harmonic_notch as ardupilot_harmonic_notch,
     HarmonicNotch as HarmonicNotch,
 )
 from .ardupilot._law import ArduPilotAttitude as ArduPilotAttitude, ArduPilotRate as ArduPilotRate
-from .betaflight._demo_flight import CHIRP_TRUTH as CHIRP_TRUTH, write_chirp_log as write_chirp_log
-from .betaflight._flown_adrc import (
+from .betaflight._adrc import (
+    adrc_b0 as adrc_b0,
     adrc_parameters as adrc_parameters,
     b0_law as b0_law,
     betaflight_adrc_loop as betaflight_adrc_loop,
+    BetaflightADRC as BetaflightADRC,
     flies_adrc as flies_adrc,
     FlownADRC as FlownADRC,
 )
+from .betaflight._demo_flight import CHIRP_TRUTH as CHIRP_TRUTH, write_chirp_log as write_chirp_log
+from .betaflight._header import (
+    betaflight_loop as betaflight_loop,
+    FlownBetaflight as FlownBetaflight,
+)
 from .betaflight._law import (
-    adrc_b0 as adrc_b0,
-    BetaflightADRC as BetaflightADRC,
     BetaflightAngle as BetaflightAngle,
     BetaflightPID as BetaflightPID,
     DMax as DMax,
@@ -143,4 +148,4 @@ from .crazyflie._firmware import (
     CrazyflieAttitude as CrazyflieAttitude,
     CrazyflieRate as CrazyflieRate,
 )
-from .px4._firmware import PX4Attitude as PX4Attitude, PX4Rate as PX4Rate
+from .px4._firmware import px4_loop as px4_loop, PX4Attitude as PX4Attitude, PX4Rate as PX4Rate

@@ -29,7 +29,7 @@ from ._adrc_stages import (
 from ._parameters import store_parameters
 from ._rate_design import Kind
 from ._rate_gains import LoopQualities
-from .betaflight._flown_adrc import FlownADRC
+from .betaflight._adrc import FlownADRC
 
 
 _LAW: B0Law = "SQRT"  # of the firmware by default

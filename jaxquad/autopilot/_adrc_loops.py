@@ -11,9 +11,9 @@ from jaxtyping import Complex, Float
 from jaxquad.identify import B0Schedule, draw_models, GainOverThrottle
 
 from ._filters import FilterChain, PT2
-from ._flown import FlownBetaflight
 from ._rate_gains import cells_of, hold_plants, law_responses, LoopQualities, RateLoops
-from .betaflight._flown_adrc import FlownADRC
+from .betaflight._adrc import FlownADRC
+from .betaflight._header import FlownBetaflight
 
 
 Designs = Float[np.ndarray, "designs 3"]  # wc, wo, b0

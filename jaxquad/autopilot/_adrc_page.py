@@ -22,7 +22,7 @@ from ._pilot_page import (
     StepGrid,
     VERDICTS,
 )
-from .betaflight._flown_adrc import FlownADRC
+from .betaflight._adrc import FlownADRC
 
 
 if TYPE_CHECKING:

@@ -20,7 +20,7 @@ from ._page import write_pilot_page
 from ._parameters import find_parameter
 from ._rate_design import Kind
 from ._reproduce_flight import Reproduction
-from .betaflight._flown_adrc import adrc_parameters, b0_law, FlownADRC
+from .betaflight._adrc import adrc_parameters, b0_law, FlownADRC
 
 
 _BUILD = (2026, 6)  # whose names a file of the ADRC has

@@ -8,8 +8,9 @@ import numpy as np
 from jaxtyping import Float
 
 from ._adrc_loops import ADRCLoop, Designs
+from ._firmware import Parameter
 from ._limits import beyond_limits
-from ._parameters import find_parameter, Parameter
+from ._parameters import find_parameter
 from ._rate_design import Kind
 from ._rate_gains import LoopQualities
 

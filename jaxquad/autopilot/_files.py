@@ -1,22 +1,14 @@
 """Parameter files that a ground station or a command line loads into a flight controller."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
-
-import numpy as np
 
 from jaxquad._core import Number, write_file
 from jaxquad.records import AXES
 
-from ._parameters import (
-    check_ranges,
-    find_parameter,
-    Firmware,
-    Parameter,
-    PARAMETERS,
-    store_parameters,
-)
+from ._firmware import firmware_named, joined_lines, number_text, Parameter
+from ._parameters import check_ranges, find_parameter, PARAMETERS, store_parameters
 
 
 class ParameterChange(NamedTuple):
@@ -51,7 +43,7 @@ class WordChange(NamedTuple):
 
 
 def propose_changes(
-    firmware: Firmware,
+    firmware: str,
     old: Mapping[str, Number],
     new: Mapping[str, Number],
     *,
@@ -105,7 +97,7 @@ def propose_changes(
 
 
 def parameter_file(
-    firmware: Firmware,
+    firmware: str,
     changes: Sequence[ParameterChange],
     *,
     revert: bool = False,
@@ -136,112 +128,14 @@ def parameter_file(
     - `ValueError`: a parameter does not exist in this version of Betaflight, or another firmware
         is to change words.
     """
-    if words and firmware != "betaflight":
+    known = firmware_named(firmware)
+    if words and not known.words:
         raise ValueError(f"{words[0].name} is a word, and {firmware} stores numbers alone.")
     values = [(x.parameter, *((x.old, x.new) if revert else (x.new, x.old))) for x in changes]
-    if firmware == "betaflight":
-        names = _betaflight_names([row.name for row, *_ in values], version, raised)
-        pairs = [(x.name, *((x.old, x.new) if revert else (x.new, x.old))) for x in words]
-        return _betaflight(values, names, version, profile, title, pairs)
-    return _FORMATS[firmware](values, title)
-
-
-Values = Sequence[tuple[Parameter, float, float]]  # parameter, the value to set, the other one
-
-
-def _number(value: Number, whole: bool) -> str:
-    """The shortest text that single precision reads back exactly."""
-    if whole:
-        return str(int(value))
-    return np.format_float_positional(np.float32(value), trim="-")
-
-
-def _px4(values: Values, title: str) -> str:
-    head = [f"# {title}"] if title else []
-    head += ["#", "# Vehicle-Id Component-Id Name Value Type"]
-    rows = []
-    for row, value, other in values:
-        rows.append(f"# {row.name} was {_number(other, row.whole)}")
-        kind = 6 if row.whole else 9  # int32, float
-        rows.append(f"1\t1\t{row.name}\t{_number(value, row.whole)}\t{kind}")
-    return _joined(head + rows)
-
-
-def _ardupilot(values: Values, title: str) -> str:
-    head = [f"# {title}"] if title else []
-    rows = []
-    for row, value, other in values:
-        rows.append(f"# {row.name} was {_number(other, row.whole)}")
-        rows.append(f"{row.name},{_number(value, row.whole)}")
-    return _joined(head + rows)
-
-
-def _crazyflie(values: Values, title: str) -> str:
-    head = [f"# {title}"] if title else []
-    rows = ["params:"]
-    for row, value, _ in values:
-        rows += [
-            f"  {row.name}:",
-            f"    default_value: {_number(row.default, row.whole)}",
-            "    is_stored: true",
-            f"    stored_value: {_number(value, row.whole)}",
-        ]
-    return _joined([*head, *rows, "type: persistent_param_state", "version: '1'"])
-
-
-_FORMATS: Mapping[str, Callable[[Values, str], str]] = {
-    "px4": _px4, "ardupilot": _ardupilot, "crazyflie": _crazyflie,
-}  # fmt: skip
-
-
-def _betaflight(
-    values: Values, names: Sequence[str], version: tuple[int, ...], profile: int | None,
-    title: str, words: Sequence[tuple[str, str, str]],
-) -> str:  # fmt: skip
-    rows = [f"# {line}" for line in title.splitlines()]
-    if profile is None:
-        rows.append("# select the PID profile that flew first: the log does not name it")
-    else:
-        rows.append(f"profile {profile}")
-    if version >= (4, 3) and not all(name.startswith("adrc_") for name in names):
-        # Sliders that stay on would rewrite what is set here.
-        rows.append("set simplified_pids_mode = OFF")
-        for part in ("gyro", "dterm"):
-            if any(row.name.startswith(f"{part}_lpf") for row, *_ in values):
-                rows.append(f"set simplified_{part}_filter = OFF")
-    for name, (row, value, other) in zip(names, values, strict=True):
-        rows += [f"# {name} was {_number(other, row.whole)}"]
-        rows += [f"set {name} = {_number(value, row.whole)}"]
-    for name, word, other in words:
-        rows += [f"# {name} was {other}", f"set {name} = {word}"]
-    return _joined([*rows, "save"])
-
-
-def _betaflight_names(
-    names: Sequence[str], version: tuple[int, ...], raised: Sequence[str]
-) -> list[str]:
-    adrc = [name for name in names if name.startswith("adrc_")]
-    if adrc and version < (2026,):
-        raise ValueError(
-            f"{', '.join(adrc)} exist only in builds of pull request 15400: give their version."
-        )
-    if version >= (2025,):
-        return list(names)
-    older = {f"d_{axis}": f"d_min_{axis}" for axis in raised}
-    older |= {f"d_max_{axis}": f"d_{axis}" for axis in raised}
-    if version < (4, 5):
-        older["angle_p_gain"] = "p_level"
-    if version < (4, 3):
-        for part in ("gyro", "dterm"):
-            older[f"{part}_lpf1_dyn_min_hz"] = f"dyn_lpf_{part}_min_hz"
-            older[f"{part}_lpf1_dyn_max_hz"] = f"dyn_lpf_{part}_max_hz"
-            older[f"{part}_lpf1_static_hz"] = f"{part}_lowpass_hz"
-            older[f"{part}_lpf2_static_hz"] = f"{part}_lowpass2_hz"
-    return [older.get(name, name) for name in names]
-
-
-def _joined(rows: Sequence[str]) -> str:
-    return "\n".join([*rows, ""])
+    pairs = [(x.name, *((x.old, x.new) if revert else (x.new, x.old))) for x in words]
+    return known.parameter_file(
+        values, title, version=version, profile=profile, raised=raised, words=pairs
+    )
 
 
 def change_table(changes: Sequence[ParameterChange], words: Sequence[WordChange] = ()) -> str:
@@ -250,16 +144,13 @@ def change_table(changes: Sequence[ParameterChange], words: Sequence[WordChange]
     for row, old, new, reason in changes:
         bounds = "none documented" if row.low == -_INF else f"{row.low:g} to {row.high:g}"
         bounds = f"{row.low:g} or above" if row.high == _INF != -row.low else bounds
-        rows.append(
-            f"| {row.name} | {_number(old, row.whole)} | {_number(new, row.whole)} | {row.unit} | "
-            f"{bounds} | {reason} |"
-        )
+        numbers = f"{number_text(old, row.whole)} | {number_text(new, row.whole)}"
+        rows.append(f"| {row.name} | {numbers} | {row.unit} | {bounds} | {reason} |")
     rows += [f"| {name} | {old} | {new} |  |  | {reason} |" for name, old, new, reason in words]
-    return _joined(rows)
+    return joined_lines(rows)
 
 
 _INF = float("inf")
-_SUFFIX = {"betaflight": "txt", "px4": "params", "ardupilot": "param", "crazyflie": "yaml"}
 
 
 class ParameterFiles(NamedTuple):
@@ -279,7 +170,7 @@ class ParameterFiles(NamedTuple):
 
 def write_parameter_files(
     folder: str | Path,
-    firmware: Firmware,
+    firmware: str,
     old: Mapping[str, Number],
     new: Mapping[str, Number],
     *,
@@ -306,26 +197,26 @@ def write_parameter_files(
 
     - `ValueError`: as in `propose_changes` and `parameter_file`, or nothing changes.
     """
-    folder, suffix = Path(folder), _SUFFIX[firmware]
+    folder, suffix = Path(folder), firmware_named(firmware).suffix
     raised = [x for x in AXES if old.get(f"d_max_{x}", 0.0) > old.get(f"d_{x}", 0.0)]
     text = lambda changes, title, back=False: parameter_file(
         firmware, changes, revert=back, version=version, profile=profile, raised=raised, title=title
     )
-    stages, table, whole = [], [], ()
+    stages, table, changes = [], [], ()
     for share in sorted(shares):
-        whole = propose_changes(
+        changes = propose_changes(
             firmware, old, new, share=share, beyond=beyond, at_once=at_once,
             reasons=reasons if share >= 1 else {x: f"on the way to {new[x]:.5g}" for x in new},
         )  # fmt: skip
         percent = round(100 * share)
         title = f"{percent} % of the way from what flew to the proposal"
-        stages.append((folder / f"{stem}_{percent:03d}.{suffix}", text(whole, title)))
-        table.append(f"## {title}\n\n{change_table(whole)}")
-    if not whole:
+        stages.append((folder / f"{stem}_{percent:03d}.{suffix}", text(changes, title)))
+        table.append(f"## {title}\n\n{change_table(changes)}")
+    if not changes:
         raise ValueError(
             "Nothing changes: what is proposed is stored as the values that flew. Propose more, or "
             "leave the files out."
         )
-    back = write_file(folder / f"{stem}_revert.{suffix}", text(whole, "what flew", True))
+    back = write_file(folder / f"{stem}_revert.{suffix}", text(changes, "what flew", True))
     written = tuple(write_file(path, content) for path, content in stages)
     return ParameterFiles(written, back, write_file(folder / f"{stem}.md", "\n".join(table)))

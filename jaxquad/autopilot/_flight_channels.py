@@ -1,12 +1,10 @@
 """What a proposal reads of a flight beside the record: gyros, set-point, terms, motors."""
 
 import dataclasses
-import functools as ft
 import re
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -23,14 +21,11 @@ from jaxquad.records import (
     RecordWarning,
 )
 
+from ._firmware import firmware_named, HOVER, Span
 from ._identified import RecordSettings
-from ._parameters import Firmware
 
 
 Samples = Float[np.ndarray, " samples"]
-Span = tuple[float | None, float | None]  # s; None: from the beginning, to the end
-_TERMS = ("P", "I", "D", "F")
-HOVER = 0.3  # of the throttle, where a log does not hold it
 
 
 @dataclasses.dataclass(frozen=True)
@@ -133,61 +128,70 @@ def read_channels_if_any(
         return None
 
 
+def channel_prefix(proposal: Proposal) -> str:
+    """What the channels of a flight begin with in a file with several."""
+    log, axis = firmware_named(proposal.vehicle).log, AXES.index(proposal.setup.axis)
+    rate = log.rates[axis] if axis < len(log.rates) else ""
+    full = proposal.setup.rate
+    return full.removesuffix(rate) if rate and full.endswith(f".{rate}") else ""
+
+
 def read_channels(
     path: Path, proposal: Proposal, settings: RecordSettings, values: Mapping[str, str]
 ) -> FlightChannels:
     """Of the longest analysed part. Raises RecordError without a rate or its set-point."""
-    firmware, prefix = _firmware(proposal), proposal.setup.rate.rpartition("gyroADC")[0]
-    axis = AXES.index(proposal.setup.axis)
-    names = _NAMES[firmware](prefix, axis)
+    firmware, prefix = firmware_named(proposal.vehicle), channel_prefix(proposal)
+    setup, axis = proposal.setup, AXES.index(proposal.setup.axis)
+    filtered = [f"{prefix}{name}" for name in firmware.log.rates]
+    setpoint = f"{prefix}{firmware.log.setpoints[axis]}"
+    names, span = firmware.channels(prefix, axis), _span(settings)
     log = _LoggedChannels(path, frozenset(channel.name for channel in channels(path)))
-    if firmware == "ardupilot":
-        names = names._replace(unfiltered=_ardupilot_gyro(log, values, _span(settings)))
-    throttle, injected = proposal.setup.throttle, _injected(proposal)
-    wanted = [*names.filtered, *names.unfiltered, *names.terms, *names.motors, names.setpoint]
-    external = proposal.setup.reference
-    wanted += [*names.output, *names.stick, *names.mixed, *names.slewed, *injected, external]
-    found = _read(log, [*wanted, *throttle], _span(settings))
-    rates, rate = found.get(names.filtered[axis]), names.filtered[axis]
-    if rates is None or names.setpoint not in found:
-        raise RecordError(f"{path} holds no {rate} or no {names.setpoint} of the analysed part")
-    on_its_clock = lambda name: np.interp(rates.time, found[name].time, _values(found[name], name))
-    at_rate = lambda name: np.interp(rates.time, found[name].time, found[name].channel(name))
-    sum_at = lambda mix: _mixed(mix, found, at_rate)
-    raw = found.get(names.unfiltered[axis]) if names.unfiltered else None
-    motors = [name for name in names.motors if name in found]
+    median = lambda name: _median(_read(log, [name], span).get(name), name, (None, None))
+    unfiltered = names.unfiltered or firmware.unfiltered_gyro(log.names, values, median)
+    injected = {setup.reference: 1.0} if setup.injected_at == "mixer" else {}
+    wanted = [*filtered, *unfiltered, *names.terms, *names.motors, setpoint, setup.reference]
+    wanted += [*names.output, *names.stick, *names.mixed, *names.slewed, *injected]
+    records = _read(log, [*wanted, *setup.throttle], span)
+    rates, rate = records.get(filtered[axis]), filtered[axis]
+    if rates is None or setpoint not in records:
+        raise RecordError(f"{path} holds no {rate} or no {setpoint} of the analysed part")
+    at_rate = lambda name, read=Record.channel: np.interp(
+        rates.time, records[name].time, read(records[name], name)
+    )
+    sum_at = lambda mix: (
+        np.sum([weight * at_rate(name) for name, weight in mix.items()], axis=0)
+        if mix and all(name in records for name in mix) else None
+    )  # fmt: skip
+    raw = records.get(unfiltered[axis]) if unfiltered else None
+    motors = [name for name in names.motors if name in records]
+    output, mixed, stick = sum_at(names.output), sum_at(names.mixed), sum_at(names.stick)
+    limit = firmware.output_limit(values, axis)
+    external = not injected and setup.reference != setpoint and setup.reference in records
     return FlightChannels(
-        rates=tuple(on_its_clock(name) for name in names.filtered if name in found),
-        dt=rates.dt,
-        setpoint=on_its_clock(names.setpoint),
-        axis=axis, start=float(rates.time[0]),
+        rates=tuple(at_rate(name, _in_radians) for name in filtered if name in records),
+        dt=rates.dt, setpoint=at_rate(setpoint, _in_radians), axis=axis,
+        start=float(rates.time[0]),
         unfiltered=() if raw is None else tuple(
-            _values(raw, name) for name in names.unfiltered if name in raw.names
+            _in_radians(raw, name) for name in unfiltered if name in raw.names
         ),
         unfiltered_dt=0.0 if raw is None else raw.dt,
-        averaged=firmware == "px4",
+        averaged=firmware.averages_gyro,
         terms={
             key: at_rate(name)
-            for key, name in zip(_TERMS, names.terms, strict=False) if name in found
+            for key, name in zip("PIDF", names.terms, strict=False) if name in records
         },
-        output=sum_at(names.output), injected=sum_at(injected),
-        not_carried=_not_carried(sum_at(names.output), sum_at(names.mixed), axis, values),
-        reference=None if injected or external == names.setpoint or external not in found
-        else at_rate(external),
+        output=output, injected=sum_at(injected),
+        not_carried=None if output is None or mixed is None
+        else mixed - np.clip(output, -limit, limit),
+        reference=at_rate(setup.reference) if external else None,
         motors=np.stack([at_rate(x) for x in motors], axis=1) if motors else None,
-        motor_ends=_motor_ends(firmware, values),
-        throttle=sum_at(throttle), stick=_stick(sum_at(names.stick), firmware, values),
-        slewed=sum_at(names.slewed), late=proposal.setup.late_s.get(names.setpoint, 0.0),
-        resolution=_resolution(firmware, values),
-        names=(rate, "" if raw is None else names.unfiltered[axis]),
-        tracked_hz=_tracked(log, _span(settings)) if firmware == "ardupilot" else {},
+        motor_ends=firmware.motor_ends(values), throttle=sum_at(setup.throttle),
+        stick=None if stick is None else firmware.stick_throttle(stick, values),
+        slewed=sum_at(names.slewed), late=setup.late_s.get(setpoint, 0.0),
+        resolution=firmware.resolution(values),
+        names=(rate, "" if raw is None else unfiltered[axis]),
+        tracked_hz=_tracked(log, firmware.tracked_channels(), span),
     )  # fmt: skip
-
-
-_SPEEDS = {
-    3: re.compile(r"ESC(\[\d+\])?\.RPM"), 2: re.compile(r"RPM(\.rpm1|\[0\]\.RPM)"),
-    5: re.compile(r"RPM(\.rpm2|\[1\]\.RPM)"),
-}  # fmt: skip
 
 
 class _LoggedChannels(NamedTuple):
@@ -197,117 +201,34 @@ class _LoggedChannels(NamedTuple):
     names: frozenset[str]
 
 
-def _tracked(log: _LoggedChannels, span: Span) -> dict[int, tuple[float, ...]]:
+def _tracked(
+    log: _LoggedChannels, patterns: Mapping[int, str], span: Span
+) -> dict[int, tuple[float, ...]]:
     """The median speeds in Hz that the log holds, of those that turn."""
-    found: dict[int, tuple[float, ...]] = {}
-    for mode, pattern in _SPEEDS.items():
-        names = sorted(name for name in log.names if pattern.fullmatch(name))
+    tracked: dict[int, tuple[float, ...]] = {}
+    for mode, pattern in patterns.items():
+        names = sorted(name for name in log.names if re.fullmatch(pattern, name))
         records = _read(log, names, (None, None)) if names else {}
         medians = [_median(record, name, span) / 60 for name, record in records.items()]
-        if turning := tuple(each for each in medians if each > 0):
-            found[mode] = turning
-    return found
+        if turning := tuple(speed for speed in medians if speed > 0):
+            tracked[mode] = turning
+    return tracked
 
 
-def _median(record: Record, name: str, span: Span) -> float:
+def _median(record: Record | None, name: str, span: Span) -> float:
     """Within a span; 0 without samples there."""
+    if record is None:
+        return 0.0
     low, high = (end if x is None else x for x, end in zip(span, (-np.inf, np.inf), strict=True))
     inside = record.channel(name)[(record.time >= low) & (record.time <= high)]
     return float(np.median(inside)) if inside.size else 0.0
-
-
-class _Names(NamedTuple):
-    filtered: Sequence[str]
-    unfiltered: Sequence[str]
-    setpoint: str
-    terms: Sequence[str]
-    motors: Sequence[str]
-    output: Mapping[str, float]
-    stick: Mapping[str, float] = MappingProxyType({})
-    mixed: Mapping[str, float] = MappingProxyType({})
-    slewed: Mapping[str, float] = MappingProxyType({})
-
-
-def _betaflight_names(prefix: str, axis: int) -> _Names:
-    return _Names(
-        [f"{prefix}gyroADC[{k}]" for k in range(3)],
-        [f"{prefix}gyroUnfilt[{k}]" for k in range(3)],
-        f"{prefix}setpoint[{axis}]",
-        [f"{prefix}axis{x}[{axis}]" for x in _TERMS],
-        [f"{prefix}motor[{k}]" for k in range(8)],
-        {f"{prefix}axisSum[{axis}]": 1.0},
-        {f"{prefix}rcCommand[3]": 1.0},
-        {f"{prefix}axisMixed[{axis}]": 1.0},
-    )
-
-
-def _px4_names(prefix: str, axis: int) -> _Names:
-    return _Names(
-        [f"vehicle_angular_velocity.xyz[{k}]" for k in range(3)],
-        [f"sensor_combined.gyro_rad[{k}]" for k in range(3)],
-        f"vehicle_rates_setpoint.{AXES[axis]}",
-        [],
-        [f"actuator_motors.control[{k}]" for k in range(4)],
-        {f"vehicle_torque_setpoint.xyz[{axis}]": 1.0},
-    )
-
-
-def _ardupilot_names(prefix: str, axis: int) -> _Names:
-    return _Names(
-        [f"RATE.{letter}" for letter in "RPY"],
-        [],
-        f"RATE.{'RPY'[axis]}Des",
-        [f"PID{'RPY'[axis]}.{x}" for x in ("P", "I", "D", "FF")],
-        [f"RCOU.C{k}" for k in range(1, 5)],
-        {f"RATE.{'RPY'[axis]}Out": 1.0},
-        slewed={f"PID{'RPY'[axis]}.Dmod": 1.0},
-    )
-
-
-_POST, _BOTH = 4, 8  # of INS_RAW_LOG_OPT: behind the filters, or before and behind them
-_GYROS = re.compile(r"(GYR(\d|\[\d\])?)\.GyrX")
-
-
-def _ardupilot_gyro(log: _LoggedChannels, values: Mapping[str, str], span: Span) -> list[str]:
-    """The gyro before its filters that flew, else the first; none where it is logged behind them.
-
-    Its messages are GYR[0], in older logs GYR1 or GYR. Where both kinds are logged, those behind
-    the filters have the higher numbers.
-    """
-    options = int(_number(values, "INS_RAW_LOG_OPT", 0.0))
-    tables = [hit[1] for name in log.names if (hit := _GYROS.fullmatch(name))]
-    if not tables or (options & _POST and not options & _BOTH):
-        return []
-    used = f"GYR[{_gyro_in_use(log, values, span)}]"
-    table = used if used in tables else min(tables)
-    return [f"{table}.Gyr{letter}" for letter in "XYZ"]
-
-
-def _gyro_in_use(log: _LoggedChannels, values: Mapping[str, str], span: Span) -> int:
-    """The IMU of the filter that flew (XKF4.PI): each of them has one of EK3_IMU_MASK."""
-    name = "XKF4[0].PI"
-    records = _read(log, [name], span)
-    mask = int(_number(values, "EK3_IMU_MASK", 3.0))
-    imus = [i for i in range(8) if mask >> i & 1]
-    core = int(np.median(records[name].channel(name))) if name in records else 0
-    return imus[core] if core < len(imus) else 0
-
-
-_NAMES: Mapping[Firmware, Callable[[str, int], _Names]] = {
-    "betaflight": _betaflight_names, "px4": _px4_names, "ardupilot": _ardupilot_names,
-}  # fmt: skip
-
-
-def _firmware(proposal: Proposal) -> Firmware:
-    known: dict[str, Firmware] = {"betaflight": "betaflight", "px4": "px4"}
-    return known.get(proposal.vehicle, "ardupilot")
 
 
 def _span(settings: RecordSettings) -> Span:
     if not settings.segments:
         return settings.start, settings.stop
     ends = [(-np.inf if a is None else a, np.inf if b is None else b) for a, b in settings.segments]
-    low, high = max(ends, key=lambda each: each[1] - each[0])
+    low, high = max(ends, key=lambda part: part[1] - part[0])
     return (low if np.isfinite(low) else None), (high if np.isfinite(high) else None)
 
 
@@ -321,7 +242,7 @@ def _read(log: _LoggedChannels, names: Sequence[str], span: Span) -> dict[str, R
         if name in log.names:
             kind = name.rpartition(".")[0].partition("[")[0]  # instances have clocks alike
             tables.setdefault(kind, []).append(name)
-    found: dict[str, Record] = {}
+    records: dict[str, Record] = {}
     for group in tables.values():
         first = {"the first one": {group[0]: 1.0}}  # a record has an input
         outputs = {name: {name: 1.0} for name in group}
@@ -331,66 +252,11 @@ def _read(log: _LoggedChannels, names: Sequence[str], span: Span) -> dict[str, R
                 parts = read_segments(log.path, [span], inputs=first, outputs=outputs)
         except RecordError:  # too few samples in this span, or missing ones
             continue
-        found |= dict.fromkeys(group, max(parts, key=lambda part: part.samples))
-    return found
+        records |= dict.fromkeys(group, max(parts, key=lambda part: part.samples))
+    return records
 
 
-def _values(record: Record, name: str) -> Samples:
-    """Rates in rad/s."""
+def _in_radians(record: Record, name: str) -> Samples:
+    """A rate in rad/s."""
     degrees = record.unit(name) == "deg/s"
     return np.radians(record.channel(name)) if degrees else record.channel(name)
-
-
-def _motor_ends(firmware: Firmware, values: Mapping[str, str]) -> tuple[float, float]:
-    if firmware == "betaflight":
-        low, high = (float(x) for x in values.get("motorOutput", "48,2047").split(",")[:2])
-        return low, high
-    if firmware == "px4":
-        return 0.0, 1.0
-    number = ft.partial(_number, values)
-    low, high = number("MOT_PWM_MIN", 1000.0), number("MOT_PWM_MAX", 2000.0)
-    share = lambda part: low + part * (high - low)
-    return share(number("MOT_SPIN_MIN", 0.15)), share(number("MOT_SPIN_MAX", 0.95))
-
-
-def _number(values: Mapping[str, str], name: str, default: float) -> float:
-    return float(values.get(name, default))
-
-
-def _mixed(
-    mix: Mapping[str, float], found: Mapping[str, Record], at: Callable[[str], Samples]
-) -> Samples | None:
-    if not mix or any(name not in found for name in mix):
-        return None
-    return np.sum([weight * at(name) for name, weight in mix.items()], axis=0)
-
-
-def _injected(proposal: Proposal) -> Mapping[str, float]:
-    """What was added to the command behind the law."""
-    return {"SIDD.Targ": 1.0} if proposal.setup.injected_at == "mixer" else {}
-
-
-def _stick(
-    command: Samples | None, firmware: Firmware, values: Mapping[str, str]
-) -> Samples | None:
-    """Betaflight's throttle before its boost, 0 to 1; a limit of the throttle is another one."""
-    if command is None or firmware != "betaflight" or float(values.get("throttle_limit_type", 0)):
-        return None
-    return np.clip((command - 1000) / 1000, 0.0, 1.0)
-
-
-def _not_carried(
-    output: Samples | None, mixed: Samples | None, axis: int, values: Mapping[str, str]
-) -> Samples | None:
-    if output is None or mixed is None:
-        return None
-    name, usual = ("pidsum_limit_yaw", 400.0) if axis == 2 else ("pidsum_limit", 500.0)
-    limit = _number(values, name, usual)
-    return mixed - np.clip(output, -limit, limit)
-
-
-def _resolution(firmware: Firmware, values: Mapping[str, str]) -> tuple[float, float]:
-    if firmware != "betaflight":
-        return 0.0, 0.0
-    finer = float(values.get("blackbox_high_resolution", 0)) > 0
-    return np.radians(0.1 if finer else 1.0), 1.0

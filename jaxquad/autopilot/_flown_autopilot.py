@@ -10,14 +10,12 @@ from jaxquad._core import Message, Number
 from jaxquad.identify import KnownFilter, MeasuredChain
 from jaxquad.records import AXES, Proposal, read_settings, Settings as LogSettings
 
-from ._angle_loop import angle_loop_of, AngleLoop
-from ._choices import change_filters, flown_loop
-from ._flight_channels import HOVER
-from ._flown import FlownLoop
+from ._filter_choices import change_filters, flown_loop
+from ._firmware import firmware_named, HOVER, OuterLoop
+from ._flight_channels import channel_prefix
 from ._identified import DesignSettings
-from ._parameters import Firmware
-from ._rate_gains import gains_of, parameters_of, RateLaw
-from .betaflight._law import BetaflightPID
+from ._law import FlownLoop, RateLoop
+from ._rate_gains import gains_of, parameters_of
 
 
 @dataclasses.dataclass(frozen=True)
@@ -31,17 +29,17 @@ class FlownAutopilot:
     parameters, or as measured where the law lacks some of them; `filters_text` says which.
     """
 
-    firmware: Firmware
+    firmware: str
     version: tuple[int, ...]
     axis: int
     loop: FlownLoop
-    law: RateLaw
+    law: RateLoop
     parameters: Mapping[str, float]
     unmodelled: tuple[Message, ...]
     values: Mapping[str, str] = dataclasses.field(default_factory=dict)
     throttle: float = 0.3
     tracked_hz: Mapping[int, Sequence[float]] = dataclasses.field(default_factory=dict)
-    angle: AngleLoop | None = None
+    angle: OuterLoop | None = None
     filters: tuple[KnownFilter, ...] = ()
     filters_text: str = ""
 
@@ -50,7 +48,7 @@ class FlownAutopilot:
         """The gyro's filters as measured; None where they are those of the law."""
         return self.filters if any(isinstance(x, MeasuredChain) for x in self.filters) else None
 
-    def with_filters(self, parameters: Mapping[str, Number]) -> RateLaw:
+    def with_filters(self, parameters: Mapping[str, Number]) -> RateLoop:
         """The law as it is read from a log with these cutoffs and notches."""
         values = change_filters(self.firmware, self.values, parameters)
         return flown_loop(
@@ -59,7 +57,7 @@ class FlownAutopilot:
 
     def at(self, throttle: float) -> "FlownAutopilot":
         """The same at another throttle, which moves cutoffs, notches and TPA of some firmwares."""
-        if self.firmware == "px4":
+        if not firmware_named(self.firmware).follows_throttle:
             return self
         there = dataclasses.replace(self, throttle=throttle)
         return dataclasses.replace(there, law=there.with_filters({}))
@@ -72,10 +70,8 @@ class FlownAutopilot:
 
 def settings_of(path: Path, proposal: Proposal) -> LogSettings:
     """The log's own parameters, of the part that is proposed."""
-    setup = proposal.setup
-    prefix = setup.rate.rpartition("gyroADC")[0].rstrip(".")
-    at = None if proposal.vehicle == "betaflight" else setup.start
-    return read_settings(path, log=prefix, at=at)
+    prefix = channel_prefix(proposal).rstrip(".")
+    return read_settings(path, log=prefix, at=proposal.setup.start)
 
 
 def read_flown(
@@ -83,44 +79,19 @@ def read_flown(
     tracked_hz: Mapping[int, Sequence[float]],
 ) -> FlownAutopilot:  # fmt: skip
     """The loop that flew. Raises ValueError where the log does not hold its gains."""
-    setup, given = proposal.setup, settings_of(path, proposal)
-    axis, values = AXES.index(setup.axis), _with_hold(given.values, setup.hold)
-    known: dict[str, Firmware] = {"betaflight": "betaflight", "px4": "px4"}
-    firmware = known.get(proposal.vehicle, "ardupilot")
+    setup, logged = proposal.setup, settings_of(path, proposal)
+    axis, firmware = AXES.index(setup.axis), firmware_named(proposal.vehicle)
+    values = firmware.with_hold(logged.values, setup.hold)
     throttle = HOVER if settings.throttle is None else settings.throttle
-    loop = flown_loop(firmware, values, given.version, throttle=throttle, tracked_hz=tracked_hz)
-    loop = _in_angle_mode(loop) if setup.levelled else loop
+    loop = firmware.flown_loop(values, logged.version, throttle=throttle, tracked_hz=tracked_hz)
+    loop = firmware.levelled(loop) if setup.levelled else loop
     if not np.any(gains_of(loop.law, axis) > 0):
         raise ValueError(
             f"{path}: P, I and D of {setup.axis} are all 0, so there is no rate loop to tune"
         )
+    dt = loop.law.interval()
     return FlownAutopilot(
-        firmware, tuple(given.version), axis, loop, loop.law, loop.parameters(), loop.unmodelled,
-        values, throttle, tracked_hz,
-        angle_loop_of(
-            firmware, given.values, axis, loop.law.interval(), levelled=setup.levelled
-        ),
+        proposal.vehicle, tuple(logged.version), axis, loop, loop.law, loop.parameters(),
+        loop.unmodelled, values, throttle, tracked_hz,
+        firmware.angle_loop(logged.values, axis, dt, levelled=setup.levelled),
     )  # fmt: skip
-
-
-def _with_hold(values: Mapping[str, str], hold: float | None) -> Mapping[str, str]:
-    """Betaflight's parameters with the loop's interval that the log's stamps show, in s."""
-    if hold is None or "looptime" not in values:
-        return values
-    denominator = float(values.get("pid_process_denom", 1.0))
-    looptime = 1e6 * hold / denominator
-    if abs(looptime / float(values["looptime"]) - 1) < _SAME_LOOP:
-        return values
-    return {**values, "looptime": f"{looptime:.6g}"}
-
-
-_SAME_LOOP = 0.05  # of the interval in the header
-
-
-def _in_angle_mode(loop: FlownLoop) -> FlownLoop:
-    """Betaflight's integral is held from a fifth of the set-point's speed on there."""
-    relax = loop.law.relax if isinstance(loop.law, BetaflightPID) else None
-    if relax is None:
-        return loop
-    relax = dataclasses.replace(relax, threshold=0.2 * relax.threshold)
-    return dataclasses.replace(loop, law=dataclasses.replace(loop.law, relax=relax))

@@ -1,10 +1,9 @@
 """What the log of an autopilot says of the loop around a plant: the gyro's filters, and the law."""
 
 import dataclasses
-import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 from jaxtyping import Complex, Float
@@ -12,28 +11,18 @@ from jaxtyping import Complex, Float
 from jaxquad._core import announce, Message
 from jaxquad.identify import KnownFilter, measured_chain, MeasuredChain
 from jaxquad.records import AXES, Mix, Proposal, propose
+from jaxquad.records.firmware import firmware_log, firmware_names
 from jaxquad.report import reason_of
 
+from ._filters import FilterChain
+from ._firmware import firmware_named
+from ._flight_channels import FlightChannels, read_channels_if_any
+from ._flown_autopilot import settings_of
 from ._identified import RecordSettings
+from ._law import RateLoop
 
-
-if TYPE_CHECKING:
-    from ._filters import FilterChain
-    from ._flight_channels import FlightChannels
-    from ._rate_gains import RateLaw
 
 Frequencies = Float[np.ndarray, " frequencies"]
-_RATES = (
-    re.compile(r"(?:.*\.)?gyroADC\[([012])\]"),
-    re.compile(r"RATE\.([RPY])"),
-    re.compile(r"vehicle_angular_velocity\.xyz\[([012])\]"),
-)  # that are behind the filters of a gyro
-_AXES = {"0": 0, "1": 1, "2": 2, "R": 0, "P": 1, "Y": 2}
-_CUTOFFS = {  # of which a log that tells its gyro's filters holds one
-    "betaflight": ("gyro_lpf1_static_hz", "gyro_lowpass_hz"),
-    "px4": ("IMU_GYRO_CUTOFF",),
-    "ardupilot": ("INS_GYRO_FILTER",),
-}
 _SHOWN = 10.0  # Hz, of the delay in print
 _SAME = 1e-3  # of the response of filters, by which those of several logs may differ
 _AT = np.array([3.0, 10.0, 30.0])  # Hz
@@ -56,10 +45,10 @@ class FlownLaw:
 
     filters: tuple[KnownFilter, ...]
     text: str
-    law: "RateLaw | None" = None
+    law: RateLoop | None = None
     axis: int = 0
     unmodelled: tuple[Message, ...] = ()
-    chains: "tuple[FilterChain, ...]" = ()
+    chains: tuple[FilterChain, ...] = ()
 
     def content(self) -> dict[str, object]:
         """For `result.json`; `StoredFilters.of` reads the filters."""
@@ -123,8 +112,12 @@ def flown_law(
     What a log does not tell costs nothing but itself: `text` says why.
     """
     [channels] = output.values() or [{}]
-    matches = [each.fullmatch(name) for name in channels for each in _RATES]
-    axes = [_AXES[each[1]] for each in matches if each]
+    axes = [
+        axis
+        for log in map(firmware_log, firmware_names()) if log is not None and log.gyro_cutoffs
+        for name in channels
+        for axis, rate in enumerate(log.rates) if name == rate or name.endswith(f".{rate}")
+    ]  # fmt: skip
     if len(channels) != 1 or not axes:
         return None
     [rate], axis = channels, axes[0]
@@ -159,7 +152,8 @@ def _law_of(
             proposal = propose(path, axis=AXES[axis])
         except ValueError:  # a table whose channels have these names
             return None
-    if proposal.setup.rate != rate or proposal.vehicle not in _CUTOFFS:
+    known = firmware_log(proposal.vehicle)
+    if proposal.setup.rate != rate or known is None or not known.gyro_cutoffs:
         return None
     return _read_law(path, axis, command, proposal, settings)
 
@@ -167,35 +161,32 @@ def _law_of(
 def _read_law(
     path: Path, axis: int, command: Mix, proposal: Proposal, settings: RecordSettings
 ) -> FlownLaw:
-    from ._choices import flown_loop
-    from ._flight_channels import HOVER, read_channels_if_any
-    from ._flown_autopilot import settings_of
-    from ._rate_gains import gyro_chains
-    from .betaflight._flown_adrc import flies_adrc
+    from ._firmware import HOVER
 
     logged = settings_of(path, proposal)
-    if not any(name in logged.values for name in _CUTOFFS[proposal.vehicle]):
-        names = " or ".join(_CUTOFFS[proposal.vehicle])
+    firmware = firmware_named(proposal.vehicle)
+    if not any(name in logged.values for name in firmware.log.gyro_cutoffs):
+        names = " or ".join(firmware.log.gyro_cutoffs)
         return FlownLaw((), f"the gyro's filters are in the model: the log does not hold {names}")
     flight = read_channels_if_any(path, proposal, settings, logged.values)
     middle = None if flight is None else flight.middle
     tracked = {} if flight is None else flight.tracked_hz
-    loop = flown_loop(
-        proposal.vehicle, logged.values, logged.version,  # pyright: ignore[reportArgumentType]
-        throttle=HOVER if middle is None else middle, tracked_hz=tracked,
+    loop = firmware.flown_loop(
+        logged.values, logged.version, throttle=HOVER if middle is None else middle,
+        tracked_hz=tracked,
     )  # fmt: skip
-    chains = tuple(each for each in gyro_chains(loop.law) if each.filters)
+    chains = tuple(chain for chain in loop.law.gyro_chains() if chain.filters)
     filters, text = best_filters(chains, loop.unmodelled, flight, axis)
-    adrc = proposal.vehicle == "betaflight" and flies_adrc(logged.values)
+    adrc = firmware.flies_adrc(logged.values)
     [channels] = command.values()
     law = loop.law if not adrc and channels == dict(proposal.setup.command) else None
     return FlownLaw(filters, text, law, axis, tuple(loop.unmodelled), chains)
 
 
 def best_filters(
-    chains: "tuple[FilterChain, ...]",
+    chains: tuple[FilterChain, ...],
     unmodelled: Sequence[Message],
-    flight: "FlightChannels | None",
+    flight: FlightChannels | None,
     axis: int,
 ) -> tuple[tuple[KnownFilter, ...], str]:
     """As measured where notches follow motors or spectrum, else those of the parameters."""
@@ -215,7 +206,7 @@ def best_filters(
 
 
 def _measured(
-    chains: "tuple[FilterChain, ...]", flight: "FlightChannels", axis: int
+    chains: tuple[FilterChain, ...], flight: FlightChannels, axis: int
 ) -> MeasuredChain | str:
     """The reason where the log does not show it."""
     unfiltered, filtered = flight.unfiltered[axis], flight.rates[axis]

@@ -11,9 +11,7 @@ from jaxquad._core import as_float, Number, pick_gain, require_positive
 from jaxquad.control import AdaptiveLADRC, LADRC, PID, ScheduledLADRC
 from jaxquad.records import AXES
 
-from ._law import DEGREES
-from ._parameters import Firmware
-from .betaflight._law import D_SCALE, I_SCALE, P_SCALE
+from ._firmware import Firmware, firmware_named
 
 
 class RateGains(NamedTuple):
@@ -29,35 +27,14 @@ class RateGains(NamedTuple):
     kd: float
 
 
-# Quad X: relative thrust of a motor per unit of u, and u in the unit that `torque_per_unit` is of.
-_MIX = {
-    "px4": (np.sqrt(0.5), np.sqrt(0.5), 1.0), "ardupilot": (0.5, 0.5, 0.5),
-    "betaflight": (1.0, 1.0, 1.0), "crazyflie": (0.5, 0.5, 1.0),
-}  # fmt: skip
-_SCALES = {
-    "px4": (1.0, 1.0, 1.0), "ardupilot": (1.0, 1.0, 1.0),
-    "betaflight": tuple(1e3 / (DEGREES * x) for x in (P_SCALE, I_SCALE, D_SCALE)),
-    "crazyflie": (65535 / DEGREES,) * 3,
-}  # fmt: skip
-_SHORT = {"roll": "RLL", "pitch": "PIT", "yaw": "YAW"}
-
-
-def _names(firmware: Firmware, axis: str) -> tuple[str, str, str]:
-    pattern = {
-        "px4": f"MC_{axis.upper()}RATE_{{}}", "ardupilot": f"ATC_RAT_{_SHORT[axis]}_{{}}",
-        "betaflight": f"{{}}_{axis}", "crazyflie": f"pid_rate.{axis}_k{{}}",
-    }[firmware]  # fmt: skip
-    p, i, d = "PID" if firmware in ("px4", "ardupilot") else "pid"
-    return pattern.format(p), pattern.format(i), pattern.format(d)
-
-
-def _scales(firmware: Firmware, axis: str) -> tuple[float, float, float]:
-    p, i, d = _SCALES[firmware]
-    return (p, i / 2.5, d) if (firmware, axis) == ("betaflight", "yaw") else (p, i, d)
+def _names(firmware: Firmware, axis: str) -> list[str]:
+    """The parameters of P, I and D."""
+    rows, k = firmware.parameters.values(), AXES.index(axis)
+    return [next(x.name for x in rows if x.field == f and x.axis == k) for f in firmware.fields]
 
 
 def rate_parameters(
-    firmware: Firmware, axis: str, gains: RateGains, *, torque_per_unit: Number = 1.0
+    firmware: str, axis: str, gains: RateGains, *, torque_per_unit: Number = 1.0
 ) -> dict[str, float]:
     """The P, I and D parameters of a rate PID in SI units, not rounded.
 
@@ -77,12 +54,13 @@ def rate_parameters(
     """
     _require_axis(axis)
     require_positive("torque_per_unit", torque_per_unit, "give the plant's gain")
-    triples = zip(_names(firmware, axis), gains, _scales(firmware, axis), strict=True)
+    known = firmware_named(firmware)
+    triples = zip(_names(known, axis), gains, known.si_scales(axis), strict=True)
     return {name: gain * scale / torque_per_unit for name, gain, scale in triples}
 
 
 def rate_gains(
-    firmware: Firmware, axis: str, values: Mapping[str, Number], *, torque_per_unit: Number = 1.0
+    firmware: str, axis: str, values: Mapping[str, Number], *, torque_per_unit: Number = 1.0
 ) -> RateGains:
     """The rate PID in SI units that parameters are: the inverse of `rate_parameters`.
 
@@ -94,22 +72,23 @@ def rate_gains(
     - `ValueError`: the axis is unknown, or a parameter is missing.
     """
     _require_axis(axis)
-    names = _names(firmware, axis)
+    known = firmware_named(firmware)
+    names = _names(known, axis)
     missing = [name for name in names if name not in values]
     if missing:
         raise ValueError(f"the parameters lack {', '.join(missing)}: give P, I and D of the axis.")
-    pairs = zip(names, _scales(firmware, axis), strict=True)
+    pairs = zip(names, known.si_scales(axis), strict=True)
     return RateGains(*(values[name] / scale * torque_per_unit for name, scale in pairs))
 
 
-def motor_share(firmware: Firmware, axis: str) -> float:
+def motor_share(firmware: str, axis: str) -> float:
     """Relative thrust of a motor of a quad X per unit of the output that moves it."""
     _require_axis(axis)
-    return float(_MIX[firmware][AXES.index(axis)])
+    return float(firmware_named(firmware).motor_shares[AXES.index(axis)])
 
 
 def torque_per_unit(
-    firmware: Firmware, axis: str, *, thrust: Number, arm: Number = 0.0, drag: Number = 0.0
+    firmware: str, axis: str, *, thrust: Number, arm: Number = 0.0, drag: Number = 0.0
 ) -> float:
     """N m of a quad X per unit of the firmware's output, in the units of `rate_parameters`.
 
@@ -215,19 +194,8 @@ def ladrc_as_pid(
     )  # fmt: skip
 
 
-_NAMES = {
-    "betaflight": "Betaflight", "px4": "PX4", "ardupilot": "ArduPilot", "crazyflie": "Crazyflie",
-}  # fmt: skip
-_OUTER = {
-    "px4": lambda axis, p: {f"MC_{axis.upper()}_P": p},
-    "ardupilot": lambda axis, p: {f"ATC_ANG_{_SHORT[axis]}_P": p},
-    "betaflight": lambda axis, p: {"angle_p_gain": 10 * p},
-    "crazyflie": lambda axis, p: {f"pid_attitude.{axis}_kp": p, f"pid_attitude.{axis}_ki": 0.0},
-}
-
-
 def cascade_parameters(
-    firmware: Firmware, axis: str, controller: object, *, torque_per_unit: Number = 1.0
+    firmware: str, axis: str, controller: object, *, torque_per_unit: Number = 1.0
 ) -> dict[str, float]:
     """The parameters by which a firmware's angle and rate loop is an angle controller of jaxquad.
 
@@ -251,50 +219,49 @@ def cascade_parameters(
     cascade = cascade_of(at(controller.kp), at(controller.ki), at(controller.kd))
     gains = RateGains(float(cascade.rate_p), float(cascade.rate_i), 0.0)
     rate = rate_parameters(firmware, axis, gains, torque_per_unit=torque_per_unit)
-    return {**_OUTER[firmware](axis, float(cascade.p)), **rate}
+    return {**firmware_named(firmware).angle_parameters(axis, float(cascade.p)), **rate}
 
 
-def find_inexpressible(firmware: Firmware, controller: object) -> tuple[str, ...]:
+def find_inexpressible(firmware: str, controller: object) -> tuple[str, ...]:
     """What of an angle controller a firmware cannot express, a sentence each; empty if nothing.
 
     **Arguments:**
 
     - `controller`: a `jq.PID` of the angle. A `LADRC` is never expressible: see `ladrc_as_pid`.
     """
-    name = _NAMES[firmware]
+    known = firmware_named(firmware)
+    name = known.log.title
     if isinstance(controller, LADRC | ScheduledLADRC | AdaptiveLADRC):
-        where = (
-            "its proposed ADRC (pull request 15400) is of the rate, not of the angle"
-            if firmware == "betaflight"
-            else "it has no disturbance observer"
-        )
-        return (f"{name} cannot run a LADRC of the angle: {where}. Use ladrc_as_pid.",)
+        why = known.no_ladrc()
+        return (f"{name} cannot run a LADRC of the angle: {why}. Use ladrc_as_pid.",)
     if not isinstance(controller, PID):
         return (f"A {type(controller).__name__} is not known: give a jq.PID.",)
-    found = []
+    reasons = []
     if np.any(np.asarray(controller.derivative_weight) != 0):
-        found.append(
+        reasons.append(
             f"{name} takes its rate feedback from the measurement alone: derivative_weight must "
             "be 0."
         )
     if np.any(np.asarray(controller.proportional_weight) != 1):
-        found.append(
+        reasons.append(
             f"{name} has no weight of the set-point: proportional_weight must be 1."
             + (
                 " A feed-forward of (weight - 1) times P does the same, and is negative below 1, "
                 "beyond the documented range."
-                if firmware in ("px4", "ardupilot")
+                if known.weighs_setpoint
                 else ""
             )
         )
     if np.any(np.asarray(controller.feedforward) != 0):
-        found.append(f"{name} feeds no angular acceleration forward: feedforward must be 0.")
+        reasons.append(f"{name} feeds no angular acceleration forward: feedforward must be 0.")
     kp, ki, kd = (np.asarray(x) for x in (controller.kp, controller.ki, controller.kd))
     if np.any(kd <= 0):
-        found.append(f"{name} has no angle loop without feedback of the rate: kd must be above 0.")
+        reasons.append(
+            f"{name} has no angle loop without feedback of the rate: kd must be above 0."
+        )
     elif np.any(kp**2 < 4 * kd * ki):
-        found.append(
+        reasons.append(
             f"{name} has no integral of the angle: the rate's does it only for ki of at most "
             f"kp^2/(4 kd) = {np.min(kp**2 / (4 * kd)):.4g}, and ki is {np.max(ki):.4g}."
         )
-    return tuple(found)
+    return tuple(reasons)

@@ -10,7 +10,8 @@ from jaxquad.records import Record
 from jaxquad.spectra import find_line, SpectralLine
 
 from ._flight_channels import FlightChannels
-from ._rate_gains import cells_of, gains_of, gyro_chain_response, law_paths, RateLaw
+from ._law import RateLoop
+from ._rate_gains import cells_of, gains_of, gyro_chain_response, law_paths
 
 
 Frequencies = Float[np.ndarray, " frequencies"]
@@ -81,7 +82,7 @@ class NoNoise(NamedTuple):
 
 
 def gyro_noise(
-    flight: FlightChannels, law: RateLaw, axis: int, least_hz: float
+    flight: FlightChannels, law: RateLoop, axis: int, least_hz: float
 ) -> GyroNoise | NoNoise:
     """The noise of a flight, or why the log does not show it."""
     size = round(_WINDOW / flight.dt)
@@ -195,7 +196,7 @@ def _steady_line(flight: FlightChannels, axis: int, least: float) -> SpectralLin
     return None if abs(line.follows) > _FOLLOWS else line
 
 
-def _unless_unseen(noise: GyroNoise, is_raw: bool, law: RateLaw, axis: int) -> GyroNoise | NoNoise:
+def _unless_unseen(noise: GyroNoise, is_raw: bool, law: RateLoop, axis: int) -> GyroNoise | NoNoise:
     """The noise, unless much of what reaches the command lies beyond what is known."""
     hertz = np.linspace(1.0, 0.499 / law.dt, 400)
     omega = 2 * np.pi * hertz

@@ -1,21 +1,24 @@
 """What the loops of all firmwares share: state, linear form, and the filters of the gyro."""
 
 import abc
+import dataclasses
 from collections.abc import Mapping
-from typing import NamedTuple, TypeVar
+from typing import ClassVar, Generic, NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, ArrayLike, Float, PyTree
 
 from jaxquad._core import (
+    as_messages,
     broadcast_gain,
     ensemble_shape,
     is_concrete,
     match_reference,
+    Message,
     pick_gain,
     require_common_shape,
     require_finite,
@@ -104,6 +107,99 @@ class FirmwareLoop(eqx.Module):
     @abc.abstractmethod
     def gains(self) -> dict[str, Array]:
         """What `tunable` names unless it is 0."""
+
+
+class RateLoop(FirmwareLoop):
+    """The rate loop of a firmware: rates in rad/s in, behind filters of the gyro.
+
+    The methods say what a design has to know of a law; all have defaults for what it does not have.
+    """
+
+    firmware: ClassVar[str]  # its name
+    feed_forward: ClassVar[tuple[str, ...]] = ()  # gains of it
+    of_sticks: ClassVar[bool] = (
+        False  # whether feed-forward is of the sticks, between their samples
+    )
+    gyro: eqx.AbstractVar[FilterChain]
+    dt: eqx.AbstractVar[float]  # s
+
+    def interval(self) -> float:
+        return self.dt
+
+    def gyro_chains(self) -> list[FilterChain]:
+        """All filters of the gyro, at their own rates."""
+        return [self.gyro]
+
+    def derivative_chain(self, axis: int) -> FilterChain:
+        """The filters of the D term alone."""
+        return FilterChain((), 1 / self.dt)
+
+    def without_gyro_filters(self) -> "RateLoop":
+        """The law as it acts on the logged rate, which is behind the gyro's filters.
+
+        A plant that was identified up to that rate contains the filters.
+        """
+        return dataclasses.replace(self, gyro=FilterChain())
+
+    def holds_integral(self, axis: int) -> bool:
+        """Whether the integral can be held while the set-point moves (iterm_relax)."""
+        return False
+
+    def d_ceiling(self, axis: int) -> float:
+        """By which factor D can rise in flight (D_MAX); 1 where it cannot."""
+        return 1.0
+
+
+RateLaw = TypeVar("RateLaw", bound=RateLoop)
+
+
+class FlownLoop(eqx.Module, Generic[RateLaw]):
+    """The rate loop of a log, for roll, pitch and yaw, and what of it is not modelled.
+
+    **Arguments:**
+
+    - `law`: the rate loop at hover (for Betaflight, with throttle-dependent cutoffs at 30 %).
+    - `unmodelled`: sentences; their kind is "notch", "anti-gravity", "feedforward" or empty.
+    """
+
+    law: RateLaw
+    unmodelled: tuple[Message, ...] = eqx.field(static=True, converter=as_messages, default=())
+
+    def parameters(self) -> dict[str, float]:
+        """The values that flew, by the names of `PARAMETERS`."""
+        from ._parameters import list_parameters
+
+        return list_parameters(self.law)
+
+    def at(self, throttle: Float[ArrayLike, "..."]) -> RateLaw:
+        """The law at a throttle of 0 to 1."""
+        return self.law
+
+    # What a replay of a log asks for
+
+    def without_gyro_filters(self) -> "FlownLoop":
+        """The law as it acts on the logged rate."""
+        return dataclasses.replace(self, law=self.law.without_gyro_filters())
+
+    def at_sample(self, throttle: Array, surge: Array, integral_share: Array) -> RateLaw:
+        """The law at one sample of a log."""
+        return self.law
+
+    def surge(self, throttle: Float[np.ndarray, " samples"]) -> Float[np.ndarray, " samples"]:
+        """Anti-gravity's measure of a moving throttle times its gain, at the loop's samples."""
+        return np.zeros_like(throttle)
+
+    def integral_share(
+        self, mixer_range: Float[np.ndarray, " samples"]
+    ) -> Float[np.ndarray, " samples"]:
+        """Of what the integral grows by, while the motors use this share of the mixer's range."""
+        return np.ones_like(mixer_range)
+
+    def setpoint_speed(
+        self, slope: Float[np.ndarray, "samples axes"], fed: Float[np.ndarray, "samples axes"]
+    ) -> Float[np.ndarray, "samples axes"]:
+        """In rad/s^2, by the slope of the set-point and the logged F."""
+        return slope
 
 
 class AngleLoop(FirmwareLoop):

@@ -14,8 +14,7 @@ from jaxtyping import Float
 from jaxquad._core import plain_content
 
 from ._flight_channels import FlightChannels
-from ._flown import FlownLoop
-from ._law import pick_axis
+from ._law import FlownLoop, pick_axis
 from ._replay import replay_terms
 
 

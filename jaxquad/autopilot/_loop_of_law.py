@@ -23,7 +23,6 @@ from jaxquad.spectra import BrokenLoop, FrequencyResponse
 from ._flown_law import FlownLaw
 from ._pilot_page import StepGrid
 from ._rate_gains import law_responses
-from ._reproduce import without_gyro_filters
 
 
 Frequencies = Float[np.ndarray, " frequencies"]
@@ -89,7 +88,7 @@ def _law_at(
     flown: FlownLaw, filters: Sequence[KnownFilter], omega: Frequencies, radians: float
 ) -> _Loop:
     assert flown.law is not None
-    law = without_gyro_filters(flown.law)  # the logged rate is behind them
+    law = flown.law.without_gyro_filters()  # the logged rate is behind them
     ahead, back = radians * law_responses(law, flown.axis, omega)
     return _Loop(omega, ahead, back, filter_response(filters, omega))
 

@@ -10,7 +10,6 @@ from jaxquad._core import announce
 from jaxquad.identify import (
     actuator,
     curve_of_parameter,
-    CurveFirmware,
     FirmwareValue,
     gain_over_throttle,
     GainOverThrottle,
@@ -20,21 +19,16 @@ from jaxquad.identify import (
     UndeterminedError,
 )
 from jaxquad.records import Proposal, Record, RecordWarning
+from jaxquad.records.firmware import firmware_names
 
 from ._files import ParameterChange, propose_changes
+from ._firmware import firmware_named
 from ._flown_autopilot import FlownAutopilot
 from ._identified import IdentifiedPlant
-from ._parameters import find_parameter, Firmware
+from ._parameters import find_parameter
 from ._plants import PlantSource
 
 
-_PARAMETERS: Mapping[Firmware, str] = {
-    "betaflight": "thrust_linear", "px4": "THR_MDL_FAC", "ardupilot": "MOT_THST_EXPO",
-}  # fmt: skip
-_KINDS: Mapping[Firmware, CurveFirmware] = {
-    "betaflight": "betaflight", "px4": "px4", "ardupilot": "ardupilot",
-}  # fmt: skip
-_SAME_SHAPE = (2026, 6)  # of Betaflight, from which on thrust_linear is of the others' family
 ReadBeside = Callable[[Mapping[str, Mapping[str, float]]], Sequence[Record]]
 _DRAWN, _SEED = 1000, 5  # of the ratio of gains
 _VAGUE = 0.4  # half of the relative 95 % interval of a gain from which plants are not drawn
@@ -111,7 +105,7 @@ class ThrottleVerdict:
     @property
     def table(self) -> str:
         """The gain over the throttle, without other firmwares' parameters."""
-        names = tuple(_PARAMETERS.values())
+        names = tuple(firmware_named(name).thrust_curve or "-" for name in firmware_names())
         return "\n".join(x for x in str(self.gains).splitlines() if not x.startswith(names))
 
     def content(self) -> dict[str, object]:
@@ -163,7 +157,7 @@ def study_throttle(
         )
     ends = [shown(x) for x in span]
     text = _in_words(gains, ends, ratio)
-    if flown.firmware == "betaflight" and parameter.curve:
+    if firmware_named(flown.firmware).keeps_throttle and parameter.curve:
         text += ". Below, throttle is the thrust that the firmware makes of it, 0 to 1"
     return ThrottleVerdict(
         text, gains, span,
@@ -185,15 +179,16 @@ class _Parameter:
     """The thrust curve's parameter as it flew."""
 
     name: str
-    kind: CurveFirmware
+    kind: str
     value: float | None  # None where the log does not hold it
     curve: float
 
 
 def _flown_parameter(flown: FlownAutopilot) -> _Parameter:
-    name = _PARAMETERS[flown.firmware]
-    cubic = flown.firmware == "betaflight" and flown.version < _SAME_SHAPE
-    kind = "betaflight 2025.12" if cubic else _KINDS[flown.firmware]
+    firmware = firmware_named(flown.firmware)
+    name, kind = firmware.thrust_curve, firmware.curve_kind(flown.version)
+    if not name:
+        return _Parameter("", kind, None, 0.0)
     logged = float(flown.values[name]) if name in flown.values else None
     assumed = find_parameter(flown.firmware, name).default if logged is None else logged
     return _Parameter(name, kind, logged, curve_of_parameter(kind, assumed))
@@ -204,11 +199,11 @@ def _read(
 ) -> list[Record]:
     """The records that were identified, with the thrust that the throttle asks for beside them.
 
-    Betaflight asks for less where it inverts a curve, so that the motors get the throttle itself.
+    Less is asked for where a firmware inverts a curve, but the motors get the throttle itself.
     """
     [(channel, factor)] = proposal.setup.throttle.items()
     mix = {channel: factor}
-    if flown.firmware == "betaflight" and parameter.curve:
+    if firmware_named(flown.firmware).keeps_throttle and parameter.curve:
         f = parameter.curve
         mix = {channel: (1 - f) * factor, f"{channel}^2": f * factor**2}
     with warnings.catch_warnings():  # identification has said what there is; the throttle is slow
@@ -218,7 +213,8 @@ def _read(
 
 def _as_logged(flown: FlownAutopilot, thrust: float, curve: float) -> float:
     """The throttle in the log that asks for a thrust."""
-    return float(actuator(thrust, curve)) if flown.firmware == "betaflight" else float(thrust)
+    kept = firmware_named(flown.firmware).keeps_throttle
+    return float(actuator(thrust, curve)) if kept else float(thrust)
 
 
 def _ratio(gains: GainOverThrottle, span: tuple[float, float]) -> tuple[float, float, float]:
@@ -248,8 +244,10 @@ def _in_words(gains: GainOverThrottle, span: list[float], ratio: tuple[float, fl
 
 def _curve_verdict(
     gains: GainOverThrottle, flown: FlownAutopilot, parameter: _Parameter
-) -> CurveVerdict:
+) -> CurveVerdict | None:
     name, value = parameter.name, parameter.value
+    if not name:
+        return None
     verdict = lambda text, found=None, change=None: CurveVerdict(name, value, found, change, text)
     try:
         found = gains.firmware_value(parameter.kind)
@@ -287,7 +285,7 @@ def _consequences(gains: GainOverThrottle, flown: FlownAutopilot) -> str:
         f"with it the gain of all axes is the same at every throttle, {times:.2f} times that at "
         f"{at:.2f}"
     )
-    if flown.firmware == "betaflight":
+    if firmware_named(flown.firmware).keeps_throttle:
         return moved
     x = float(actuator(middle, gains.flown))
     hover = curve.value * x**2 + (1 - curve.value) * x

@@ -12,15 +12,15 @@ from jaxquad.records import AXES
 from jaxquad.report import Cell, Headline, Provenance, reason_of, Table
 
 from ._files import ParameterChange, WordChange
-from ._filters import FilterChain, PT1
+from ._filters import FilterChain
+from ._firmware import firmware_named
 from ._flight_channels import FlightChannels
 from ._gyro_noise import gyro_noise, GyroNoise
+from ._law import RateLoop
 from ._limits import limits_text
 from ._page import PilotPage
-from ._rate_gains import gains_in, gains_of, gyro_chain_response, law_paths, RateLaw
+from ._rate_gains import gains_in, gains_of, gyro_chain_response, law_paths
 from ._stages import margin_text, Stage
-from .ardupilot._law import ArduPilotRate
-from .betaflight._law import BetaflightPID
 
 
 if TYPE_CHECKING:
@@ -32,7 +32,6 @@ _PERIOD, _SHOWN, _FINEST = 8.0, 1.2, 1 / 400  # s, of a computed step, of a show
 _WINDOW = 4.0  # s, of computed terms
 _NEAR = 0.005  # of a motor's range, from its ends
 _SLOWEST = 20.0  # Hz, below which motion is taken for noise
-_UNITS = {"betaflight": "pidsum", "px4": "torque set-point", "ardupilot": "ROut"}
 
 
 def pilot_page(found: "AutopilotProposal", origin: Provenance, overview: str = "") -> PilotPage:
@@ -72,7 +71,7 @@ def pilot_page(found: "AutopilotProposal", origin: Provenance, overview: str = "
         stages=_stage_rows(found) if found.stages else None,
         changes=change_rows(found.changes) if found.new else None,
         text=str(found),
-        unit=_UNITS[flown.firmware],
+        unit=firmware_named(flown.firmware).unit,
         again=None if check is None else FlownAgain(
             check.time, check.setpoint, check.rate, check.again
         ),
@@ -127,7 +126,7 @@ def _headlines(found: "AutopilotProposal") -> list[Headline]:
     return headlines
 
 
-def _proposed_law(found: "AutopilotProposal") -> RateLaw | None:
+def _proposed_law(found: "AutopilotProposal") -> RateLoop | None:
     """The law with the proposed filters; None where nothing is proposed."""
     if not found.new:
         return None
@@ -137,29 +136,23 @@ def _proposed_law(found: "AutopilotProposal") -> RateLaw | None:
     return found.flown.with_filters({name: found.new[name] for name in filters})
 
 
-def _filters(law: RateLaw, after: RateLaw | None, axis: int) -> dict[str, Chains]:
+def _filters(law: RateLoop, after: RateLoop | None, axis: int) -> dict[str, Chains]:
     before = chains_of(law, axis)
     if after is None or after is law:
         return {"flown": before}
     return {"flown": before, "proposed": chains_of(after, axis)}
 
 
-def chains_of(law: RateLaw, axis: int) -> Chains:
+def chains_of(law: RateLoop, axis: int) -> Chains:
     """The filters of the gyro and those of the D term alone."""
-    rate = 1 / law.dt
-    if isinstance(law, BetaflightPID):
-        gyro, slope = (law.gyro, FilterChain(law.filters, rate)), FilterChain(law.dterm, rate)
-    else:
-        cutoff = float(np.broadcast_to(law.derivative_hz, (3,))[axis])
-        own = rate if isinstance(law, ArduPilotRate) else law.gyro.rate_hz
-        gyro, slope = (law.gyro,), FilterChain((PT1(cutoff),) if cutoff > 0 else (), own)
-    chains: Chains = {"gyro": tuple(each for each in gyro if each.filters)}
+    gyro, slope = law.gyro_chains(), law.derivative_chain(axis)
+    chains: Chains = {"gyro": tuple(chain for chain in gyro if chain.filters)}
     if slope.filters and gains_of(law, axis)[2] > 0:
         chains["D term"] = (slope,)
     return chains
 
 
-Designs = Mapping[str, tuple[RateLaw, Float[np.ndarray, " gains"]]]
+Designs = Mapping[str, tuple[RateLoop, Float[np.ndarray, " gains"]]]
 
 
 def _spectra(
@@ -243,7 +236,7 @@ class StepGrid(NamedTuple):
         return StepBand(np.arange(shown) * self.dt, middle, low, high)
 
 
-def _terms(flight: FlightChannels | None, law: RateLaw, axis: int) -> tuple[dict[str, float], str]:
+def _terms(flight: FlightChannels | None, law: RateLoop, axis: int) -> tuple[dict[str, float], str]:
     """Root mean squares of the terms, and where they are from."""
     if flight is None:
         return {}, ""
@@ -258,7 +251,7 @@ def logged_terms(flight: FlightChannels) -> dict[str, float]:
     return {name: float(np.sqrt(np.mean(x**2))) for name, x in moved.items()}
 
 
-def _computed_terms(flight: FlightChannels, law: RateLaw, axis: int) -> dict[str, float]:
+def _computed_terms(flight: FlightChannels, law: RateLoop, axis: int) -> dict[str, float]:
     size = min(int(_WINDOW / flight.dt), len(flight.setpoint))
     hertz = np.fft.rfftfreq(size, flight.dt)
     seen = (hertz > 0) & (hertz < 0.4999 / law.dt)

@@ -9,16 +9,14 @@ from jaxtyping import Float
 
 from jaxquad.identify import draw_models, filter_response, Fit, GainOverThrottle, KnownFilter
 
-from ._angle_loop import AngleLoop
+from ._firmware import OuterLoop
+from ._law import RateLoop
 from ._rate_gains import (
-    ceiling_of,
     cells_of,
     forward_path,
     gyro_chain_response,
     hold_plants,
-    is_relaxed,
     law_paths,
-    RateLaw,
     RateLoops,
 )
 
@@ -54,9 +52,9 @@ class PlantSource:
         return float(np.asarray(vars(self.fit.model).get("damping", 0.0)))
 
     def loops(
-        self, law: RateLaw, axis: int, count: int, seed: int, *,
+        self, law: RateLoop, axis: int, count: int, seed: int, *,
         omega: Frequencies | None = None, throttle: float | None = None,
-        angle: AngleLoop | None = None,
+        angle: OuterLoop | None = None,
     ) -> RateLoops:  # fmt: skip
         """The loops of a law with so many plants, and an angle loop around them.
 
@@ -80,8 +78,8 @@ class PlantSource:
         plants = hold_plants(per_radian * gain, lag, delay, omega, law.dt, damping)
         white = cells_of(omega) * np.abs(passed) ** 2
         return RateLoops(
-            omega, back, ahead, plants * passed, white, passed, ceiling_of(law, axis), chain,
-            is_relaxed(law, axis), forward_path(law, axis, omega),
+            omega, back, ahead, plants * passed, white, passed, law.d_ceiling(axis), chain,
+            law.holds_integral(axis), forward_path(law, axis, omega),
             None if angle is None else angle.path(omega),
         )  # fmt: skip
 

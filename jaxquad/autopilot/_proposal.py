@@ -12,6 +12,7 @@ from jaxquad.records import AXES
 from jaxquad.report import Provenance, provenance, write_json
 
 from ._files import change_table, ParameterChange
+from ._firmware import firmware_named
 from ._flight_channels import FlightChannels
 from ._flown_autopilot import FlownAutopilot
 from ._gyro_noise import GyroNoise
@@ -29,7 +30,6 @@ from ._stages import margin_text, OuterStage, Stage
 
 _CURVE = "thrust_curve"
 _FAR = 0.98  # of the factor by which a gain may change
-_SHORT = ("RLL", "PIT", "YAW")  # of ArduPilot's parameters of one axis
 
 
 @dataclasses.dataclass(frozen=True)
@@ -100,8 +100,8 @@ class AutopilotProposal:
         """New filters that the other axes have, too."""
         if self.filters is None or not self.new:
             return {}
-        own = f"_{_SHORT[self.flown.axis]}_"
-        return {name: self.new[name] for name in self.filters.flown if own not in name}
+        rows = firmware_named(self.flown.firmware).parameters
+        return {name: self.new[name] for name in self.filters.flown if rows[name].axis < 0}
 
     @property
     def changes(self) -> tuple[ParameterChange, ...]:

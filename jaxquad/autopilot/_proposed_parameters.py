@@ -8,12 +8,12 @@ from jaxquad._core import write_file
 from jaxquad.records import AXES
 
 from ._files import parameter_file, ParameterChange, propose_changes, write_parameter_files
-from ._parameters import find_parameter, Firmware
+from ._firmware import firmware_named
+from ._parameters import find_parameter
 
 
 _THIRD, _ALL = 1 / 3, 1.0
 _STEM = "proposal"
-_SUFFIX: Mapping[Firmware, str] = {"betaflight": "txt", "px4": "params", "ardupilot": "param"}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -26,7 +26,7 @@ class ProposedParameters:
     - `reasons`: for each new one; `at_once`: those that have no third of the way.
     """
 
-    firmware: Firmware
+    firmware: str
     version: tuple[int, ...]
     old: dict[str, float]
     new: dict[str, float] = dataclasses.field(default_factory=dict)
@@ -76,4 +76,4 @@ class ProposedParameters:
             self.firmware, changes, revert=revert, version=self.version or (2025, 12),
             raised=raised, title=title, profile=None,
         )  # fmt: skip
-        return write_file(folder / f"{stem}.{_SUFFIX[self.firmware]}", text)
+        return write_file(folder / f"{stem}.{firmware_named(self.firmware).suffix}", text)

@@ -9,9 +9,9 @@ import numpy as np
 
 from jaxquad._core import announce
 
-from ._angle_loop import AngleLoop
-from ._choices import filter_choices
 from ._files import propose_changes
+from ._filter_choices import filter_choices
+from ._firmware import firmware_named, OuterLoop
 from ._flight_channels import FlightChannels
 from ._flown_autopilot import FlownAutopilot
 from ._gyro_noise import gyro_noise, GyroNoise, NoNoise
@@ -273,7 +273,7 @@ class _Work:
             ]
         return _Certified(tuple(stages), whole, dict(filters), designs, loops)
 
-    def _angle_value(self, loops: RateLoops, gains: np.ndarray, angle: AngleLoop) -> float:
+    def _angle_value(self, loops: RateLoops, gains: np.ndarray, angle: OuterLoop) -> float:
         """The greatest stored gain, up to what flew, with which the angle loop keeps the limits."""
         kept = self.settings
         row = find_parameter(self.flown.firmware, angle.name)
@@ -304,7 +304,12 @@ class _Work:
         if flown.angle is not None and flown.angle.name in new:
             old[flown.angle.name] = flown.angle.value
         changes = propose_changes(
-            flown.firmware, old, new, share=_THIRD, beyond=list(new), at_once=switched(bank)
+            flown.firmware,
+            old,
+            new,
+            share=_THIRD,
+            beyond=list(new),
+            at_once=switched(flown.firmware, bank),
         )
         return old | {change.parameter.name: change.new for change in changes}
 
@@ -318,9 +323,10 @@ class _Work:
         return dict(filter_values(list(names), choices))
 
 
-def switched(flown: Mapping[str, float]) -> tuple[str, ...]:
+def switched(firmware: str, flown: Mapping[str, float]) -> tuple[str, ...]:
     """Of filters that flew, the parameters of notches that were off."""
-    notch = [name for name in flown if "notch" in name or "_NF" in name]
+    notches = {name for pair in firmware_named(firmware).notches for name in pair}
+    notch = [name for name in flown if name in notches]
     off = any(flown[name] == 0 for name in notch)
     return tuple(notch) if off else ()
 
@@ -375,7 +381,9 @@ def _compared(
     reason = (
         f"delay of gyro {gyro:+.2f} ms, of D {slope:+.2f} ms, at command noise {freed.noise:.2f}"
     )
-    return both, FilterVerdict(text, flown, reason, switched(flown), alone, shared)
+    return both, FilterVerdict(
+        text, flown, reason, switched(work.flown.firmware, flown), alone, shared
+    )
 
 
 _SWINGING = 0.1  # of a flight with a motor at its limit, from which the motors bound a swing

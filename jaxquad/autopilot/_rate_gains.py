@@ -16,21 +16,28 @@ from jaxtyping import Bool, Complex, Float
 
 from jaxquad._core import Number
 from jaxquad.identify import filter_response
-from jaxquad.records import AXES
 
-from ._angle_loop import OuterQualities
-from ._filters import FilterChain
-from ._parameters import Firmware, firmware_of, Parameter, PARAMETERS, store_parameters
-from ._reproduce import without_gyro_filters
-from .ardupilot._law import ArduPilotRate
-from .betaflight._law import BetaflightADRC, BetaflightPID
-from .px4._firmware import PX4Rate
+from ._firmware import Parameter
+from ._law import RateLoop
+from ._parameters import PARAMETERS, store_parameters
 
 
-RateLaw = BetaflightPID | PX4Rate | ArduPilotRate
 Gains = Float[np.ndarray, "designs gains"]
 Paths = Complex[np.ndarray, "designs frequencies"]
 FIELDS = ("p", "i", "d")
+
+
+class OuterQualities(NamedTuple):
+    """What an angle loop gives, for each plant.
+
+    **Attributes:**
+
+    - `stable`; `peak`: Ms; `resonance`: of the response from set-point to angle.
+    """
+
+    stable: Bool[np.ndarray, " plants"]
+    peak: Float[np.ndarray, " plants"]
+    resonance: Float[np.ndarray, " plants"]
 
 
 class LoopQualities(NamedTuple):
@@ -99,7 +106,7 @@ class RateLoops:
         """For each throttle its own."""
         return dataclasses.replace(self, beside=()), *self.beside
 
-    def of_law(self, law: RateLaw, axis: int) -> "RateLoops":
+    def of_law(self, law: RateLoop, axis: int) -> "RateLoops":
         """The same plants under a law with other filters, as exactly as those of the flown one.
 
         Without those beside.
@@ -292,60 +299,60 @@ def _is_stable(
     return ends[0] - 2 * np.pi * rounds < 0
 
 
+def delay_margin(
+    loop: Complex[np.ndarray, "plants frequencies"], omega: Float[np.ndarray, " frequencies"]
+) -> Float[np.ndarray, " plants"]:
+    """The delay in s that brings each open loop to -1, at the worst of its crossings of 1."""
+    size, angle = np.log(np.abs(loop)), np.angle(loop)
+    falls = np.diff(np.sign(size), axis=1) != 0
+    span = size[:, :-1] - size[:, 1:]
+    part = np.where(falls, size[:, :-1] / np.where(span == 0, 1.0, span), 0.0)
+    turned = np.angle(loop[:, 1:] / loop[:, :-1])
+    phase = np.mod(angle[:, :-1] + part * turned + np.pi, 2 * np.pi)  # beyond -180 deg
+    at = omega[:-1] * (omega[1:] / omega[:-1]) ** part
+    return np.where(falls, phase / at, np.inf).min(axis=1)
+
+
 def law_paths(
-    law: RateLaw, axis: int, omega: Float[np.ndarray, " frequencies"]
+    law: RateLoop, axis: int, omega: Float[np.ndarray, " frequencies"]
 ) -> tuple[Complex[np.ndarray, "gains frequencies"], Complex[np.ndarray, "gains frequencies"]]:
     """Per unit of P, I and D: from the filtered rate to minus the command, from the set-point."""
-    seen = without_gyro_filters(law)  # the logged rate is behind them: they are in the plant
-    each = [law_responses(_alone(seen, name), axis, omega) for name in FIELDS]
-    ahead, back = np.stack(each, axis=1)
+    bare = law.without_gyro_filters()  # the logged rate is behind them: they are in the plant
+    responses = [law_responses(_alone(bare, name), axis, omega) for name in FIELDS]
+    ahead, back = np.stack(responses, axis=1)
     return -back, ahead
 
 
-def gyro_chains(law: RateLaw) -> list[FilterChain]:
-    """All filters of the gyro, at their own rates."""
-    if isinstance(law, BetaflightPID) and law.filters:
-        return [law.gyro, FilterChain(law.filters, 1 / law.dt)]
-    return [law.gyro]
-
-
 def gyro_chain_response(
-    law: RateLaw, omega: Float[np.ndarray, " frequencies"]
+    law: RateLoop, omega: Float[np.ndarray, " frequencies"]
 ) -> Complex[np.ndarray, " frequencies"]:
     """Of all filters of the gyro."""
-    return filter_response(gyro_chains(law), omega)
+    return filter_response(law.gyro_chains(), omega)
 
 
 def forward_path(
-    law: RateLaw, axis: int, omega: Float[np.ndarray, " frequencies"]
+    law: RateLoop, axis: int, omega: Float[np.ndarray, " frequencies"]
 ) -> Complex[np.ndarray, " frequencies"] | None:
     """Of the law's feed-forward, from the set-point to the command; of Betaflight's sticks none."""
-    names = _ahead_of(law)
-    if isinstance(law, BetaflightPID) or not any(np.any(vars(law)[name]) for name in names):
+    if law.of_sticks or not any(np.any(vars(law)[name]) for name in law.feed_forward):
         return None
     without = eqx.tree_at(
         lambda each: [vars(each)[name] for name in FIELDS],
-        without_gyro_filters(law), [jnp.zeros_like(law.p)] * len(FIELDS),
+        law.without_gyro_filters(), [jnp.zeros_like(law.p)] * len(FIELDS),
     )  # fmt: skip
     return law_responses(without, axis, omega)[0]
 
 
-def _ahead_of(law: RateLaw) -> tuple[str, ...]:
-    if isinstance(law, ArduPilotRate):
-        return "ff", "d_ff"
-    return ("f",) if isinstance(law, BetaflightPID) else ("ff",)
-
-
-def _alone(law: RateLaw, name: str) -> RateLaw:
+def _alone(law: RateLoop, name: str) -> RateLoop:
     """The law with a gain of 1, none of the other two and no feed-forward."""
-    ahead = _ahead_of(law)
-    of = lambda law: [vars(law)[each] for each in (*FIELDS, *ahead)]
-    gains = [jnp.full_like(law.p, float(each == name)) for each in (*FIELDS, *ahead)]
+    fields = (*FIELDS, *law.feed_forward)
+    of = lambda law: [vars(law)[field] for field in fields]
+    gains = [jnp.full_like(law.p, float(field == name)) for field in fields]
     return eqx.tree_at(of, law, gains)  # what `replace` would check anew is known to be right
 
 
 def law_responses(
-    law: RateLaw | BetaflightADRC, axis: int, omega: Float[np.ndarray, " frequencies"]
+    law: RateLoop, axis: int, omega: Float[np.ndarray, " frequencies"]
 ) -> Complex[np.ndarray, "inputs frequencies"]:
     """From the set-point and from the rate, both in rad/s, to the command."""
     linear = law.linear(axis)
@@ -381,58 +388,50 @@ def hold_plants(
     return gain * (1 - q) * q ** (whole + 1) * steps
 
 
-def is_relaxed(law: RateLaw, axis: int) -> bool:
-    """Whether the integral can be held while the set-point moves (iterm_relax)."""
-    if not isinstance(law, BetaflightPID) or law.relax is None:
-        return False
-    return float(np.broadcast_to(law.relax.share, (3,))[axis]) > 0
-
-
-def ceiling_of(law: RateLaw, axis: int) -> float:
-    """By which factor D can rise in flight (D_MAX); 1 where it cannot."""
-    if not isinstance(law, BetaflightPID) or law.d_max is None:
-        return 1.0
-    base, most = (float(np.broadcast_to(x, (3,))[axis]) for x in (law.d, law.d_max.ceiling))
-    return max(1.0, most / base) if base > 0 else 1.0
-
-
-def gains_of(law: RateLaw, axis: int) -> Float[np.ndarray, " gains"]:
+def gains_of(law: RateLoop, axis: int) -> Float[np.ndarray, " gains"]:
     """P, I and D of one axis."""
     return np.array([float(np.broadcast_to(vars(law)[name], (3,))[axis]) for name in FIELDS])
 
 
-def gain_row(firmware: Firmware, axis: int, field: str) -> Parameter:
+def gain_row(firmware: str, axis: int, field: str) -> Parameter:
     """The parameter of a gain of one axis."""
     rows = PARAMETERS[firmware].values()
     return next(row for row in rows if row.field == field and row.axis == axis)
 
 
-def parameters_of(law: RateLaw, axis: int, gains: Float[np.ndarray, " gains"]) -> dict[str, float]:
+def _ceiling_name(law: RateLoop, axis: int) -> str:
+    """The parameter up to which D can rise in flight; empty where the firmware has none."""
+    rows = PARAMETERS[law.firmware].values()
+    return next((x.name for x in rows if x.field == "d_max.ceiling" and x.axis == axis), "")
+
+
+def parameters_of(law: RateLoop, axis: int, gains: Float[np.ndarray, " gains"]) -> dict[str, float]:
     """The parameters that stand for these gains; a ceiling of D rises with D."""
-    firmware = firmware_of(law)
+    firmware = law.firmware
     flown = gains_of(law, axis)
     found = {
         gain_row(firmware, axis, name).name: float(gain)
         for name, gain, old in zip(FIELDS, gains, flown, strict=True)
         if old > 0
     }
-    if (ceiling := ceiling_of(law, axis)) > 1:
-        found[f"d_max_{AXES[axis]}"] = ceiling * float(gains[2])
+    if (ceiling := law.d_ceiling(axis)) > 1:
+        found[_ceiling_name(law, axis)] = ceiling * float(gains[2])
     return store_parameters(firmware, found)
 
 
-def ceiling_in(law: RateLaw, axis: int, designs: Sequence[Mapping[str, Number]]) -> float:
+def ceiling_in(law: RateLoop, axis: int, designs: Sequence[Mapping[str, Number]]) -> float:
     """The most by which D can rise in flight under one of these stored sets of parameters."""
-    flown = ceiling_of(law, axis)
-    pairs = [(each.get(f"d_max_{AXES[axis]}"), gains_in(law, axis, each)[2]) for each in designs]
+    flown = law.d_ceiling(axis)
+    pairs = [(each.get(_ceiling_name(law, axis)), gains_in(law, axis, each)[2]) for each in designs]
     return max([flown, *(float(top / base) for top, base in pairs if top and base > 0)])
 
 
 def gains_in(
-    law: RateLaw, axis: int, parameters: Mapping[str, Number]
+    law: RateLoop, axis: int, parameters: Mapping[str, Number]
 ) -> Float[np.ndarray, " gains"]:
     """P, I and D of parameters; those that are not named stay."""
-    firmware, gains = firmware_of(law), gains_of(law, axis)
-    for k, name in enumerate(FIELDS):
-        gains[k] = parameters.get(gain_row(firmware, axis, name).name, gains[k])
+    gains = gains_of(law, axis)
+    for row in PARAMETERS[law.firmware].values():
+        if row.field in FIELDS and row.axis == axis and row.name in parameters:
+            gains[FIELDS.index(row.field)] = parameters[row.name]
     return gains

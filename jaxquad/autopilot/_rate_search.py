@@ -7,10 +7,10 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Complex, Float, Int
 
-from ._choices import FilterChoice
 from ._filters import FilterChain
+from ._firmware import FilterChoice, Parameter
 from ._gyro_noise import GyroNoise
-from ._parameters import Firmware, Parameter
+from ._law import RateLoop
 from ._rate_gains import (
     FIELDS,
     Filters,
@@ -20,7 +20,6 @@ from ._rate_gains import (
     gyro_chain_response,
     law_paths,
     Paths,
-    RateLaw,
     RateLoops,
 )
 
@@ -62,7 +61,7 @@ class OtherAxis(NamedTuple):
 
 
 def other_axes(
-    law: RateLaw, noise: GyroNoise, omega: Float[np.ndarray, " frequencies"]
+    law: RateLoop, noise: GyroNoise, omega: Float[np.ndarray, " frequencies"]
 ) -> tuple[OtherAxis, ...]:
     """Those whose gyro is in the log, under a law; behind the gyro's filters of that law."""
     found = []
@@ -77,7 +76,7 @@ class FilterBank:
     """The options of all free filters, as their responses over those that flew."""
 
     def __init__(
-        self, choices: Sequence[FilterChoice], law: RateLaw, noise: GyroNoise,
+        self, choices: Sequence[FilterChoice], law: RateLoop, noise: GyroNoise,
         omega: Float[np.ndarray, " frequencies"],
     ):  # fmt: skip
         self.choices, self.known = tuple(choices), omega / (2 * np.pi) <= noise.known_hz
@@ -170,7 +169,7 @@ class Search:
 
     def __init__(
         self, loops: RateLoops, flown: Float[np.ndarray, " gains"], targets: Targets,
-        firmware: Firmware, axis: int, bank: FilterBank | None = None,
+        firmware: str, axis: int, bank: FilterBank | None = None,
         before: RateLoops | None = None,
     ):  # fmt: skip
         """`before` are the loops of what flew, where `loops` are behind other filters."""
@@ -304,8 +303,8 @@ class SharedChange(NamedTuple):
 
 
 def shared_change(
-    law: RateLaw,
-    changed: RateLaw,
+    law: RateLoop,
+    changed: RateLoop,
     noise: GyroNoise,
     omega: Float[np.ndarray, " frequencies"],
     axis: int,

@@ -4,21 +4,17 @@ What is not linear in a law, such as a relaxed or limited integral, is in its eq
 its replay. Source: docs/autopilots.md, "Which gains flew".
 """
 
-import dataclasses
 from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Complex, Float
 
-from jaxquad.control import Setpoint
+from jaxquad.control import LinearController, Setpoint
 
-from ._flown import FlownBetaflight, FlownLoop
-from ._law import DEGREES
-from ._reproduce import without_gyro_filters
-from .betaflight._law import F_SCALE
+from ._law import FlownLoop
 
 
 Samples = Float[Array | np.ndarray, "samples axes"]
@@ -101,7 +97,7 @@ def replay_terms(
         *_moments(flown, grid, throttle, mixer_range),
         *_restarts(grid, setpoint, integral, restart),
     )  # fmt: skip
-    terms = _replayed(_without_filters(flown), rows)
+    terms = _replayed(flown.without_gyro_filters(), rows)
     return {name: grid.coarse(np.asarray(term)) for name, term in terms.items()}
 
 
@@ -165,28 +161,12 @@ class _Grid:
         return np.stack([np.interp(self.log, self.loop, column) for column in signal.T], axis=1)
 
 
-def _without_filters(flown: FlownLoop) -> FlownLoop:
-    """The law as it acts on the logged rate."""
-    bare = dataclasses.replace(flown, law=without_gyro_filters(flown.law))
-    return dataclasses.replace(bare, gyro_dynamic=None) if _is_betaflight(bare) else bare
-
-
-def _is_betaflight(flown: FlownLoop) -> bool:
-    return isinstance(flown, FlownBetaflight)
-
-
 def _speed(
     flown: FlownLoop, grid: _Grid, r: np.ndarray, feed_forward: Samples | None
 ) -> np.ndarray:
-    """The set-point's speed in rad/s^2, of Betaflight's logged F where that has a gain."""
+    """The set-point's speed in rad/s^2."""
     slope = np.diff(r, axis=0, prepend=r[:1]) / grid.interval
-    if feed_forward is None or not _is_betaflight(flown):
-        return slope
-    weight = F_SCALE * DEGREES * np.asarray(flown.law.f)
-    weight = np.broadcast_to(weight, r.shape[1:])
-    known = weight > 0
-    scaled = grid.fine(feed_forward) / np.where(known, weight, 1.0)
-    return np.where(known, scaled, np.where(np.any(feed_forward, axis=0), slope, 0.0))
+    return slope if feed_forward is None else flown.setpoint_speed(slope, grid.fine(feed_forward))
 
 
 def _moments(
@@ -194,12 +174,10 @@ def _moments(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Throttle, anti-gravity's surge and the integral's share: of the loop before, as they act."""
     x = grid.fine(throttle, grid.interval)
-    rested = np.zeros_like(x), np.ones_like(x)
-    if not isinstance(flown, FlownBetaflight):
-        return x, *rested
     surge = flown.surge(grid.fine(throttle))
-    spread = None if mixer_range is None else grid.fine(mixer_range, grid.interval)
-    share = rested[1] if spread is None else flown.integral_share(spread)
+    share = np.ones_like(x)
+    if mixer_range is not None:
+        share = flown.integral_share(grid.fine(mixer_range, grid.interval))
     return x, np.concatenate([[0.0], surge[:-1]]), share
 
 
@@ -221,12 +199,6 @@ def _rows(*series: np.ndarray) -> _Row:
     return _Row(*(jnp.asarray(pad(x)) for x in series))
 
 
-def _law_at(flown: FlownLoop, row: _Row):
-    if isinstance(flown, FlownBetaflight):
-        return flown.at(row.throttle, surge=row.surge, integral_share=row.integral_share)
-    return flown.law
-
-
 @eqx.filter_jit
 def _replayed(flown: FlownLoop, rows: _Row):
     zero = jnp.zeros_like(rows.rate[0])
@@ -234,7 +206,9 @@ def _replayed(flown: FlownLoop, rows: _Row):
     def sample(memory, row: _Row):
         memory = {**memory, "integral": jnp.where(row.anew, row.integral, memory["integral"])}
         reference = Setpoint(row.setpoint, row.speed, zero)
-        memory, _, terms = _law_at(flown, row).advance(memory, zero, reference, row.rate)
+        memory, _, terms = flown.at_sample(row.throttle, row.surge, row.integral_share).advance(
+            memory, zero, reference, row.rate
+        )
         return memory, terms
 
     return jax.lax.scan(sample, flown.law.rest(zero), rows)[1]
@@ -273,10 +247,51 @@ def _flown_again(flown: FlownLoop, step: _Step, wait: int, rows: _Row):
         memory, state, queue = carry
         rate = state[1]
         reference = Setpoint(row.setpoint, row.speed, zero)
-        memory, command, _ = _law_at(flown, row).advance(memory, zero, reference, rate)
+        memory, command, _ = flown.at_sample(row.throttle, row.surge, row.integral_share).advance(
+            memory, zero, reference, rate
+        )
         queue = jnp.concatenate([(command + row.rate)[None], queue])  # the newest one first
         moved = matrix @ state + jnp.outer(now, queue[-2]) + jnp.outer(before, queue[-1])
         return (memory, moved, queue[:-1]), rate
 
     start = (flown.law.rest(zero), jnp.zeros((2, *zero.shape)), queue)
     return jax.lax.scan(sample, start, rows)[1]
+
+
+@eqx.filter_jit
+def predict_loop(
+    law: LinearController,
+    plant: Complex[Array | np.ndarray, "... frequencies"],
+    omega: Float[Array | np.ndarray, " frequencies"],
+) -> Complex[Array, "... frequencies"]:
+    """The closed loop's response from set-point to measurement.
+
+    **Arguments:**
+
+    - `law`: of one axis, `law.linear(axis)`; of the rate, for a plant up to the rate.
+    - `plant`: its response from the command to the measurement in rad or rad/s, the hold of the
+        command included (`hold_response`); draws of it on leading axes.
+    - `omega`: rad/s, below pi/dt.
+    """
+    turn = omega * law.dt
+    z = jax.lax.complex(jnp.cos(turn), jnp.sin(turn))
+    inputs = jnp.stack([law.reference_in, law.measurement_in], axis=1)
+    through = jnp.stack([law.reference_through, law.measurement_through])
+    states = len(law.A)
+
+    def at(z: Array) -> Array:
+        resolvent = z * jnp.eye(states, dtype=z.dtype) - law.A.astype(z.dtype)
+        return law.C.astype(z.dtype) @ jnp.linalg.solve(resolvent, inputs.astype(z.dtype))
+
+    ahead, back = (jax.vmap(at)(z) + through.astype(z.dtype)[None]).T
+    plant = jnp.asarray(plant, z.dtype)
+    wide = (1,) * (plant.ndim - 1) + (-1,)
+    return plant * ahead.reshape(wide) / (1 - plant * back.reshape(wide))
+
+
+def hold_response(
+    omega: Float[Array | np.ndarray, " frequencies"], dt: float
+) -> Complex[np.ndarray, " frequencies"]:
+    """Of a command that is held over samples of `dt` seconds, at `omega` in rad/s."""
+    half = np.asarray(omega) * dt / 2
+    return np.sinc(half / np.pi) * np.exp(-1j * half)

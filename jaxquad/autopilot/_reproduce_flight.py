@@ -22,7 +22,7 @@ from jaxquad.identify import (
 from jaxquad.records import Record, select
 from jaxquad.spectra import frequency_response, FrequencyResponse, LocalPolynomial
 
-from ._reproduce import predict_loop
+from ._replay import predict_loop
 
 
 _CHANGE = 1e-4  # of a parameter, for slopes
@@ -175,7 +175,7 @@ def reproduce_flight(
         `jq.identify.gain_over_throttle`.
     - `unit`: of the rate in the fit.
     - `filters`: those that the rate passed before it was logged, if the plant is without them. A
-        plant that contains them goes with `jq.autopilot.without_gyro_filters`.
+        plant that contains them goes with the law's `without_gyro_filters()`.
     - `axis`: of the controller.
     - `band`: (low, high) in rad/s; by default where the response is coherent.
 

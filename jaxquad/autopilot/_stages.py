@@ -6,8 +6,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from ._angle_loop import AngleLoop, delay_margin
-from ._rate_gains import RateLoops, together
+from ._firmware import OuterLoop
+from ._rate_gains import delay_margin, RateLoops, together
 
 
 class Stage(NamedTuple):
@@ -62,7 +62,7 @@ class OuterStage(NamedTuple):
 
 
 def certify_angle(
-    loops: RateLoops, gains: Float[np.ndarray, " gains"], angle: AngleLoop, value: float
+    loops: RateLoops, gains: Float[np.ndarray, " gains"], angle: OuterLoop, value: float
 ) -> OuterStage:
     """The angle loop with a value of its parameter around the rate loop with these gains."""
     around = loops.outer_qualities(gains, angle.gain(value))

@@ -9,10 +9,12 @@ from ._demo import (
     find_demo_flight as find_demo_flight,
     write_demo_log as write_demo_log,
 )
+from ._identification import Identification as Identification
 from ._identify import (
-    Identification as Identification,
     identify as identify,
+    identify_again as identify_again,
     identify_opened as identify_opened,
+    verify_result as verify_result,
 )
 from ._kinds import SettingsError as SettingsError
 from ._log import (
@@ -31,10 +33,6 @@ from ._result_file import (
 from ._settings import (
     GROUPS as GROUPS,
     IdentifySettings as IdentifySettings,
-)
-from ._stored import (
-    identify_again as identify_again,
-    verify_result as verify_result,
 )
 from ._tune import tune as tune, Tuning as Tuning
 from ._tune_settings import (

@@ -15,14 +15,13 @@ from jaxquad.autopilot import (
     check_law,
     check_loop,
     design_gains,
+    firmware_named,
     FlightChannels,
     FlownAutopilot,
-    gyro_chains,
     read_channels_if_any,
     read_flown,
     settings_of,
     study_throttle,
-    what_to_fly,
 )
 from jaxquad.records import AXES, Proposal
 
@@ -143,7 +142,7 @@ def _tune_axis(axis: _ReadAxis, filters: Mapping[str, float]) -> AutopilotPropos
     plant = identify_plant(path, asked, proposal, flown.filters)
     known = (settings, plant, flown)
     unsure = lambda why, again: AutopilotProposal("cannot tell", why, *known, again, flight=flight)
-    recipe = what_to_fly(flown.firmware, AXES[flown.axis])
+    recipe = firmware_named(flown.firmware).what_to_fly(AXES[flown.axis])
     if not plant.fit.identifiable:
         summary = plant.fit.verdict.summary
         return unsure(Message(f"this log cannot tell: «plant|{summary}». {recipe}"), None)
@@ -193,6 +192,6 @@ def _read_flight(
         settings = dataclasses.replace(settings, throttle=flight.middle)
     tracked = {} if flight is None else flight.tracked_hz
     flown = read_flown(path, proposal, settings, tracked)
-    chains = tuple(each for each in gyro_chains(flown.law) if each.filters)
+    chains = tuple(chain for chain in flown.law.gyro_chains() if chain.filters)
     filters, text = best_filters(chains, flown.unmodelled, flight, flown.axis)
     return dataclasses.replace(flown, filters=filters, filters_text=text), flight

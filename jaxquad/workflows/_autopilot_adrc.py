@@ -15,6 +15,7 @@ from jaxquad.autopilot import (
     betaflight_loop,
     doubted_throttle,
     FilterChain,
+    firmware_named,
     flies_adrc,
     FlightChannels,
     Flown,
@@ -47,7 +48,8 @@ _LINES = 40  # frequencies of a reproduced response
 
 def flew_adrc(path: Path, proposal: Proposal) -> bool:
     """Whether a log is of a flight with Betaflight's proposed ADRC."""
-    return proposal.vehicle == "betaflight" and flies_adrc(settings_of(path, proposal).values)
+    firmware = firmware_named(proposal.vehicle)
+    return firmware.has_adrc and firmware.flies_adrc(settings_of(path, proposal).values)
 
 
 def tune_adrc(
@@ -57,7 +59,7 @@ def tune_adrc(
 
     Raises `SettingsError` for another firmware, and for a hover throttle other than the flown one.
     """
-    if proposed.vehicle != "betaflight":
+    if not firmware_named(proposed.vehicle).has_adrc:
         raise SettingsError(
             f"`law` is adrc, which is proposed for Betaflight alone (its pull request 15400), and "
             f"{path} is a log of {proposed.vehicle}: leave it out"

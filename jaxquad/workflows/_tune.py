@@ -27,7 +27,8 @@ from jaxquad.tuning import (
     worst_flights,
 )
 
-from ._identify import Identification, identify_fit
+from ._identification import Identification
+from ._identify import identify_fit
 from ._log import open_again
 from ._result_file import load_result, require_radians, StoredResult
 from ._tune_settings import TuneSettings

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from jaxquad.autopilot import ArduPilotRate, FilterChain
-from jaxquad.autopilot._angle_loop import angle_loop_of, delay_margin
+from jaxquad.autopilot import ArduPilotRate, FilterChain, firmware_named
 from jaxquad.autopilot._rate_gains import (
     cells_of,
+    delay_margin,
     gains_of,
     hold_plants,
     law_paths,
@@ -79,7 +79,7 @@ def test_the_angle_loop_is_stable_up_to_the_gain_at_which_a_simulated_one_is():
     law = ArduPilotRate(
         *GAINS, gyro=FilterChain((), 1 / DT), target_hz=0.0, error_hz=0.0, derivative_hz=0.0, dt=DT
     )
-    angle = angle_loop_of("ardupilot", {"ATC_ANG_RLL_P": "4.5"}, 0, DT, levelled=False)
+    angle = firmware_named("ardupilot").angle_loop({"ATC_ANG_RLL_P": "4.5"}, 0, DT, levelled=False)
     assert angle is not None and angle.closed and angle.gain(angle.value) == 4.5
     back, ahead = law_paths(law, 0, OMEGA)
     plants = hold_plants(column(GAIN), column(LAG), column(0.0), OMEGA, DT)
@@ -101,7 +101,7 @@ def test_the_angle_loop_is_stable_up_to_the_gain_at_which_a_simulated_one_is():
 
 def test_betaflights_angle_loop_is_open_in_acro_and_has_no_yaw():
     values = {"levelPID": "50,75,75"}
-    acro = angle_loop_of("betaflight", values, 0, 1 / 4000, levelled=False)
+    acro = firmware_named("betaflight").angle_loop(values, 0, 1 / 4000, levelled=False)
     assert acro is not None and not acro.closed and acro.gain(acro.value) == pytest.approx(5.0)
-    assert angle_loop_of("betaflight", values, 2, 1 / 4000, levelled=True) is None
-    assert angle_loop_of("betaflight", {}, 0, 1 / 4000, levelled=True) is None
+    assert firmware_named("betaflight").angle_loop(values, 2, 1 / 4000, levelled=True) is None
+    assert firmware_named("betaflight").angle_loop({}, 0, 1 / 4000, levelled=True) is None

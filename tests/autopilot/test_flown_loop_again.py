@@ -15,13 +15,12 @@ from jaxquad.autopilot import (
     hold_response,
     predict_loop,
     PX4Rate,
-    without_gyro_filters,
 )
 
 
 DT, GAIN, LAG = 1 / 400, 60.0, 0.03  # s, rad/s^2 per unit of u, s
 WHOLE = PX4Rate([0.15], [0.2], [0.003], gyro=FilterChain((Butterworth(40.0),), 2000.0))
-LAW = without_gyro_filters(WHOLE)
+LAW = WHOLE.without_gyro_filters()
 SAMPLES = 4096
 OMEGA = 2 * np.pi * np.arange(4, 200, 4) / (SAMPLES * DT)
 

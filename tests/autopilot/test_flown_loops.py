@@ -15,7 +15,6 @@ from jaxquad.autopilot import (
     predict_loop,
     px4_loop,
     replay_terms,
-    without_gyro_filters,
 )
 from jaxquad.records import read, read_settings
 from jaxquad.records.formats import load_log
@@ -218,7 +217,7 @@ def test_the_laws_of_a_measured_log_reproduce_its_closed_loops(data):
     settings = read_settings(path)
     flown = betaflight_loop(settings.values, settings.version, throttle=0.34)
     assert any(x.startswith("feedforward_transition") for x in flown.unmodelled)
-    law, omega = without_gyro_filters(flown.law), 2 * np.pi * np.geomspace(5.0, 15.0, 12)
+    law, omega = flown.law.without_gyro_filters(), 2 * np.pi * np.geomspace(5.0, 15.0, 12)
     for axis in (0, 1):
         names = f"setpoint[{axis}]", f"axisSum[{axis}]", f"gyroADC[{axis}]"
         parts = {"outputs": [names[2]], "start": 453.5, "stop": 469.0}

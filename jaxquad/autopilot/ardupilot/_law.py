@@ -1,4 +1,7 @@
+"""ArduPilot's rate and angle loops."""
+
 from collections.abc import Mapping
+from typing import ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -8,7 +11,7 @@ from jaxtyping import Array, Float, PyTree
 from jaxquad._core import as_float, broadcast_gain, per_member, require_positive
 from jaxquad.control import Reference, Setpoint
 
-from .._filters import FilterChain
+from .._filters import FilterChain, PT1
 from .._law import (
     AngleLoop,
     bounded,
@@ -16,6 +19,7 @@ from .._law import (
     FirmwareLoop,
     gyro_rest,
     low_pass_share,
+    RateLoop,
     require_gains,
     require_gyro_rate,
     Signal,
@@ -24,7 +28,7 @@ from .._law import (
 )
 
 
-class ArduPilotRate(FirmwareLoop):
+class ArduPilotRate(RateLoop):
     """ArduPilot's rate loop (AC_PID of Copter): rates in rad/s in, ROut of -1 to 1 out.
 
     The target is low-passed (FLTT), then the error (FLTE), then the derivative of the filtered
@@ -52,6 +56,8 @@ class ArduPilotRate(FirmwareLoop):
         beyond half of its rate.
     """
 
+    firmware: ClassVar[str] = "ardupilot"
+    feed_forward: ClassVar[tuple[str, ...]] = ("ff", "d_ff")
     p: Float[Array, "..."] = per_member(rank=1, converter=as_float)
     i: Float[Array, "..."] = per_member(rank=1, converter=as_float)
     d: Float[Array, "..."] = per_member(rank=1, converter=as_float)
@@ -76,15 +82,16 @@ class ArduPilotRate(FirmwareLoop):
         require_gains(self.dt, {**self.gains(), "ff": self.ff, "d_ff": self.d_ff}, limits)
         require_gyro_rate(self.gyro, self.dt)
 
-    def interval(self) -> float:
-        return self.dt
+    def derivative_chain(self, axis: int) -> FilterChain:
+        cutoff = float(np.broadcast_to(self.derivative_hz, (3,))[axis])
+        return FilterChain((PT1(cutoff),) if cutoff > 0 else (), 1 / self.dt)
 
     def gains(self) -> dict[str, Array]:
         return {"p": self.p, "i": self.i, "d": self.d}
 
     def rest(self, zero: Signal) -> dict[str, PyTree]:
-        held = dict.fromkeys(("target", "error", "slope", "integral"), zero)
-        return {"gyro": gyro_rest(self.gyro, zero), **held}
+        signals = dict.fromkeys(("target", "error", "slope", "integral"), zero)
+        return {"gyro": gyro_rest(self.gyro, zero), **signals}
 
     def advance(
         self,
@@ -113,8 +120,8 @@ class ArduPilotRate(FirmwareLoop):
     def _integrated(self, integral, excess, growth):
         """A limited mixer lets the integral shrink only."""
         limited = jnp.abs(excess) > 1e-6
-        held = limited & (integral * growth >= 0)
-        return bounded(integral + jnp.where(held, 0.0, growth), self.integral_limit)
+        growing = limited & (integral * growth >= 0)
+        return bounded(integral + jnp.where(growing, 0.0, growth), self.integral_limit)
 
     def _within_limit(self, p, d):
         limit, both = broadcast_gain(self.pd_limit, p), jnp.abs(p + d)

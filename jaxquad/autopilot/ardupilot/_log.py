@@ -229,5 +229,5 @@ LOG = FirmwareLog(
         "ATC_", "INS_GYRO_", "INS_HNTC", "MOT_", "SCHED_LOOP_RATE", "PSC_", "FSTRATE_",
     ),
     learned=("MOT_THST_HOVER",),  # in flight, and stored at the end of it: the hover's throttle
-    numbers_chirps=True,
+    numbers_chirps=True, gyro_cutoffs=("INS_GYRO_FILTER",),
 )  # fmt: skip

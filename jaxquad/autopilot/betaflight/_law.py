@@ -1,9 +1,12 @@
+"""Betaflight's PID, its angle mode, and what changes them in flight."""
+
 import dataclasses
 from collections.abc import Mapping
-from typing import Literal
+from typing import ClassVar, Literal
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
 from jaxquad._core import as_float, broadcast_gain, per_member, require_positive
@@ -15,9 +18,9 @@ from .._law import (
     bounded,
     DEGREES,
     filter_gyro,
-    FirmwareLoop,
     gyro_rest,
     low_pass_share,
+    RateLoop,
     require_gains,
     require_gyro_rate,
     Signal,
@@ -108,7 +111,7 @@ class DMax(eqx.Module):
         return (held, smooth), jnp.minimum(1 + (most - 1) * share, most)
 
 
-class BetaflightPID(FirmwareLoop):
+class BetaflightPID(RateLoop):
     """Betaflight's rate loop: rates in rad/s in, the sum of P, I, D and F in pidsum units out.
 
         Sum = Kp e + I - Kd d/dt (filtered gyro) + Kf d/dt (set-point),    e = set-point - gyro
@@ -147,6 +150,9 @@ class BetaflightPID(FirmwareLoop):
         beyond half of its rate.
     """
 
+    firmware: ClassVar[str] = "betaflight"
+    feed_forward: ClassVar[tuple[str, ...]] = ("f",)
+    of_sticks: ClassVar[bool] = True
     p: Float[Array, "..."] = per_member(rank=1, converter=as_float)
     i: Float[Array, "..."] = per_member(rank=1, converter=as_float)
     d: Float[Array, "..."] = per_member(rank=1, converter=as_float)
@@ -178,8 +184,23 @@ class BetaflightPID(FirmwareLoop):
         """The filters of the rate and of its derivative, at the loop's rate."""
         return FilterChain(self.filters, 1 / self.dt), FilterChain(self.dterm, 1 / self.dt)
 
-    def interval(self) -> float:
-        return self.dt
+    def gyro_chains(self) -> list[FilterChain]:
+        return [self.gyro, FilterChain(self.filters, 1 / self.dt)] if self.filters else [self.gyro]
+
+    def derivative_chain(self, axis: int) -> FilterChain:
+        return FilterChain(self.dterm, 1 / self.dt)
+
+    def without_gyro_filters(self) -> "BetaflightPID":
+        return dataclasses.replace(self, gyro=FilterChain(), filters=())
+
+    def holds_integral(self, axis: int) -> bool:
+        return self.relax is not None and float(np.broadcast_to(self.relax.share, (3,))[axis]) > 0
+
+    def d_ceiling(self, axis: int) -> float:
+        if self.d_max is None:
+            return 1.0
+        base, most = (float(np.broadcast_to(x, (3,))[axis]) for x in (self.d, self.d_max.ceiling))
+        return max(1.0, most / base) if base > 0 else 1.0
 
     def gains(self) -> dict[str, Array]:
         return {"p": self.p, "i": self.i, "d": self.d}
@@ -320,122 +341,3 @@ class BetaflightAngle(AngleLoop):
         level = broadcast_gain(self.level, angle) / 10
         smooth, wanted = self._smooth.step(memory["smooth"], level * (aim - angle))
         return {"smooth": smooth}, wanted
-
-
-class BetaflightADRC(FirmwareLoop):
-    """The ADRC proposed for Betaflight (pull request 15400): rates in rad/s in, pidsum units out.
-
-    An observer of y'' = b u + f, y the rate in deg/s, estimates y, y' and f by forward Euler:
-
-        z1 += T (z2 - 3 wo e),  z2 += T (z3 + b u - 3 wo^2 e),  z3 += -T (sigma z3 + wo^3 e)
-        b u = wc^2 (r - z1) - 2 wc z2 - z3,    e = z1 - y before the update
-
-    where u in the observer is the command that reached the mixer. In the air: the gate before
-    liftoff is not modelled. wo is at most 0.5/T. Source: docs/autopilots.md.
-
-    **Arguments:** (each number is a scalar, one value per axis, or `[axes, *ensemble]`)
-
-    - `wc`, `wo`: adrc_wc, adrc_wo in rad/s.
-    - `b0`: adrc_b0 in deg/s^3 per unit of pidsum, see `adrc_b0`.
-    - `f`: feed-forward as in `BetaflightPID`.
-    - `gyro`, `filters`: as in `BetaflightPID`; `lowpass`: adrc_gyro_lpf_hz, a pt2 at 150 Hz.
-    - `setpoint_lowpass_hz`: adrc_td_hz, 0 is off.
-    - `b0_scale`: of b0 by the throttle.
-    - `forgetting`: adrc_sigma_decay / 10 in 1/s.
-    - `limit`: pidsum_limit; `dt`: in s.
-
-    **Raises:**
-
-    - `ValueError`: a gain is not finite, the gyro's rate is no multiple of 1/dt, or a filter lies
-        beyond half of its rate.
-    """
-
-    wc: Float[Array, "..."] = per_member(rank=1, converter=as_float, default=60.0)
-    wo: Float[Array, "..."] = per_member(rank=1, converter=as_float, default=100.0)
-    b0: Float[Array, "..."] = per_member(rank=1, converter=as_float, default=2000.0)
-    f: Float[Array, "..."] = per_member(rank=1, converter=as_float, default=0.0)
-    gyro: FilterChain = FilterChain()
-    filters: tuple[Filter, ...] = ()
-    lowpass: tuple[Filter, ...] | None = None
-    setpoint_lowpass_hz: Float[Array, "..."] = per_member(rank=1, converter=as_float, default=0.0)
-    b0_scale: Float[Array, "..."] = per_member(rank=1, converter=as_float, default=1.0)
-    forgetting: Float[Array, "..."] = per_member(rank=1, converter=as_float, default=0.3)
-    limit: Float[Array, "..."] = per_member(rank=1, converter=as_float, default=500.0)
-    dt: float = eqx.field(static=True, default=1 / 4000)  # s
-
-    def __check_init__(self):
-        for name, gain in self.gains().items():
-            require_positive(name, gain)
-        require_gains(self.dt, {**self.gains(), "f": self.f}, {"limit": self.limit})
-        require_gyro_rate(self.gyro, self.dt)
-        self._chain()  # refuses what lies beyond half of the loop's rate
-
-    def _chain(self) -> FilterChain:
-        """All filters of the rate at the loop's rate."""
-        lowpass = (PT2(150.0),) if self.lowpass is None else self.lowpass
-        return FilterChain((*self.filters, *lowpass), 1 / self.dt)
-
-    def interval(self) -> float:
-        return self.dt
-
-    def gains(self) -> dict[str, Array]:
-        return {"wc": self.wc, "wo": self.wo, "b0": self.b0}
-
-    def rest(self, zero: Signal) -> dict[str, PyTree]:
-        return {
-            "gyro": gyro_rest(self.gyro, zero), "filters": self._chain().init(zero),
-            "reference": zero, "slow": zero, "z": (zero, zero, zero), "command": zero,
-        }  # fmt: skip
-
-    def advance(
-        self,
-        memory: Mapping[str, PyTree],
-        excess: Signal,
-        reference: Reference,
-        measurement: Signal,
-    ) -> tuple[dict[str, PyTree], Signal, Terms]:
-        at = lambda gain: broadcast_gain(gain, measurement)
-        r, speed = split_reference(reference, memory["reference"], self.dt)
-        gyro, (smooth, _) = filter_gyro(self.gyro, self.dt, memory["gyro"], DEGREES * measurement)
-        filters, y = self._chain().step(memory["filters"], smooth)
-        share = low_pass_share(self.setpoint_lowpass_hz, self.dt, r)
-        slow = memory["slow"] + share * (DEGREES * r - memory["slow"])
-        b, wc = at(self.b0) * at(self.b0_scale), at(self.wc)
-        z = self._observed(memory["z"], b * (memory["command"] - excess), y, b)
-        terms = {
-            "P": wc**2 * (slow - z[0]) / b, "I": -z[2] / b, "D": -2 * wc * z[1] / b,
-            "F": F_SCALE * at(self.f) * DEGREES * speed,
-        }  # fmt: skip
-        command = bounded(sum_of(terms), self.limit)
-        next = {
-            "gyro": gyro, "filters": filters, "reference": r, "slow": slow, "z": z,
-            "command": command,
-        }  # fmt: skip
-        return next, command, terms
-
-    def _observed(self, z, drive, y, b):
-        at = lambda gain: broadcast_gain(gain, y)
-        wo, dt = jnp.minimum(at(self.wo), 0.5 / self.dt), self.dt
-        error = z[0] - y
-        most = at(self.limit) * b
-        first = z[0] + dt * (z[1] - 3 * wo * error)
-        second = z[1] + dt * (z[2] + drive - 3 * wo**2 * error)
-        third = z[2] - dt * (at(self.forgetting) * z[2] + wo**3 * error)
-        return (
-            jnp.clip(first, -8000.0, 8000.0),
-            jnp.clip(second, -1e5, 1e5),
-            jnp.clip(third, -most, most),
-        )
-
-
-def adrc_b0(gain: Float[ArrayLike, "..."], lag: Float[ArrayLike, "..."]) -> Float[Array, "..."]:
-    """b0 of `BetaflightADRC` in deg/s^3 per pidsum, of an identified plant gain/(s (lag s + 1)).
-
-    Differentiable: `fit.derived` propagates the covariance of gain and lag.
-
-    **Arguments:**
-
-    - `gain`: from the sum that the mixer gets over 1000 to the angular acceleration, in rad/s^2.
-    - `lag`: of the motors in s.
-    """
-    return DEGREES * as_float(gain) / (1000 * as_float(lag))

@@ -319,5 +319,6 @@ LOG = FirmwareLog(
     name="betaflight", title="Betaflight", setup=betaflight_setup,
     rates=[f"gyroADC[{i}]" for i in range(3)], setpoints=[f"setpoint[{i}]" for i in range(3)],
     throttle=(("collective", 1.0), ("setpoint[3]", 1e-3)), hold=command_hold,
-    release="Firmware revision", flights=flights_of, remarks_on=saturation,
+    release="Firmware revision", gyro_cutoffs=("gyro_lpf1_static_hz", "gyro_lowpass_hz"),
+    flights=flights_of, remarks_on=saturation,
 )  # fmt: skip

@@ -1,19 +1,36 @@
-from collections.abc import Mapping
+"""The Crazyflie: its rate and attitude PID, parameters and files."""
+
+from collections.abc import Mapping, Sequence
+from typing import ClassVar
 
 import equinox as eqx
+import numpy as np
 from jaxtyping import Array, Float, PyTree
 
 from jaxquad._core import as_float, as_float_or_none, broadcast_gain, per_member, require_positive
 from jaxquad.control import Reference
+from jaxquad.records import AXES
 
 from .._filters import Butterworth, FilterChain
+from .._firmware import (
+    Channels,
+    Firmware,
+    joined_lines,
+    number_text,
+    Parameter,
+    Range,
+    rows_of_axes,
+    Values,
+    Words,
+)
 from .._law import (
     AngleLoop,
     bounded,
     DEGREES,
     filter_gyro,
-    FirmwareLoop,
+    FlownLoop,
     gyro_rest,
+    RateLoop,
     require_gains,
     require_gyro_rate,
     Signal,
@@ -21,9 +38,10 @@ from .._law import (
     sum_of,
     Terms,
 )
+from ._log import LOG
 
 
-class CrazyflieRate(FirmwareLoop):
+class CrazyflieRate(RateLoop):
     """The Crazyflie's rate loop (controller 1): rates in rad/s in, the int16 command out.
 
         u = kp e + ki sat(int e, integral_limit) - kd y' + kff r    in deg/s, before truncation
@@ -53,6 +71,8 @@ class CrazyflieRate(FirmwareLoop):
         beyond half of its rate.
     """
 
+    firmware: ClassVar[str] = "crazyflie"
+    feed_forward: ClassVar[tuple[str, ...]] = ("kff",)
     kp: Float[Array, "..."] = per_member(rank=1, converter=as_float)
     ki: Float[Array, "..."] = per_member(rank=1, converter=as_float)
     kd: Float[Array, "..."] = per_member(rank=1, converter=as_float)
@@ -70,9 +90,6 @@ class CrazyflieRate(FirmwareLoop):
         require_gains(self.dt, {**self.gains(), "kff": self.kff}, limits)
         require_gyro_rate(self.gyro, self.dt)
         self._slope()  # refuses what lies beyond half of the loop's rate
-
-    def interval(self) -> float:
-        return self.dt
 
     def gains(self) -> dict[str, Array]:
         return {"kp": self.kp, "ki": self.ki, "kd": self.kd}
@@ -138,7 +155,7 @@ class CrazyflieAttitude(AngleLoop):
     def outer_gains(self) -> dict[str, Array]:
         return {"kp": self.kp, "ki": self.ki, "kd": self.kd}
 
-    def inner(self) -> FirmwareLoop:
+    def inner(self) -> RateLoop:
         return self.rate
 
     def outer_rest(self, zero: Signal) -> dict[str, PyTree]:
@@ -153,3 +170,65 @@ class CrazyflieAttitude(AngleLoop):
         integral = bounded(memory["integral"] + error * self.dt, self.integral_limit)
         wanted = at(self.kp) * error + at(self.ki) * integral - at(self.kd) * DEGREES * rate
         return {"integral": integral}, wanted / DEGREES
+
+
+def _table() -> list[Parameter]:
+    of = lambda end, group="pid_rate": [f"{group}.{axis}_{end}" for axis in AXES]
+    free: Range = (-np.inf, np.inf)
+    return [
+        *rows_of_axes(of("kp"), "1/(deg/s)", (250, 250, 120), free, "kp"),
+        *rows_of_axes(of("ki"), "1/deg", (500, 500, 16.7), free, "ki"),
+        *rows_of_axes(of("kd"), "1/(deg/s^2)", (2.5, 2.5, 0), free, "kd"),
+        *rows_of_axes(of("kff"), "1/(deg/s)", (0, 0, 0), free, "kff"),
+        *rows_of_axes(of("kp", "pid_attitude"), "1/s", (6, 6, 6), free, "angle.kp"),
+        *rows_of_axes(of("ki", "pid_attitude"), "1/s^2", (3, 3, 1), free, "angle.ki"),
+        *rows_of_axes(of("kd", "pid_attitude"), "", (0, 0, 0.35), free, "angle.kd"),
+        Parameter("pid_rate.rateFiltEn", "", 0, 0, 1, True),
+        *rows_of_axes([f"pid_rate.om{x}FiltCut" for x in "xyz"], "Hz", (30,) * 3, (0, 250), ""),
+    ]
+
+
+class Crazyflie(Firmware):
+    """The firmware of the Crazyflie, whose logs hold no parameters."""
+
+    log = LOG
+    parameters = {row.name: row for row in _table()}
+    fields = ("kp", "ki", "kd")
+    suffix = "yaml"
+    motor_shares = (0.5, 0.5, 1.0)
+
+    def flown_loop(
+        self, values: Mapping[str, str], version: Sequence[int], *, throttle: float,
+        tracked_hz: Mapping[int, Sequence[float]],
+    ) -> FlownLoop:  # fmt: skip
+        raise ValueError("logs of the Crazyflie hold no parameters, so they do not tell its loop")
+
+    def channels(self, prefix: str, axis: int) -> Channels:
+        return Channels()
+
+    def what_to_fly(self, axis: str) -> str:
+        return f"Fly this: strong and quick {axis} stick for 20 s"
+
+    def si_scales(self, axis: str) -> tuple[float, float, float]:
+        return (65535 / DEGREES,) * 3
+
+    def angle_parameters(self, axis: str, p: float) -> dict[str, float]:
+        return {f"pid_attitude.{axis}_kp": p, f"pid_attitude.{axis}_ki": 0.0}
+
+    def parameter_file(
+        self, values: Values, title: str, *, version: tuple[int, ...], profile: int | None,
+        raised: Sequence[str], words: Words,
+    ) -> str:  # fmt: skip
+        rows = ["params:"]
+        for row, value, _ in values:
+            rows += [
+                f"  {row.name}:",
+                f"    default_value: {number_text(row.default, row.whole)}",
+                "    is_stored: true",
+                f"    stored_value: {number_text(value, row.whole)}",
+            ]
+        head = [f"# {title}"] if title else []
+        return joined_lines([*head, *rows, "type: persistent_param_state", "version: '1'"])
+
+
+FIRMWARE = Crazyflie()

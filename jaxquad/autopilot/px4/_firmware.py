@@ -1,21 +1,41 @@
-from collections.abc import Mapping
+"""PX4: its rate and attitude loops, parameters, channels and files."""
+
+import dataclasses
+from collections.abc import Iterator, Mapping, Sequence
+from typing import ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
-from jaxquad._core import as_float, broadcast_gain, per_member, require_positive
+from jaxquad._core import as_float, broadcast_gain, Message, per_member, require_positive
 from jaxquad.control import Reference, Setpoint
+from jaxquad.records import AXES
 
-from .._filters import FilterChain, PT1, Section
+from .._filters import BandwidthNotch, Butterworth, Filter, FilterChain, PT1, Section
+from .._firmware import (
+    Channels,
+    Firmware,
+    joined_lines,
+    LowPass,
+    number_text,
+    Numbers,
+    OuterLoop,
+    Parameter,
+    Range,
+    rows_of_axes,
+    Values,
+    Words,
+)
 from .._law import (
     AngleLoop,
     bounded,
     filter_gyro,
-    FirmwareLoop,
+    FlownLoop,
     gyro_rest,
     low_pass_share,
+    RateLoop,
     require_gains,
     require_gyro_rate,
     Signal,
@@ -23,12 +43,13 @@ from .._law import (
     sum_of,
     Terms,
 )
+from ._log import LOG
 
 
 _FADED = np.deg2rad(400.0)  # rad/s of error at which the integral no longer grows
 
 
-class PX4Rate(FirmwareLoop):
+class PX4Rate(RateLoop):
     """PX4's rate loop: rates in rad/s in, the normalised torque set-point out.
 
         u = K P e + I - K D y' + FF r,    I += (1 - (e / 400 deg/s)^2) K I_gain T e afterwards
@@ -58,6 +79,8 @@ class PX4Rate(FirmwareLoop):
         beyond half of its rate.
     """
 
+    firmware: ClassVar[str] = "px4"
+    feed_forward: ClassVar[tuple[str, ...]] = ("ff",)
     p: Float[Array, "..."] = per_member(rank=1, converter=as_float)
     i: Float[Array, "..."] = per_member(rank=1, converter=as_float)
     d: Float[Array, "..."] = per_member(rank=1, converter=as_float)
@@ -78,8 +101,15 @@ class PX4Rate(FirmwareLoop):
         require_gains(self.dt, {**self.gains(), "k": self.k, "ff": self.ff}, limits)
         require_gyro_rate(self.gyro, self.dt)
 
-    def interval(self) -> float:
-        return self.dt
+    def derivative_chain(self, axis: int) -> FilterChain:
+        cutoff = float(np.broadcast_to(self.derivative_hz, (3,))[axis])
+        return FilterChain((PT1(cutoff),) if cutoff > 0 else (), self.gyro.rate_hz)
+
+    def without_gyro_filters(self) -> "PX4Rate":
+        if not self.gyro.filters:
+            return dataclasses.replace(self, gyro=FilterChain())
+        open = FilterChain((PT1(0.0),), self.gyro.rate_hz)  # the derivative is at the gyro's rate
+        return dataclasses.replace(self, gyro=open)
 
     def gains(self) -> dict[str, Array]:
         return {"p": self.p, "i": self.i, "d": self.d}
@@ -166,7 +196,7 @@ class PX4Attitude(AngleLoop):
     def outer_gains(self) -> dict[str, Array]:
         return {"p": self.p}
 
-    def inner(self) -> FirmwareLoop:
+    def inner(self) -> RateLoop:
         return self.rate
 
     def outer_rest(self, zero: Signal) -> dict[str, PyTree]:
@@ -180,3 +210,154 @@ class PX4Attitude(AngleLoop):
         if isinstance(reference, Setpoint):
             wanted = wanted + reference.rate
         return {}, bounded(wanted, self.rate_limit)
+
+
+def px4_loop(values: Mapping[str, str], *, gyro_rate_hz: float = 8000.0) -> FlownLoop[PX4Rate]:
+    """The rate loop of PX4's parameters.
+
+    **Arguments:**
+
+    - `values`: the parameters by name.
+    - `gyro_rate_hz`: at which the gyro's filters run, which no parameter says; it is rounded to a
+        multiple of the loop's.
+
+    **Raises:**
+
+    - `ValueError`: a gain is missing.
+    """
+    read = Numbers(values)
+    rate = read.number("IMU_GYRO_RATEMAX", 400.0) or 400.0
+    chain: list[Filter] = []
+    for k in (0, 1):
+        centre = read.number(f"IMU_GYRO_NF{k}_FRQ", 0.0)
+        if centre > 0:
+            chain.append(BandwidthNotch(centre, read.number(f"IMU_GYRO_NF{k}_BW", 20.0)))
+    cutoff = read.number("IMU_GYRO_CUTOFF", 40.0)
+    chain += [Butterworth(cutoff)] if cutoff > 0 else []
+    per_axis = lambda end: [read.number(f"MC_{x}RATE_{end}") for x in ("ROLL", "PITCH", "YAW")]
+    law = PX4Rate(
+        p=per_axis("P"), i=per_axis("I"), d=per_axis("D"),
+        k=[read.number(f"MC_{x}RATE_K", 1.0) for x in ("ROLL", "PITCH", "YAW")],
+        ff=[read.number(f"MC_{x}RATE_FF", 0.0) for x in ("ROLL", "PITCH", "YAW")],
+        gyro=FilterChain(tuple(chain), rate * max(1, round(gyro_rate_hz / rate))),
+        derivative_hz=read.number("IMU_DGYRO_CUTOFF", 20.0),
+        torque_hz=[0.0, 0.0, read.number("MC_YAW_TQ_CUTOFF", 0.0)],
+        integral_limit=[read.number(f"MC_{x}R_INT_LIM", 0.3) for x in "RPY"], dt=1 / rate,
+    )  # fmt: skip
+    unmodelled = []
+    if read.number("IMU_GYRO_DNF_EN", 0.0) > 0:
+        text = "IMU_GYRO_DNF_EN: dynamic notches follow motors or spectrum"
+        unmodelled.append(Message(text, "notch"))
+    if read.number("MC_BAT_SCALE_EN", 0.0) > 0:
+        text = "MC_BAT_SCALE_EN: the torque is scaled by the battery's voltage"
+        unmodelled.append(Message(text))
+    return FlownLoop(law, tuple(unmodelled))
+
+
+def _table() -> list[Parameter]:
+    of = lambda end: [f"MC_{axis.upper()}RATE_{end}" for axis in AXES]
+    above: Range = (0, np.inf)
+    return [
+        *rows_of_axes(of("P"), "", (0.15, 0.15, 0.2), ((0.01, 0.5), (0.01, 0.6), (0, 0.6)), "p"),
+        *rows_of_axes(of("I"), "1/s", (0.2, 0.2, 0.1), above, "i"),
+        *rows_of_axes(of("D"), "s", (0.003, 0.003, 0), ((0, 0.01), above, above), "d"),
+        *rows_of_axes(of("K"), "", (1, 1, 1), (0.01, 5), "k"),
+        *rows_of_axes(of("FF"), "", (0, 0, 0), above, "ff"),
+        *rows_of_axes([f"MC_{x}R_INT_LIM" for x in "RPY"], "", (0.3,) * 3, above, "integral_limit"),
+        *rows_of_axes(
+            [f"MC_{axis.upper()}_P" for axis in AXES], "1/s", (4, 4, 2.8),
+            ((0, 12), (0, 12), (0, 5)), "angle.p",
+        ),
+        *rows_of_axes(
+            [f"MC_{axis.upper()}RATE_MAX" for axis in AXES], "deg/s", (220, 220, 200), (0, 1800), ""
+        ),
+        Parameter("MC_YAW_TQ_CUTOFF", "Hz", 2, 0, np.inf, False, "torque_hz", 2),
+        Parameter("IMU_GYRO_CUTOFF", "Hz", 40, 0, 1000, False, "gyro"),
+        Parameter("IMU_DGYRO_CUTOFF", "Hz", 20, 0, 1000, False, "derivative_hz"),
+        *(Parameter(f"IMU_GYRO_NF{k}_FRQ", "Hz", 0, 0, np.inf) for k in (0, 1)),
+        *(Parameter(f"IMU_GYRO_NF{k}_BW", "Hz", 20, 0, np.inf) for k in (0, 1)),
+        Parameter("IMU_GYRO_RATEMAX", "Hz", 400, 100, 2000, True),
+        Parameter("THR_MDL_FAC", "", 0, 0, 1),
+        Parameter("MC_AIRMODE", "", 0, 0, 2, True),
+    ]  # fmt: skip
+
+
+_ESTIMATE = 0.004  # s, from one attitude estimate to the next
+
+
+class PX4(Firmware):
+    """PX4, multicopters."""
+
+    log = LOG
+    parameters = {row.name: row for row in _table()}
+    unit = "torque set-point"
+    suffix = "params"
+    motor_shares = (np.sqrt(0.5), np.sqrt(0.5), 1.0)
+    averages_gyro = True
+    thrust_curve = "THR_MDL_FAC"
+    weighs_setpoint = True
+    notches = tuple((f"IMU_GYRO_NF{k}_FRQ", f"IMU_GYRO_NF{k}_BW") for k in (0, 1))
+
+    def flown_loop(
+        self, values: Mapping[str, str], version: Sequence[int], *, throttle: float,
+        tracked_hz: Mapping[int, Sequence[float]],
+    ) -> FlownLoop:  # fmt: skip
+        return px4_loop(values)
+
+    def channels(self, prefix: str, axis: int) -> Channels:
+        return Channels(
+            unfiltered=[f"sensor_combined.gyro_rad[{k}]" for k in range(3)],
+            motors=[f"actuator_motors.control[{k}]" for k in range(4)],
+            output={f"vehicle_torque_setpoint.xyz[{axis}]": 1.0},
+        )
+
+    def what_to_fly(self, axis: str) -> str:
+        return (
+            "Fly this: SDLOG_PROFILE with high rate, hover high and clear in Position mode, and "
+            f"strong and quick {axis} stick in Acro for 20 s, or the autotune (MC_AT_EN) on this "
+            "axis"
+        )
+
+    def angle_loop(
+        self, values: Mapping[str, str], axis: int, dt: float, *, levelled: bool
+    ) -> OuterLoop | None:
+        name = f"MC_{AXES[axis].upper()}_P"
+        return OuterLoop.of(values, name, 1.0, 0.5 * _ESTIMATE + dt, closed=True)
+
+    def low_passes(
+        self, loop: FlownLoop, values: Mapping[str, str], version: Sequence[int], axis: int,
+        throttle: float,
+    ) -> Iterator[LowPass]:  # fmt: skip
+        law = loop.law
+        for x in law.gyro.filters:
+            if isinstance(x, Butterworth):
+                flown = {"IMU_GYRO_CUTOFF": float(x.cutoff_hz)}
+                yield LowPass("gyro", flown, x, law.gyro.rate_hz)
+        slope = float(law.derivative_hz)
+        if slope > 0 and np.any(np.asarray(law.d) > 0):
+            flown = {"IMU_DGYRO_CUTOFF": slope}
+            yield LowPass("derivative", flown, PT1(slope), law.gyro.rate_hz)
+
+    def notch(self, centre_hz: float, second: float) -> Filter:
+        return BandwidthNotch(centre_hz, second)
+
+    def notch_width(self, centre_hz: float, half_width: float) -> float:
+        return float(np.rint(2 * half_width * centre_hz))
+
+    def angle_parameters(self, axis: str, p: float) -> dict[str, float]:
+        return {f"MC_{axis.upper()}_P": p}
+
+    def parameter_file(
+        self, values: Values, title: str, *, version: tuple[int, ...], profile: int | None,
+        raised: Sequence[str], words: Words,
+    ) -> str:  # fmt: skip
+        rows = [f"# {title}"] if title else []
+        rows += ["#", "# Vehicle-Id Component-Id Name Value Type"]
+        for row, value, other in values:
+            rows.append(f"# {row.name} was {number_text(other, row.whole)}")
+            kind = 6 if row.whole else 9  # int32, float
+            rows.append(f"1\t1\t{row.name}\t{number_text(value, row.whole)}\t{kind}")
+        return joined_lines(rows)
+
+
+FIRMWARE = PX4()

@@ -114,5 +114,5 @@ LOG = FirmwareLog(
     throttle=(("vehicle_thrust_setpoint.xyz[2]", -1.0), ("actuator_controls_0.control[3]", 1.0)),
     hold=lambda log: hold_by_rate(log, "IMU_GYRO_RATEMAX"),
     of_loop=("MC_", "IMU_GYRO_", "IMU_DGYRO_", "THR_MDL_FAC", "CA_", "PWM_", "DSHOT_"),
-    release="ver_sw_release",
+    release="ver_sw_release", gyro_cutoffs=("IMU_GYRO_CUTOFF",),
 )  # fmt: skip

@@ -43,7 +43,8 @@ from ..frequency_domain._parameters import Free, Numbers, Parameters, select_par
 from ..frequency_domain._problem import make_problem
 from ..frequency_domain._result import Fit
 from ..frequency_domain._solve import solution_at, stopped_early
-from ..uncertainty._assess import assess, Counted, discrepancy_at, records_at
+from ..uncertainty._assess import assess
+from ..uncertainty._error_budget import weighting_at
 from ._normal import Batch, Evaluate, evaluates_singly, Member, normal_equations_of
 
 
@@ -308,9 +309,7 @@ class BatchFit(eqx.Module):
         problem = problem.weighted([self.weights[k]], mixings)
         message = "" if self.converged[k] else stopped_early(STALLED, steps)
         solution = solution_at(problem, self.z[k], message, steps)
-        records = records_at(problem, [points], solution)
-        found = discrepancy_at(records, [points], solution)
-        return assess(problem, Counted([points], records, None, None, found), solution)
+        return assess(problem, weighting_at(problem, [points], solution), solution)
 
     def __str__(self) -> str:
         lost = int(np.sum(~self.converged))

@@ -13,7 +13,7 @@ from jaxquad._core import Message, require_x64
 from jaxquad.models import TransferFunction
 from jaxquad.spectra import FrequencyResponse
 
-from ..uncertainty._make_fit import unfitted
+from ..uncertainty._assess import unfitted
 from ..uncertainty._verdict import without_numbers
 from ._cost import Band, Cost, least_coherence, MaximumLikelihood, Points
 from ._fit import check_options, fit

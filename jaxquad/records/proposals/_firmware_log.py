@@ -107,6 +107,7 @@ class FirmwareLog:
     - `settings`: whether its logs hold parameters; `release`: which of them is the version.
     - `flights`: those of a file; `remarks_on`: what to say of the part that is used.
     - `numbers_chirps`: whether a proposal lists all chirps with their numbers.
+    - `gyro_cutoffs`: parameters, one of which is in each log that tells the gyro's filters.
     - `reader`: of its files, where no format of `jq.read` is theirs.
     """
 
@@ -124,6 +125,7 @@ class FirmwareLog:
     flights: Callable[[Log], tuple[Flight, ...]] = one_flight
     remarks_on: Callable[[Log, Setup, Spans], tuple[str, ...]] = _no_remark
     numbers_chirps: bool = False
+    gyro_cutoffs: tuple[str, ...] = ()
     reader: Reader | None = None
 
 

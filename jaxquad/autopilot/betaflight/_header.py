@@ -1,60 +1,19 @@
-"""The loop that a log's parameters describe, for Betaflight, PX4 and ArduPilot."""
+"""The rate loop of a Betaflight header: gains, filters, and what of them moves in flight."""
 
 import dataclasses
-import math
-from collections.abc import Mapping, Sequence
-from typing import Generic, Literal, NamedTuple, TypeVar
+from collections.abc import Iterator, Mapping, Sequence
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import ArrayLike, Float
+from jaxtyping import Array, ArrayLike, Float
 
 from jaxquad._core import as_messages, Message
 
-from ._filters import (
-    BandwidthNotch,
-    betaflight_quality,
-    Butterworth,
-    Filter,
-    FilterChain,
-    Notch,
-    PT1,
-    PT2,
-    PT3,
-)
-from ._parameters import list_parameters
-from .ardupilot._harmonic_notch import HarmonicNotch, read_harmonic_notches, Tracking
-from .ardupilot._law import ArduPilotRate
-from .betaflight._law import (
-    BetaflightADRC,
-    BetaflightPID,
-    DMax,
-    dynamic_cutoff,
-    ItermRelax,
-    tpa_factor,
-)
-from .px4._firmware import PX4Rate
-
-
-RateLaw = TypeVar("RateLaw", BetaflightPID, BetaflightADRC, PX4Rate, ArduPilotRate)
-
-
-class FlownLoop(eqx.Module, Generic[RateLaw]):
-    """The rate loop of a log, for roll, pitch and yaw, and what of it is not modelled.
-
-    **Arguments:**
-
-    - `law`: the rate loop at hover (for Betaflight, with throttle-dependent cutoffs at 30 %).
-    - `unmodelled`: sentences; their kind is "notch", "anti-gravity", "feedforward" or empty.
-    """
-
-    law: RateLaw
-    unmodelled: tuple[Message, ...] = eqx.field(static=True, default=())
-
-    def parameters(self) -> dict[str, float]:
-        """The values that flew, by the names of `PARAMETERS`."""
-        return list_parameters(self.law)
+from .._filters import betaflight_quality, Butterworth, Filter, FilterChain, Notch, PT1, PT2, PT3
+from .._firmware import cutoff_of, LowPass, Stage
+from .._law import DEGREES, FlownLoop
+from ._law import BetaflightPID, DMax, dynamic_cutoff, F_SCALE, ItermRelax, tpa_factor
 
 
 class FlownBetaflight(FlownLoop[BetaflightPID]):
@@ -79,11 +38,11 @@ class FlownBetaflight(FlownLoop[BetaflightPID]):
 
     def parameters(self) -> dict[str, float]:
         """The values that flew, by the names of `PARAMETERS`, with the dynamic cutoffs."""
-        found = list_parameters(self.law)
-        for name, range in (("gyro", self.gyro_dynamic), ("dterm", self.dterm_dynamic)):
-            if range is not None:
-                found[f"{name}_lpf1_dyn_min_hz"], found[f"{name}_lpf1_dyn_max_hz"] = range[:2]
-        return found
+        flown = super().parameters()
+        for name, cutoffs in (("gyro", self.gyro_dynamic), ("dterm", self.dterm_dynamic)):
+            if cutoffs is not None:
+                flown[f"{name}_lpf1_dyn_min_hz"], flown[f"{name}_lpf1_dyn_max_hz"] = cutoffs[:2]
+        return flown
 
     def at(
         self,
@@ -97,16 +56,21 @@ class FlownBetaflight(FlownLoop[BetaflightPID]):
         filters = _retuned(law.filters, self.gyro_dynamic, throttle)
         dterm = _retuned(law.dterm, self.dterm_dynamic, throttle)
         on_p = factor if self.tpa_on_p else jnp.ones_like(factor)
-        held = jnp.where(jnp.asarray(law.integral_factor) == 1, 1.0, 0.0)  # not of yaw
+        of_level = jnp.where(jnp.asarray(law.integral_factor) == 1, 1.0, 0.0)  # not of yaw
         boost = 0.0 if self.anti_gravity is None else _SURGED_P * self.anti_gravity[2] / 100
         return dataclasses.replace(
             law, filters=filters, dterm=dterm, tpa=factor, tpa_p=on_p,
-            accelerator=_SURGED_I * surge * held, p_boost=boost * surge * held,
+            accelerator=_SURGED_I * surge * of_level, p_boost=boost * surge * of_level,
             integral_share=integral_share,
         )  # fmt: skip
 
+    def without_gyro_filters(self) -> "FlownBetaflight":
+        return dataclasses.replace(super().without_gyro_filters(), gyro_dynamic=None)
+
+    def at_sample(self, throttle: Array, surge: Array, integral_share: Array) -> BetaflightPID:
+        return self.at(throttle, surge=surge, integral_share=integral_share)
+
     def surge(self, throttle: Float[np.ndarray, " samples"]) -> Float[np.ndarray, " samples"]:
-        """Anti-gravity's measure of a moving throttle times its gain, at the loop's samples."""
         from scipy.signal import lfilter
 
         if self.anti_gravity is None:
@@ -123,10 +87,18 @@ class FlownBetaflight(FlownLoop[BetaflightPID]):
     def integral_share(
         self, mixer_range: Float[np.ndarray, " samples"]
     ) -> Float[np.ndarray, " samples"]:
-        """Of what the integral grows by, while the motors use this share of the mixer's range."""
         if self.windup >= 1:
             return np.ones_like(mixer_range)
         return np.clip((1 - mixer_range) / (1 - self.windup), 0.0, 1.0)
+
+    def setpoint_speed(
+        self, slope: Float[np.ndarray, "samples axes"], fed: Float[np.ndarray, "samples axes"]
+    ) -> Float[np.ndarray, "samples axes"]:
+        """By the logged F where that has a gain: it is of the sticks, between their samples."""
+        weight = np.broadcast_to(F_SCALE * DEGREES * np.asarray(self.law.f), slope.shape[1:])
+        weighted = weight > 0
+        scaled = fed / np.where(weighted, weight, 1.0)
+        return np.where(weighted, scaled, np.where(np.any(fed, axis=0), slope, 0.0))
 
 
 _SURGED_I, _SURGED_P = 0.34, 0.0034  # what anti-gravity's measure adds to Ki, and to P per percent
@@ -196,42 +168,27 @@ def betaflight_loop(
     return dataclasses.replace(flown, law=flown.at(throttle))
 
 
-class FlownLowPass(NamedTuple):
-    """A low-pass of Betaflight's gyro or D term that is on, with what sets its cutoff, in Hz."""
-
-    stage: Literal["gyro", "derivative"]
-    parameters: Mapping[str, float]  # lowest and highest cutoff of a dynamic one
-    filter: Filter
-    rate_hz: float
-
-
 def betaflight_low_passes(
-    values: Mapping[str, str], version: Sequence[int], *, throttle: float = 0.3
-) -> tuple[FlownLowPass, ...]:
-    """The low-passes of a Betaflight header that are on, at a throttle of 0 to 1."""
+    values: Mapping[str, str], version: Sequence[int], throttle: float
+) -> Iterator[LowPass]:
+    """The low-passes of a header that are on, at a throttle of 0 to 1."""
     read = _Header(values, tuple(version))
     looptime, denominator = read.number("looptime"), read.number("pid_process_denom", default=1.0)
     gyro_hz, loop_hz = 1e6 / looptime, 1e6 / looptime / denominator
-    found: list[FlownLowPass] = []
-    stages: tuple[tuple[Literal["gyro", "derivative"], str, tuple, tuple, float], ...] = (
+    stages: tuple[tuple[Stage, str, tuple, tuple, float], ...] = (
         ("gyro", "gyro", _GYRO_LOW_PASS, _GYRO_SECOND, gyro_hz),
         ("derivative", "dterm", _DTERM_LOW_PASS, _DTERM_SECOND, loop_hz),
     )
     for stage, name, first, second, rate in stages:
         filters, dynamic = read.low_pass(first, loop_hz)
-        for each in _retuned(filters, dynamic, throttle):
+        for low_pass in _retuned(filters, dynamic, throttle):
             ends = (
-                {f"{name}_lpf1_static_hz": _cutoff(each)} if dynamic is None
+                {f"{name}_lpf1_static_hz": cutoff_of(low_pass)} if dynamic is None
                 else {f"{name}_lpf1_dyn_min_hz": dynamic[0], f"{name}_lpf1_dyn_max_hz": dynamic[1]}
             )  # fmt: skip
-            found.append(FlownLowPass(stage, ends, each, loop_hz))
-        for each in read.second_low_pass(second):
-            found.append(FlownLowPass(stage, {f"{name}_lpf2_static_hz": _cutoff(each)}, each, rate))
-    return tuple(found)
-
-
-def _cutoff(low_pass: Filter) -> float:
-    return float(np.ravel(vars(low_pass)["cutoff_hz"])[0])
+            yield LowPass(stage, ends, low_pass, loop_hz)
+        for low_pass in read.second_low_pass(second):
+            yield LowPass(stage, {f"{name}_lpf2_static_hz": cutoff_of(low_pass)}, low_pass, rate)
 
 
 _GYRO_LOW_PASS = (
@@ -341,26 +298,28 @@ class _Header:
         return ItermRelax(cutoff, 40.0, share, kind, mode in (3, 4))
 
     def unmodelled(self) -> tuple[Message, ...]:
-        found: list[str] = []
+        left_out: list[str] = []
         if self.version < (4, 4):
             text = "anti-gravity: the integral grows faster while the throttle moves"
-            found.append(Message(text, "anti-gravity"))
+            left_out.append(Message(text, "anti-gravity"))
         harmonics = self.number("rpm_filter_harmonics", "gyro_rpm_notch_harmonics", default=0.0)
         if harmonics > 0:
             text = f"{harmonics:g} RPM notches per motor on the gyro: they follow the motors"
-            found.append(Message(text, "notch"))
+            left_out.append(Message(text, "notch"))
         if self.number("dyn_notch_count", "dyn_notch_q", default=0.0) > 0:
-            found.append(Message("dynamic notches on the gyro: they follow its spectrum", "notch"))
+            left_out.append(
+                Message("dynamic notches on the gyro: they follow its spectrum", "notch")
+            )
         if (transition := self.number("feedforward_transition", default=0.0)) > 0:
             text = (
                 f"feedforward_transition {transition:g}: F grows with the sticks' deflection; the "
                 "law is that of centred sticks, without F"
             )
-            found.append(Message(text, "feedforward"))
+            left_out.append(Message(text, "feedforward"))
         for name, words in _UNUSUAL.items():
             if self.number(name, default=0.0) > 0:
-                found.append(f"{name}: {words}")
-        return as_messages(found)
+                left_out.append(f"{name}: {words}")
+        return as_messages(left_out)
 
 
 _UNUSUAL = {
@@ -371,137 +330,3 @@ _UNUSUAL = {
     "tpa_curve_type": "TPA is hyperbolic; the law has the straight one",
     "iterm_rotation": "the integrals turn with the vehicle",
 }
-
-
-def px4_loop(values: Mapping[str, str], *, gyro_rate_hz: float = 8000.0) -> FlownLoop[PX4Rate]:
-    """The rate loop of PX4's parameters.
-
-    **Arguments:**
-
-    - `values`: the parameters by name.
-    - `gyro_rate_hz`: at which the gyro's filters run, which no parameter says; it is rounded to a
-        multiple of the loop's.
-
-    **Raises:**
-
-    - `ValueError`: a gain is missing.
-    """
-    read = _Parameters(values)
-    rate = read.number("IMU_GYRO_RATEMAX", 400.0) or 400.0
-    chain: list[Filter] = []
-    for k in (0, 1):
-        centre = read.number(f"IMU_GYRO_NF{k}_FRQ", 0.0)
-        if centre > 0:
-            chain.append(BandwidthNotch(centre, read.number(f"IMU_GYRO_NF{k}_BW", 20.0)))
-    cutoff = read.number("IMU_GYRO_CUTOFF", 40.0)
-    chain += [Butterworth(cutoff)] if cutoff > 0 else []
-    per_axis = lambda end: [read.number(f"MC_{x}RATE_{end}") for x in ("ROLL", "PITCH", "YAW")]
-    law = PX4Rate(
-        p=per_axis("P"), i=per_axis("I"), d=per_axis("D"),
-        k=[read.number(f"MC_{x}RATE_K", 1.0) for x in ("ROLL", "PITCH", "YAW")],
-        ff=[read.number(f"MC_{x}RATE_FF", 0.0) for x in ("ROLL", "PITCH", "YAW")],
-        gyro=FilterChain(tuple(chain), rate * max(1, round(gyro_rate_hz / rate))),
-        derivative_hz=read.number("IMU_DGYRO_CUTOFF", 20.0),
-        torque_hz=[0.0, 0.0, read.number("MC_YAW_TQ_CUTOFF", 0.0)],
-        integral_limit=[read.number(f"MC_{x}R_INT_LIM", 0.3) for x in "RPY"], dt=1 / rate,
-    )  # fmt: skip
-    unmodelled = []
-    if read.number("IMU_GYRO_DNF_EN", 0.0) > 0:
-        text = "IMU_GYRO_DNF_EN: dynamic notches follow motors or spectrum"
-        unmodelled.append(Message(text, "notch"))
-    if read.number("MC_BAT_SCALE_EN", 0.0) > 0:
-        text = "MC_BAT_SCALE_EN: the torque is scaled by the battery's voltage"
-        unmodelled.append(Message(text))
-    return FlownLoop(law, tuple(unmodelled))
-
-
-class FlownArduPilot(FlownLoop[ArduPilotRate]):
-    """ArduPilot's rate loop of a log, with the notches that follow the throttle.
-
-    **Arguments:** (those of `FlownLoop`, and)
-
-    - `tracking`: which of the gyro's filters follow the throttle, and how.
-    """
-
-    tracking: tuple[Tracking, ...] = eqx.field(static=True, default=())
-
-    def at(self, throttle: Float[ArrayLike, "..."]) -> ArduPilotRate:
-        """The law at a throttle of 0 to 1: where its notches are."""
-        filters = list(self.law.gyro.filters)
-        for each in self.tracking:
-            notch = filters[each.place]
-            assert isinstance(notch, HarmonicNotch)
-            filters[each.place] = dataclasses.replace(notch, centre_hz=each.centre_hz(throttle))
-        chain = FilterChain(tuple(filters), self.law.gyro.rate_hz)
-        return dataclasses.replace(self.law, gyro=chain)
-
-
-def ardupilot_loop(
-    values: Mapping[str, str],
-    *,
-    throttle: float = 0.3,
-    tracked_hz: Mapping[int, Sequence[float]] | None = None,
-) -> FlownArduPilot:
-    """The rate loop of ArduPilot's parameters (Copter).
-
-    **Arguments:**
-
-    - `values`: the parameters by name. The gyro's rate is rounded up to a multiple of the loop's.
-    - `throttle`: 0 to 1 of the mixer (`RATE.AOut`), where notches are that follow it.
-    - `tracked_hz`: what harmonic notches follow that go by an RPM sensor (2, 5), ESC telemetry (3)
-        or the gyro's spectrum (4), in Hz: by INS_HNTCH_MODE, with a number for each source.
-
-    **Raises:**
-
-    - `ValueError`: a gain is missing.
-    """
-    read = _Parameters(values)
-    rate = read.number("SCHED_LOOP_RATE", 400.0)
-    gyro_rate = 1000.0 * 2 ** read.number("INS_GYRO_RATE", 0.0)
-    gyro_rate = rate * max(1, math.ceil(gyro_rate / rate - 1e-9))
-    per_axis = lambda end, default=None: [
-        read.number(f"ATC_RAT_{x}_{end}", default) for x in ("RLL", "PIT", "YAW")
-    ]
-    limit = np.array(per_axis("PDMX", 0.0))
-    cutoff = read.number("INS_GYRO_FILTER", 20.0)
-    notches = read_harmonic_notches(read.number, tracked_hz or {})
-    low_pass = (Butterworth(cutoff),) if cutoff > 0 else ()
-    law = ArduPilotRate(
-        p=per_axis("P"), i=per_axis("I"), d=per_axis("D"), ff=per_axis("FF", 0.0),
-        d_ff=per_axis("D_FF", 0.0), gyro=FilterChain((*notches.filters, *low_pass), gyro_rate),
-        target_hz=per_axis("FLTT", 20.0), error_hz=per_axis("FLTE", 0.0),
-        derivative_hz=per_axis("FLTD", 20.0), integral_limit=per_axis("IMAX", 0.5),
-        pd_limit=np.where(limit > 0, limit, np.inf), dt=1 / rate,
-    )  # fmt: skip
-    switched = {
-        **{f"ATC_RAT_{x}_SMAX": "the slew limiter lowers P and D" for x in ("RLL", "PIT", "YAW")},
-        **{
-            f"ATC_RAT_{x}_{n}": Message("a notch", "notch")
-            for x in ("RLL", "PIT", "YAW")
-            for n in ("NTF", "NEF")
-        },
-        "FSTRATE_ENABLE": "the rate loop runs faster than SCHED_LOOP_RATE",
-    }
-    found = [
-        Message(f"{name}: {what}", Message(what).kind)
-        for name, what in switched.items()
-        if read.number(name, 0.0) > 0
-    ]
-    flown = FlownArduPilot(law, (*found, *notches.unmodelled), notches.tracking)
-    return dataclasses.replace(flown, law=flown.at(throttle))
-
-
-class _Parameters:
-    """Numbers by their names."""
-
-    def __init__(self, values: Mapping[str, str]):
-        self.values = values
-
-    def number(self, name: str, default: float | None = None) -> float:
-        if name in self.values:
-            return float(self.values[name])
-        if default is None:
-            raise ValueError(
-                f"the log has no parameter {name}: log the parameters of the autopilot."
-            )
-        return default

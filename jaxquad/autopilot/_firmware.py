@@ -1,0 +1,392 @@
+"""The interface of a firmware (law, parameters, channels, files), and the registry of all.
+
+A firmware is one file or folder: `px4/` is a short one, and CONTRIBUTING.md says how to add one.
+"""
+
+import abc
+import dataclasses
+import importlib
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Literal, NamedTuple
+
+import numpy as np
+from jaxtyping import Complex, Float
+
+from jaxquad._core import Number
+from jaxquad.records.firmware import firmware_names, FirmwareLog, register_log
+
+from ._filters import Filter, FilterChain
+from ._law import FlownLoop
+
+
+Stage = Literal["gyro", "derivative"]
+Values = Sequence[tuple["Parameter", float, float]]  # parameter, the value to set, the other one
+Words = Sequence[tuple[str, str, str]]  # name, the word to set, the other one
+Span = tuple[float | None, float | None]  # s; None: from the beginning, to the end
+HOVER = 0.3  # of the throttle, where a log does not hold it
+
+
+class Parameter(NamedTuple):
+    """A parameter of a firmware, as its documentation has it.
+
+    **Arguments:**
+
+    - `name`, `unit`: as the firmware calls them.
+    - `default`: of the firmware.
+    - `low`, `high`: of the documented range; an infinity where none is documented.
+    - `whole`: whether the firmware stores a whole number; else it is a single-precision one.
+    - `field`, `axis`: of the law that it sets: ("p", 0); -1 for all axes. "angle.p" is a field of
+      the angle loop, "gyro" the cutoff of the only Butterworth low-pass of the gyro.
+    """
+
+    name: str
+    unit: str
+    default: float
+    low: float
+    high: float
+    whole: bool = False
+    field: str = ""
+    axis: int = -1
+
+
+Range = tuple[Number, Number]
+
+
+def rows_of_axes(
+    names: Sequence[str], unit: str, defaults: Sequence[Number], ranges: tuple[Range, ...] | Range,
+    field: str, *, whole: bool = False,
+) -> list[Parameter]:  # fmt: skip
+    """A parameter of roll, pitch and yaw, with one range or with three."""
+    low, *_ = ranges
+    bounds = [ranges] * 3 if isinstance(low, int | float) else ranges
+    return [
+        Parameter(name, unit, default, *bound, whole, field, axis)
+        for axis, (name, default, bound) in enumerate(zip(names, defaults, bounds, strict=True))
+    ]  # fmt: skip
+
+
+class FilterOption(NamedTuple):
+    """A filter as the firmware can store it; None is off."""
+
+    parameters: Mapping[str, float]
+    filter: Filter | None
+
+
+class FilterChoice(NamedTuple):
+    """The options of one filter of a loop.
+
+    **Arguments:**
+
+    - `stage`: whether it acts on the gyro, and so on all terms, or on the derivative alone.
+    - `shared`: whether it acts on all axes.
+    - `rate_hz`: at which it runs.
+    - `options`: in the order of their cutoffs.
+    - `flown`: which of them flew.
+    """
+
+    stage: Stage
+    shared: bool
+    rate_hz: float
+    options: tuple[FilterOption, ...]
+    flown: int
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of its parameters."""
+        return tuple(self.options[self.flown].parameters)
+
+
+class LowPass(NamedTuple):
+    """A low-pass that is on: the parameters that scale its cutoff, and where it acts."""
+
+    stage: Stage
+    parameters: Mapping[str, float]
+    filter: Filter
+    rate_hz: float
+    shared: bool = True
+
+
+@dataclasses.dataclass(frozen=True)
+class OuterLoop:
+    """The gain of an axis' angle loop, and how late it acts.
+
+    **Attributes:**
+
+    - `name`: of the parameter; `value`: as the firmware stores it; `unit`: of it, in 1/s.
+    - `late`: s from the angle to the rate's set-point.
+    - `closed`: whether it was closed in the flight.
+    - `smooth`: filters of the rate's set-point.
+    """
+
+    name: str
+    value: float
+    unit: float
+    late: float
+    closed: bool
+    smooth: FilterChain = FilterChain()
+
+    def path(self, omega: Float[np.ndarray, " frequencies"]) -> Complex[np.ndarray, " frequencies"]:
+        """From the rate to minus the set-point, per 1/s of gain."""
+        smooth = np.asarray(self.smooth.response(omega / (2 * np.pi)))
+        return smooth * np.exp(-1j * omega * self.late) / (1j * omega)
+
+    def gain(self, value: float) -> float:
+        """In 1/s."""
+        return self.unit * value
+
+    @classmethod
+    def of(
+        cls, values: Mapping[str, str], name: str, unit: float, late: float, *, closed: bool,
+        smooth: FilterChain | None = None,
+    ) -> "OuterLoop | None":  # fmt: skip
+        """Of a parameter among the `values` of a log; None where it is missing or 0."""
+        value = float(values.get(name, 0.0))
+        chain = FilterChain() if smooth is None else smooth
+        return cls(name, value, unit, late, closed, chain) if value > 0 else None
+
+
+class Channels(NamedTuple):
+    """Names of channels of an axis; a mix is a weighted sum of some. Empty: not logged.
+
+    **Attributes:**
+
+    - `unfiltered`: the gyro before its filters, of roll, pitch and yaw.
+    - `terms`: P, I, D and F of the command; `output`: their sum.
+    - `mixed`: what the motors made of the output.
+    - `motors`: their commands; `stick`: the throttle that filters and TPA follow.
+    - `slewed`: the share that a slew limiter leaves of P and D.
+    """
+
+    unfiltered: Sequence[str] = ()
+    terms: Sequence[str] = ()
+    motors: Sequence[str] = ()
+    output: Mapping[str, float] = {}
+    stick: Mapping[str, float] = {}
+    mixed: Mapping[str, float] = {}
+    slewed: Mapping[str, float] = {}
+
+
+class Firmware(abc.ABC):
+    """A firmware: what flies, its parameters and files, and what its logs hold.
+
+    Subclasses have `log`, `parameters` and the methods that are abstract; all others have defaults
+    for what a firmware does not have. `register` makes one known.
+
+    **Attributes:**
+
+    - `log`: what its logs mean; its `name` is that of the firmware.
+    - `parameters`: by name. Those with the `fields` "p", "i" and "d" of an axis are tuned.
+    - `fields`: of the rate law, its P, I and D gains.
+    - `unit`: of the law's command; `suffix`: of parameter files.
+    - `motor_shares`: relative thrust of a motor of a quad X per unit of output, of three axes.
+    - `follows_throttle`: whether the law changes with the throttle.
+    - `averages_gyro`: whether the unfiltered rate is the mean over its sample.
+    - `thrust_curve`: the parameter that inverts the curve of thrust; `keeps_throttle`: whether it
+      inverts it for the axes alone, so that the motors get the throttle itself.
+    - `weighs_setpoint`: whether feed-forward of the set-point can stand for its weight.
+    - `notches`: the parameters of static notches, a centre and a second one each.
+    - `words`: whether some of its parameters are words; `has_adrc`: whether it can fly Betaflight's
+      proposed ADRC.
+    """
+
+    log: FirmwareLog
+    parameters: Mapping[str, Parameter]
+    fields: tuple[str, str, str] = ("p", "i", "d")
+    unit: str = "command"
+    suffix: str = "param"
+    motor_shares: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    follows_throttle: bool = False
+    averages_gyro: bool = False
+    thrust_curve: str = ""
+    keeps_throttle: bool = False
+    weighs_setpoint: bool = False
+    notches: tuple[tuple[str, str], ...] = ()
+    words: bool = False
+    has_adrc: bool = False
+
+    @abc.abstractmethod
+    def flown_loop(
+        self, values: Mapping[str, str], version: Sequence[int], *, throttle: float,
+        tracked_hz: Mapping[int, Sequence[float]],
+    ) -> FlownLoop:  # fmt: skip
+        """The rate loop of a log's parameters. Raises ValueError where a gain is missing."""
+
+    @abc.abstractmethod
+    def channels(self, prefix: str, axis: int) -> Channels:
+        """Of a log whose channels begin with `prefix`."""
+
+    @abc.abstractmethod
+    def what_to_fly(self, axis: str) -> str:
+        """A flight that excites the axis: what to set, what to fly, how to end it."""
+
+    # What a log holds beside its channels
+
+    def unfiltered_gyro(
+        self, names: frozenset[str], values: Mapping[str, str], median: Callable[[str], float]
+    ) -> Sequence[str]:
+        """The gyro before its filters that flew, where `channels` cannot know it.
+
+        `names` are those of all channels, `median` gives that of one, 0 where it is not logged.
+        """
+        return []
+
+    def tracked_channels(self) -> Mapping[int, str]:
+        """Patterns of channels, in turns per minute, that notches of a mode follow."""
+        return {}
+
+    def motor_ends(self, values: Mapping[str, str]) -> tuple[float, float]:
+        """The lowest and the highest command of a motor."""
+        return 0.0, 1.0
+
+    def stick_throttle(
+        self, command: Float[np.ndarray, " samples"], values: Mapping[str, str]
+    ) -> Float[np.ndarray, " samples"] | None:
+        """0 to 1, of the `stick` of `channels`; None where it is not what the law follows."""
+        return command
+
+    def output_limit(self, values: Mapping[str, str], axis: int) -> float:
+        """Of the law's output, before the mixer."""
+        return np.inf
+
+    def resolution(self, values: Mapping[str, str]) -> tuple[float, float]:
+        """Steps in which rates (rad/s) and terms are logged; 0 where they are not rounded."""
+        return 0.0, 0.0
+
+    def with_hold(self, values: Mapping[str, str], hold: float | None) -> Mapping[str, str]:
+        """The parameters with the loop's interval in s that the log's stamps show."""
+        return values
+
+    # The law
+
+    def levelled(self, loop: FlownLoop) -> FlownLoop:
+        """The rate loop as it is inside an angle loop that was closed."""
+        return loop
+
+    def angle_loop(
+        self, values: Mapping[str, str], axis: int, dt: float, *, levelled: bool
+    ) -> OuterLoop | None:
+        """The angle loop around a rate loop of interval `dt` in s; None where there is none.
+
+        `levelled` is whether it is known to have been closed, where that may change in flight.
+        """
+        return None
+
+    def low_passes(
+        self, loop: FlownLoop, values: Mapping[str, str], version: Sequence[int], axis: int,
+        throttle: float,
+    ) -> Iterator[LowPass]:  # fmt: skip
+        """Those of gyro and D term that are on, whose cutoffs may change."""
+        return iter(())
+
+    def notch(self, centre_hz: float, second: float) -> Filter:
+        """A static notch by the values of two parameters, see `notches`."""
+        raise NotImplementedError
+
+    def notch_width(self, centre_hz: float, half_width: float) -> float:
+        """The second parameter of a notch whose half width is this share of its centre."""
+        raise NotImplementedError
+
+    def flown_notches(self, values: Mapping[str, str]) -> list[tuple[float, float]]:
+        """The parameters of the `notches` that a log holds, in their order."""
+        number, usual = Numbers(values).number, self.parameters
+        return [(number(a, 0.0), number(b, float(usual[b].default))) for a, b in self.notches]
+
+    def notch_rate_hz(self, loop: FlownLoop) -> float:
+        """At which static notches run."""
+        return loop.law.gyro.rate_hz
+
+    def change_filters(
+        self, values: Mapping[str, str], parameters: Mapping[str, Number]
+    ) -> dict[str, str]:
+        """The values of a log with other filters. Raises ValueError where one has no place."""
+        return {**values, **{name: repr(float(x)) for name, x in parameters.items()}}
+
+    def curve_kind(self, version: Sequence[int]) -> str:
+        """What `jq.identify` calls the family of the `thrust_curve`."""
+        return self.log.name
+
+    def flies_adrc(self, values: Mapping[str, str]) -> bool:
+        """Whether the log is of a flight with Betaflight's proposed ADRC."""
+        return False
+
+    # Gains in SI units, and files
+
+    def si_scales(self, axis: str) -> tuple[float, float, float]:
+        """P, I and D parameters per gain in SI units over the torque of a unit of output."""
+        return 1.0, 1.0, 1.0
+
+    def angle_parameters(self, axis: str, p: float) -> dict[str, float]:
+        """The angle loop's parameters for a gain in 1/s."""
+        raise ValueError(f"{self.log.title} has no angle loop here.")
+
+    def no_ladrc(self) -> str:
+        """Why it cannot run a LADRC of the angle."""
+        return "it has no disturbance observer"
+
+    def parameter_file(
+        self, values: Values, title: str, *, version: tuple[int, ...], profile: int | None,
+        raised: Sequence[str], words: Words,
+    ) -> str:  # fmt: skip
+        """The text to load, see `jq.autopilot.parameter_file`; by default lines `NAME,value`."""
+        rows = [f"# {title}"] if title else []
+        for row, value, other in values:
+            rows.append(f"# {row.name} was {number_text(other, row.whole)}")
+            rows.append(f"{row.name},{number_text(value, row.whole)}")
+        return joined_lines(rows)
+
+
+def number_text(value: Number, whole: bool) -> str:
+    """The shortest text that single precision reads back exactly."""
+    if whole:
+        return str(int(value))
+    return np.format_float_positional(np.float32(value), trim="-")
+
+
+def joined_lines(rows: Sequence[str]) -> str:
+    """A text file of these lines."""
+    return "\n".join([*rows, ""])
+
+
+def cutoff_of(low_pass: Filter) -> float:
+    """In Hz, of a low-pass of one axis or of the first one."""
+    return float(np.ravel(vars(low_pass)["cutoff_hz"])[0])
+
+
+_FIRMWARES: dict[str, Firmware] = {}
+
+
+def register(firmware: Firmware) -> None:
+    """Make a firmware known: to `jq.read` and `jq.propose`, and to `jq.workflows.autopilot`.
+
+    **Arguments:**
+
+    - `firmware`: of a subclass of `Firmware`. One of the same name is replaced.
+    """
+    register_log(firmware.log)
+    _FIRMWARES[firmware.log.name] = firmware
+
+
+def firmware_named(name: str) -> Firmware:
+    """The firmware of this name, as the `vehicle` of a log. Raises ValueError for another one."""
+    if name not in _FIRMWARES:
+        if name not in firmware_names():
+            raise ValueError(f"firmware is {name!r}: give one of {', '.join(firmware_names())}.")
+        _FIRMWARES[name] = importlib.import_module(f"{__package__}.{name}._firmware").FIRMWARE
+    return _FIRMWARES[name]
+
+
+class Numbers:
+    """Numbers by the names of parameters, for `Firmware.flown_loop`."""
+
+    def __init__(self, values: Mapping[str, str]):
+        self.values = values
+
+    def number(self, name: str, default: float | None = None) -> float:
+        """Raises ValueError where it is missing and has no default."""
+        if name in self.values:
+            return float(self.values[name])
+        if default is None:
+            raise ValueError(
+                f"the log has no parameter {name}: log the parameters of the autopilot."
+            )
+        return default
