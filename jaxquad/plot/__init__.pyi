@@ -1,14 +1,7 @@
 from ._bode import bode as bode, coherence as coherence
-from ._curves import (
-    FlownAgain as FlownAgain,
-    Spectrum as Spectrum,
-    StepBand as StepBand,
-    ThrottleCurve as ThrottleCurve,
-)
 from ._histories import (
     channels_of as channels_of,
     extremes as extremes,
-    flight as flight,
     histories as histories,
     record_figure as record_figure,
     ROWS as ROWS,
@@ -28,8 +21,12 @@ from ._pilot import (
     b0_figure as b0_figure,
     balance_figure as balance_figure,
     filters_figure as filters_figure,
+    FlownAgain as FlownAgain,
     spectra_figure as spectra_figure,
+    Spectrum as Spectrum,
+    StepBand as StepBand,
     steps_figure as steps_figure,
+    ThrottleCurve as ThrottleCurve,
 )
 from ._plane import nyquist as nyquist, pzmap as pzmap
 from ._predictions import (
@@ -42,5 +39,6 @@ from ._predictions import (
 from ._tuning import (
     certificate_figure as certificate_figure,
     convergence_figure as convergence_figure,
+    flight as flight,
     front_figure as front_figure,
 )
