@@ -23,7 +23,7 @@ from jaxquad.records.firmware import firmware_names
 
 from ._files import ParameterChange, propose_changes
 from ._firmware import firmware_named
-from ._flown_autopilot import FlownAutopilot
+from ._flight_channels import FlownAutopilot
 from ._identified import IdentifiedPlant
 from ._parameters import find_parameter
 from ._plants import PlantSource

@@ -17,10 +17,9 @@ from ._firmware import firmware_named
 from ._flight_channels import FlightChannels
 from ._gyro_noise import gyro_noise, GyroNoise
 from ._law import RateLoop
-from ._limits import limits_text
 from ._page import PilotPage
 from ._rate_gains import gains_in, gains_of, gyro_chain_response, law_paths
-from ._stages import margin_text, Stage
+from ._stages import limits_text, Stage
 
 
 if TYPE_CHECKING:
@@ -292,7 +291,7 @@ def _stage_rows(found: "AutopilotProposal") -> Table:
     rows: list[list[str | Cell]] = [
         [
             name, f"{100 * x.stable:.1f}", f"{x.peak:.2f}", f"{x.resonance:.2f}",
-            f"{x.crossover / (2 * np.pi):.1f}", margin_text(x),
+            f"{x.crossover / (2 * np.pi):.1f}", x.margin_text,
             f"{x.rejection:.2f}", f"{x.noise:.2f}", *_further(x),
             *(f"{peak:.2f}" for peak in x.peaks[: len(levels)]),
         ]

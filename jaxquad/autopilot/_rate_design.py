@@ -10,15 +10,12 @@ import numpy as np
 from jaxquad._core import announce
 
 from ._files import propose_changes
-from ._filter_choices import filter_choices
 from ._firmware import firmware_named, OuterLoop
-from ._flight_channels import FlightChannels
-from ._flown_autopilot import FlownAutopilot
+from ._flight_channels import FlightChannels, FlownAutopilot
 from ._gyro_noise import gyro_noise, GyroNoise, NoNoise
 from ._identified import DesignSettings, IdentifiedPlant
-from ._limits import beyond_angle, beyond_limits
 from ._over_throttle import ThrottleVerdict
-from ._parameters import find_parameter
+from ._parameters import filter_choices, find_parameter
 from ._rate_gains import (
     ceiling_in,
     gains_in,
@@ -28,7 +25,7 @@ from ._rate_gains import (
     RateLoops,
 )
 from ._rate_search import filter_values, FilterBank, Search, shared_change, SharedChange, Targets
-from ._stages import certify_angle, certify_gains, Stage
+from ._stages import beyond_angle, beyond_limits, certify_angle, certify_gains, Stage
 
 
 Kind = Literal["proposed", "kept", "cannot tell", "not to be flown"]

@@ -15,8 +15,7 @@ from jaxquad.records import AXES
 from .._filters import Butterworth, FilterChain, PT1
 from .._firmware import Channels, Firmware, LowPass, Numbers, OuterLoop, Parameter, rows_of_axes
 from .._law import FlownLoop
-from ._harmonic_notch import HarmonicNotch, read_harmonic_notches, Tracking
-from ._law import ArduPilotRate
+from ._law import ArduPilotRate, HarmonicNotch, read_harmonic_notches, Tracking
 from ._log import LOG
 
 

@@ -15,21 +15,25 @@ from jaxquad._core import announce, plain_content
 from jaxquad.identify import B0Law, B0Schedule, GainOverThrottle, ScaledB0, UndeterminedError
 from jaxquad.records import AXES
 
-from ._adrc_loops import ADRCFrame, ADRCLoop, Designs, draw_at, Flown, make_adrc_loop
-from ._adrc_stages import (
+from .._parameters import store_parameters
+from .._rate_design import Design, Kind
+from .._rate_gains import LoopQualities
+from ._adrc import FlownADRC
+from ._adrc_loops import (
     a_third,
+    ADRCFrame,
+    ADRCLoop,
     ADRCStage,
     ADRCTargets,
     beyond_targets,
-    Design,
+    Designs,
+    draw_at,
+    Flown,
     judge,
+    make_adrc_loop,
     rows_of,
     stages_of,
 )
-from ._parameters import store_parameters
-from ._rate_design import Kind
-from ._rate_gains import LoopQualities
-from .betaflight._adrc import FlownADRC
 
 
 _LAW: B0Law = "SQRT"  # of the firmware by default
