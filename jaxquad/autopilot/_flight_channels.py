@@ -26,7 +26,7 @@ from jaxquad.records import (
 )
 
 from ._firmware import firmware_named, HOVER, OuterLoop, Span
-from ._identified import DesignSettings, RecordSettings
+from ._identified import RecordSettings
 from ._law import FlownLoop, RateLoop
 from ._parameters import change_filters, flown_loop
 from ._rate_gains import gains_of, parameters_of
@@ -326,14 +326,14 @@ def settings_of(path: Path, proposal: Proposal) -> LogSettings:
 
 
 def read_flown(
-    path: Path, proposal: Proposal, settings: DesignSettings,
+    path: Path, proposal: Proposal, throttle: float | None,
     tracked_hz: Mapping[int, Sequence[float]],
 ) -> FlownAutopilot:  # fmt: skip
     """The loop that flew. Raises ValueError where the log does not hold its gains."""
     setup, logged = proposal.setup, settings_of(path, proposal)
     axis, firmware = AXES.index(setup.axis), firmware_named(proposal.vehicle)
     values = firmware.with_hold(logged.values, setup.hold)
-    throttle = HOVER if settings.throttle is None else settings.throttle
+    throttle = HOVER if throttle is None else throttle
     loop = firmware.flown_loop(values, logged.version, throttle=throttle, tracked_hz=tracked_hz)
     loop = firmware.levelled(loop) if setup.levelled else loop
     if not np.any(gains_of(loop.law, axis) > 0):

@@ -66,12 +66,12 @@ class FlownLaw:
 
     def content(self) -> dict[str, object]:
         """For `result.json`; `StoredFilters.of` reads the filters."""
-        measured = [each for each in self.filters if isinstance(each, MeasuredChain)]
+        measured = [x for x in self.filters if isinstance(x, MeasuredChain)]
         chains = [
-            {"rate_hz": x.rate_hz, "sections": [_numbers(each) for each in x.sections()]}
+            {"rate_hz": x.rate_hz, "sections": [_numbers(x) for x in x.sections()]}
             for x in self.chains
         ]
-        correction = [{"delay_s": each.delay, "lag_s": each.lag} for each in measured]
+        correction = [{"delay_s": x.delay, "lag_s": x.lag} for x in measured]
         return {"text": self.text, "chains": chains, "correction": (*correction, {})[0]}
 
 
@@ -92,7 +92,10 @@ class StoredFilters:
         """From what `FlownLaw.content` has stored. Raises ValueError for anything else."""
         try:
             chains = tuple(
-                (float(x["rate_hz"]), tuple(tuple(map(float, each)) for each in x["sections"]))
+                (
+                    float(x["rate_hz"]),
+                    tuple(tuple(map(float, section)) for section in x["sections"]),
+                )
                 for x in content["chains"]
             )
             correction = content["correction"]
@@ -144,7 +147,7 @@ def flown_law(
     except Exception as error:
         return FlownLaw((), f"the gyro's filters are in the model: {reason_of(error)}")
     first, *others = laws
-    if first is None or any(_differs(first, each) for each in others):
+    if first is None or any(_differs(first, law) for law in others):
         text = "the gyro's filters are in the model: those of the logs differ"
         return None if first is None else FlownLaw((), text)
     return first
@@ -153,7 +156,7 @@ def flown_law(
 def _differs(one: FlownLaw, other: FlownLaw | None) -> bool:
     if other is None:
         return True
-    both = [np.prod([x.response(_AT) for x in each.filters], axis=0) for each in (one, other)]
+    both = [np.prod([x.response(_AT) for x in law.filters], axis=0) for law in (one, other)]
     return bool(np.max(np.abs(np.asarray(both[0]) / np.asarray(both[1]) - 1)) > _SAME)
 
 
@@ -166,8 +169,8 @@ def _law_of(
             proposal = propose(path, axis=AXES[axis])
         except ValueError:  # a table whose channels have these names
             return None
-    known = firmware_log(proposal.vehicle)
-    if proposal.setup.rate != rate or known is None or not known.gyro_cutoffs:
+    log = firmware_log(proposal.vehicle)
+    if proposal.setup.rate != rate or log is None or not log.gyro_cutoffs:
         return None
     return _read_law(path, axis, command, proposal, settings)
 
@@ -204,8 +207,8 @@ def best_filters(
     axis: int,
 ) -> tuple[tuple[KnownFilter, ...], str]:
     """As measured where notches follow motors or spectrum, else those of the parameters."""
-    hidden = [each for each in unmodelled if each.kind == "notch"]
-    missing = "" if not hidden else f" (not {'; '.join(each.partition(':')[0] for each in hidden)})"
+    hidden = [text for text in unmodelled if text.kind == "notch"]
+    missing = "" if not hidden else f" (not {'; '.join(text.partition(':')[0] for text in hidden)})"
     if hidden and flight is not None and len(flight.unfiltered) > axis and not flight.averaged:
         measured = _measured(chains, flight, axis)
         if isinstance(measured, MeasuredChain):
@@ -213,7 +216,7 @@ def best_filters(
         missing = f"{missing[:-1]}, which could not be measured: {measured})"
     if not chains:
         return (), f"the gyro has no filter that is known{missing}"
-    words = ", ".join(each.in_words() for chain in chains for each in chain.filters)
+    words = ", ".join(text.in_words() for chain in chains for text in chain.filters)
     late = sum(float(chain.delay_ms([_SHOWN])[0]) for chain in chains)
     text = f"the gyro's filters, {words}{missing}, are divided out: {late:.2g} ms at {_SHOWN:g} Hz"
     return chains, text
@@ -320,5 +323,5 @@ def _step(
     values = random.multivariate_normal(fit.values, fit.covariance, _PLANTS, method="eigh")
     sign = np.sign(fit.values)
     values = np.where(sign * values > 0, values, 0.0 * sign)  # a parameter keeps its sign
-    plants = [_plant(frf, with_values(fit.model, places, each), grid.omega) for each in values]
-    return grid.band(np.stack([loop.closed(each) for each in plants]))
+    plants = [_plant(frf, with_values(fit.model, places, plant), grid.omega) for plant in values]
+    return grid.band(np.stack([loop.closed(plant) for plant in plants]))

@@ -153,15 +153,15 @@ def check_law(flown: FlownLoop, axis: int, flight: FlightChannels) -> LawCheck:
     Where more than 2 % of the output are left, the set-point is tried one loop earlier and later.
     """
     law = pick_axis(flown, axis)
-    known = _checked(law, flight, flight.late)
-    output = known.terms.get("output")
+    stated = _checked(law, flight, flight.late)
+    output = stated.terms.get("output")
     if output is None or output.share <= _SHIFTED:
-        return known
+        return stated
     step = flown.law.interval()
     others = [_checked(law, flight, flight.late + way * step) for way in (1, -1)]
-    best = min(others, key=lambda each: each.terms["output"].left)
+    best = min(others, key=lambda check: check.terms["output"].left)
     if best.terms["output"].left > _BETTER * output.left:
-        return known
+        return stated
     return dataclasses.replace(best, shifted=True)
 
 
@@ -184,7 +184,7 @@ def _checked(law: FlownLoop, flight: FlightChannels, late: float) -> LawCheck:
     )  # fmt: skip
     if flight.slewed is not None:
         terms |= {name: terms[name] * flight.slewed[:, None] for name in "PD"}
-    if "I" in logged and any(each.kind == "anti-gravity" for each in law.unmodelled):
+    if "I" in logged and any(text.kind == "anti-gravity" for text in law.unmodelled):
         terms["I"] = np.repeat(logged.pop("I")[:, None], many, axis=1)  # not judged
     if forward is not None:
         terms["F"] = np.repeat(forward[:, None], many, axis=1)
@@ -383,17 +383,17 @@ def _parts(response: Complex[np.ndarray, " frequencies"]) -> dict[str, object]:
 
 
 def check_loop(
-    found: IdentifiedPlant, flown: FlownAutopilot, flight: FlightChannels, law: LawCheck
+    plant: IdentifiedPlant, flown: FlownAutopilot, flight: FlightChannels, law: LawCheck
 ) -> LoopCheck:
     """Fly the loop again on the excitation that the log holds."""
     forward, injected = flight.terms.get("F"), flight.injected
     added = flight.not_carried if injected is None else injected
     again = fly_again(
-        pick_axis(flown.loop, flown.axis), plant_of(found.fit, _unit(found)), flight.setpoint,
+        pick_axis(flown.loop, flown.axis), plant_of(plant.fit, _unit(plant)), flight.setpoint,
         flight.followed, dt=flight.dt, late=law.late, feed_forward=forward, injected=added,
     )  # fmt: skip
     drive = flight.setpoint if injected is None else injected
-    response = _responses(found, flight, drive, again)
+    response = _responses(plant, flight, drive, again)
     omega = np.asarray(response.omega)
     both = np.asarray(response.response)[:, :, 0]
     passed = filter_response(flown.filters, omega)
@@ -403,7 +403,7 @@ def check_loop(
     return LoopCheck(
         law, omega, both[:, 0], np.asarray(response.random_error)[:, 0, 0], both[:, 1] * passed,
         used & np.isfinite(both).all(axis=1), float(np.mean(flight.limited)),
-        float(np.sqrt(found.fit.chi_squared)), time[part],
+        float(np.sqrt(plant.fit.chi_squared)), time[part],
         flight.setpoint[part], flight.rates[flown.axis][part], chain[part],
     )  # fmt: skip
 
@@ -417,12 +417,12 @@ def plant_of(fit: Fit, unit: str) -> HeldPlant:
     )
 
 
-def _unit(found: IdentifiedPlant) -> str:
-    return found.records[0].output_units[0]
+def _unit(plant: IdentifiedPlant) -> str:
+    return plant.records[0].output_units[0]
 
 
 def _responses(
-    found: IdentifiedPlant, flight: FlightChannels, drive: Samples, again: Samples
+    plant: IdentifiedPlant, flight: FlightChannels, drive: Samples, again: Samples
 ) -> FrequencyResponse:
     """From the excitation to the logged and to the simulated rate, with one estimator."""
     rate = flight.rates[flight.axis]
@@ -432,7 +432,7 @@ def _responses(
         external, input_names=["drive"], output_names=["logged", "again"],
         reference_names=None if external is None else ["excitation"],
     )  # fmt: skip
-    low, high = found.band
+    low, high = plant.band
     omega = np.geomspace(low, min(high, 0.4 * 2 * np.pi / flight.dt), _POINTS)
     estimator = LocalPolynomial() if external is None else JointInputOutput()
     return frequency_response(record, omega, estimator=estimator)

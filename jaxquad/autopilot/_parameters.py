@@ -47,14 +47,14 @@ PARAMETERS: Mapping[str, Mapping[str, Parameter]] = _Tables()
 
 def find_parameter(firmware: str, name: str) -> Parameter:
     """The parameter of this name. Raises ValueError for one that is not in the table."""
-    found = PARAMETERS[firmware].get(name)
-    if found is None:
+    row = PARAMETERS[firmware].get(name)
+    if row is None:
         near = [x for x in PARAMETERS[firmware] if x.lower()[:4] == name.lower()[:4]]
         raise ValueError(
             f"{name} is no parameter that is known of {firmware}"
             + (f": do you mean one of {', '.join(near[:6])}?" if near else ".")
         )
-    return found
+    return row
 
 
 def store_parameters(firmware: str, values: Mapping[str, Number]) -> dict[str, float]:
@@ -73,22 +73,22 @@ def store_parameters(firmware: str, values: Mapping[str, Number]) -> dict[str, f
         if not np.isfinite(value):
             raise ValueError(f"{name} is {value}: give a finite number.")
         row = find_parameter(firmware, name)
-        stored[name] = float(np.rint(value)) if row.whole else float(np.float32(value))
+        stored[name] = float(np.rint(value)) if row.integer else float(np.float32(value))
     return stored
 
 
 def check_ranges(firmware: str, values: Mapping[str, Number]) -> tuple[str, ...]:
     """A sentence for each value beyond the range that the firmware documents."""
-    found = []
+    beyond = []
     for name, value in values.items():
         row = find_parameter(firmware, name)
         if not row.low * (1 - 1e-6) <= value <= row.high * (1 + 1e-6):
             unit = f" {row.unit}" if row.unit else ""
-            found.append(
+            beyond.append(
                 f"{name} is {value:g}{unit}, beyond its documented range of {row.low:g} to "
                 f"{row.high:g}{unit}."
             )
-    return tuple(found)
+    return tuple(beyond)
 
 
 def firmware_of(law: FirmwareLoop) -> str:
@@ -248,14 +248,14 @@ def filter_choices(
     - `change`: factor by which a cutoff may rise or fall, within its documented range.
     - `line_hz`: of the line; None offers no notch.
     """
-    known = firmware_named(firmware)
+    kind = firmware_named(firmware)
     loop = flown_loop(firmware, values, version, throttle=throttle)
     choices = [
         _low_pass_choice(firmware, low_pass, change)
-        for low_pass in known.low_passes(loop, values, version, axis, throttle)
+        for low_pass in kind.low_passes(loop, values, version, axis, throttle)
     ]
     if line_hz is not None:
-        choices += _notch_choices(known, values, known.notch_rate_hz(loop), line_hz)
+        choices += _notch_choices(kind, values, kind.notch_rate_hz(loop), line_hz)
     return tuple(choice for choice in choices if len(choice.options) > 1)
 
 

@@ -370,11 +370,11 @@ def read_harmonic_notches(
 
 
 def _followed(
-    notch: HarmonicNotch, mode: int, reference: float, apart: bool, sources: Sequence[float]
+    notch: HarmonicNotch, mode: int, reference: float, separate: bool, sources: Sequence[float]
 ) -> list[HarmonicNotch]:
     """A notch for each source, or one for their mean, which REF scales but for the spectrum."""
     centres = list(sources)
-    if not apart or mode in (2, 5):
+    if not separate or mode in (2, 5):
         centres = [(1.0 if mode == 4 else reference) * float(np.mean(sources))]
     lowest = notch.centre_hz
     moved = [jnp.maximum(lowest, centre) for centre in centres]

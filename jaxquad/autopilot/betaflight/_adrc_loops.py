@@ -128,21 +128,23 @@ def _setpoint_response(
 
 
 def make_adrc_loop(
-    found: GainOverThrottle, flown: Flown, axis: int, throttle: float, frame: ADRCFrame,
+    plant: GainOverThrottle, flown: Flown, axis: int, throttle: float, frame: ADRCFrame,
     plants: int, seed: int, omega: Frequencies | None = None,
 ) -> ADRCLoop:  # fmt: skip
     """The loops of plants drawn at a throttle, behind the filters of what flew."""
     law, scale = flown.at(throttle), float(frame.schedule.scale(throttle))
     if omega is None:
         omega = np.geomspace(_LOWEST, 0.999 * np.pi / law.dt, _FREQUENCIES)
-    gain, lag, delay = draw_at(found, throttle, plants, seed)
-    per_radian = 1.0 if found.output_unit == "rad/s" else 1 / _DEGREES
-    held = hold_plants(per_radian * gain[:, None], lag[:, None], delay[:, None], omega, law.dt)
+    gain, lag, delay = draw_at(plant, throttle, plants, seed)
+    per_radian = 1.0 if plant.output_unit == "rad/s" else 1 / _DEGREES
+    responses = hold_plants(per_radian * gain[:, None], lag[:, None], delay[:, None], omega, law.dt)
     ahead, back = law_responses(law, axis, omega)
     passed = np.ones(omega.size, complex)
-    for each in rate_filters(flown, throttle, frame):
-        passed = passed * np.asarray(each.response(omega / (2 * np.pi)))
-    before = RateLoops(omega, -back[None], ahead[None], held, cells_of(omega), np.ones_like(passed))
+    for chain in rate_filters(flown, throttle, frame):
+        passed = passed * np.asarray(chain.response(omega / (2 * np.pi)))
+    before = RateLoops(
+        omega, -back[None], ahead[None], responses, cells_of(omega), np.ones_like(passed)
+    )
     return ADRCLoop(law.dt, before, passed, scale, frame)
 
 
@@ -154,20 +156,20 @@ def gyro_filters(flown: Flown, throttle: float) -> list[FilterChain]:
 
 def rate_filters(flown: Flown, throttle: float, frame: ADRCFrame) -> list[FilterChain]:
     """The chains before the observer: those of the gyro, and adrc_gyro_lpf_hz."""
-    own = (PT2(frame.lowpass_hz),) if frame.lowpass_hz > 0 else ()
-    return [*gyro_filters(flown, throttle), FilterChain(own, 1 / flown.law.dt)]
+    observer = (PT2(frame.lowpass_hz),) if frame.lowpass_hz > 0 else ()
+    return [*gyro_filters(flown, throttle), FilterChain(observer, 1 / flown.law.dt)]
 
 
 def draw_at(
-    found: GainOverThrottle, throttle: float, plants: int, seed: int
+    plant: GainOverThrottle, throttle: float, plants: int, seed: int
 ) -> Sequence[Float[np.ndarray, " plants"]]:
     """Gain, lag and delay of drawn plants; of a record with one level, at that level's throttle."""
-    if found.throttle.size > 1:
-        drawn = found.draw(np.array([throttle]), plants, seed=seed)
+    if plant.throttle.size > 1:
+        drawn = plant.draw(np.array([throttle]), plants, seed=seed)
         return drawn.gain[0], drawn.lag, drawn.delay
-    found.b0(0)  # says what to fly where the lag is not determined
-    scores = np.random.default_rng(seed).standard_normal((len(found.fit.names), plants))
-    models = draw_models(found.fit, jnp.asarray(scores))
+    plant.b0(0)  # says what to fly where the lag is not determined
+    scores = np.random.default_rng(seed).standard_normal((len(plant.fit.names), plants))
+    models = draw_models(plant.fit, jnp.asarray(scores))
     wide = lambda x: np.broadcast_to(np.asarray(x, float), (plants,))
     return wide(np.asarray(models.gain)[0]), wide(models.lag), wide(models.delay)
 
@@ -239,7 +241,7 @@ def stages_of(
     loops: Sequence[ADRCLoop], axis: str, before: Design | None, best: Design
 ) -> dict[str, ADRCStage]:
     """What flew, a third of the way where that has a meaning, the proposal, and the defaults."""
-    flown = [each.flown() for each in loops]
+    flown = [loop.flown() for loop in loops]
     of = lambda design: _stage(design, [x.qualities(design[None]) for x in loops], flown)
     none = np.full(3, np.nan)
     stages = {"what flew": _stage(none if before is None else before, flown, flown)}
@@ -250,9 +252,9 @@ def stages_of(
 
 
 def _stage(
-    design: Design, found: Sequence[LoopQualities], flown: Sequence[LoopQualities]
+    design: Design, qualities: Sequence[LoopQualities], flown: Sequence[LoopQualities]
 ) -> ADRCStage:
-    joined, before = _together(found), _together(flown)
+    joined, before = _together(qualities), _together(flown)
     relative = lambda new, old: float(np.sqrt(np.mean((new / old) ** 2)))
     wc, wo, b0 = map(float, design)
     return ADRCStage(
@@ -268,10 +270,10 @@ def _stage(
     )
 
 
-def _together(found: Sequence[LoopQualities]) -> LoopQualities:
+def _together(qualities: Sequence[LoopQualities]) -> LoopQualities:
     """Of one design, the plants of all throttles one after the other."""
-    columns = zip(*found, strict=True)
-    return LoopQualities(*(np.concatenate([each[0] for each in column]) for column in columns))
+    columns = zip(*qualities, strict=True)
+    return LoopQualities(*(np.concatenate([x[0] for x in column]) for column in columns))
 
 
 def judge(
@@ -300,5 +302,5 @@ def judge(
 
 def beyond_targets(stages: Mapping[str, ADRCStage], targets: ADRCTargets, edge: float) -> list[str]:
     """In words, which of the targets are not kept."""
-    flown, whole = stages["what flew"], stages["proposed"]
-    return beyond_limits(flown, stages.get("a third of the way", whole), whole, targets, edge)
+    flown, best = stages["what flew"], stages["proposed"]
+    return beyond_limits(flown, stages.get("a third of the way", best), best, targets, edge)
