@@ -37,10 +37,9 @@ from jaxquad.spectra import (
     LocalPolynomial,
 )
 
-from ._kinds import SettingsError
 from ._log import read_records
-from ._settings import IdentifySettings
-from ._tune_settings import AutopilotSettings
+from ._options import SettingsError
+from ._settings import AutopilotSettings, IdentifySettings
 
 
 _LINES = 40  # frequencies of a reproduced response
