@@ -106,27 +106,19 @@ def locate(file: DataFile) -> Path:
     - `ReadError`: the file is nowhere, cannot be downloaded, or is not what was published.
     """
     cache = Path(platformdirs.user_cache_dir("jaxquad")) / "datasets" / file.folder
-    given = os.environ.get(_FOLDER)
-    folders = ([Path(given) / file.folder] if given else []) + [cache]
+    data = os.environ.get(_FOLDER)
+    folders = ([Path(data) / file.folder] if data else []) + [cache]
     for folder in folders:
         for name in (*file.others, file.name):
             if (folder / name).is_file() and (folder != cache or not file.sha256):
                 return folder / name
+    unset = "" if _FOLDER in os.environ else f" ({_FOLDER} is not set)"
+    missing = f"{file.name} is not in {' nor in '.join(map(str, folders))}{unset}"
     if not file.sha256:
         raise ReadError(
-            f"{_where(file, folders)}. It cannot be checked after a download, as no checksum of it "
+            f"{missing}. It cannot be checked after a download, as no checksum of it "
             f"is known: take it from {file.origin} and put it into {folders[0]}"
         )
-    return _download(file, cache, _where(file, folders))
-
-
-def _where(file: DataFile, folders: list[Path]) -> str:
-    named = "" if _FOLDER in os.environ else f" ({_FOLDER} is not set)"
-    return f"{file.name} is not in {' nor in '.join(map(str, folders))}{named}"
-
-
-def _download(file: DataFile, cache: Path, missing: str) -> Path:
-    """The file in the cache, where a sound one stays as it is."""
     try:
         import pooch
     except ImportError as error:
@@ -135,7 +127,7 @@ def _download(file: DataFile, cache: Path, missing: str) -> Path:
             f'"jaxquad[datasets]", or set {_FOLDER} to the folder that holds {file.folder}'
         ) from error
     pooch.get_logger().setLevel("WARNING")
-    try:
+    try:  # a sound file in the cache stays as it is
         path = pooch.retrieve(
             file.origin, f"sha256:{file.sha256}", fname=file.name, path=cache, progressbar=False
         )

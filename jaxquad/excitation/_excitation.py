@@ -91,84 +91,66 @@ def check_guidelines(
 
     **Returns:** `Guidelines`, a tuple of `Guideline`, which prints as one line for each rule.
     """
-    rules = [_sample_rate(excitation)]
+    low, high, duration = excitation.omega_min, excitation.omega_max, excitation.duration
+    limit = 25 * high
+    rules = [
+        _guideline(
+            "sample rate",
+            2 * np.pi * excitation.sample_rate,
+            limit,
+            f"sample rate {excitation.sample_rate:.4g} Hz "
+            f"(rule: at least 25 f_max = {limit / (2 * np.pi):.4g} Hz)",
+            "Sample faster, or lower omega_max",
+        )
+    ]
     if excitation.kind in ("sweep", "multisine"):
-        rules += [_record_length(excitation), _range(excitation), _window(excitation)]
+        longest, shortest = 2 * np.pi / low, 20 * 2 * np.pi / high
+        safer = "; longer is safer" if 4 * longest <= duration < 5 * longest else ""
+        rules += [
+            _guideline(
+                "record length",
+                duration,
+                4 * longest,
+                f"record length {duration:.4g} s excited (rule: at least 4 to 5 periods of "
+                f"omega_min = {4 * longest:.4g} to {5 * longest:.4g} s){safer}",
+                "Lengthen the record, or raise omega_min",
+            ),
+            _guideline(
+                "range",
+                high / low,
+                10.0,
+                f"range omega_max / omega_min = {high / low:.4g} (rule: at least 10, a decade)",
+                "Widen the band: a narrow band does not determine a model",
+            ),
+            _guideline(
+                "window",
+                duration / 2,
+                shortest,
+                f"window {duration / 2:.4g} s, half the record "
+                f"(rule: at least 20 cycles of omega_max = {shortest:.4g} s)",
+                "Lengthen the record, or raise omega_max",
+            ),
+        ]
+        in_hertz = lambda omega: f"{omega:.4g} rad/s = {omega / (2 * np.pi):.3g} Hz"
         if omega_bandwidth is not None:
             require_all_positive(omega_bandwidth=omega_bandwidth)
-            rules.append(_low_end(excitation, omega_bandwidth))
+            limit = 0.5 * omega_bandwidth
+            said = f"low end {in_hertz(low)} (rule: at most half the bandwidth = {in_hertz(limit)})"
+            rules.append(_guideline("low end", low, limit, said, "Lower omega_min", highest=True))
         if omega_180 is not None:
             require_all_positive(omega_180=omega_180)
-            rules.append(_high_end(excitation, omega_180))
+            limit = 2.5 * omega_180
+            said = f"high end {in_hertz(high)} (rule: at least 2.5 omega_180 = {in_hertz(limit)})"
+            rules.append(_guideline("high end", high, limit, said, "Raise omega_max"))
     if excitation.kind == "sweep":
-        rules += [_lead_in(excitation), _trim(excitation)]
+        cycles = excitation.lead_in * low / (2 * np.pi)
+        said = f"lead-in {cycles:.3g} cycles of omega_min (rule: at least 2)"
+        rules.append(_guideline("lead-in", cycles, 2.0, said, "Use lead_in_cycles=2"))
+        zeros = min(excitation.lead, excitation.tail)
+        said = f"trim {zeros:.3g} s of zeros at each end (rule: at least 3 s)"
+        advice = "Use trim=3, or record 3 s of trim at each end"
+        rules.append(_guideline("trim", zeros, 3.0, said, advice))
     return Guidelines(rules)
-
-
-def _sample_rate(design: Excitation) -> Guideline:
-    value, limit = 2 * np.pi * design.sample_rate, 25 * design.omega_max
-    said = (
-        f"sample rate {design.sample_rate:.4g} Hz "
-        f"(rule: at least 25 f_max = {limit / (2 * np.pi):.4g} Hz)"
-    )
-    return _guideline("sample rate", value, limit, said, "Sample faster, or lower omega_max")
-
-
-def _record_length(design: Excitation) -> Guideline:
-    longest = 2 * np.pi / design.omega_min
-    said = (
-        f"record length {design.duration:.4g} s excited (rule: at least 4 to 5 periods of "
-        f"omega_min = {4 * longest:.4g} to {5 * longest:.4g} s)"
-    )
-    if 4 * longest <= design.duration < 5 * longest:
-        said += "; longer is safer"
-    advice = "Lengthen the record, or raise omega_min"
-    return _guideline("record length", design.duration, 4 * longest, said, advice)
-
-
-def _range(design: Excitation) -> Guideline:
-    value = design.omega_max / design.omega_min
-    said = f"range omega_max / omega_min = {value:.4g} (rule: at least 10, a decade)"
-    advice = "Widen the band: a narrow band does not determine a model"
-    return _guideline("range", value, 10.0, said, advice)
-
-
-def _window(design: Excitation) -> Guideline:
-    longest, shortest = design.duration / 2, 20 * 2 * np.pi / design.omega_max
-    said = (
-        f"window {longest:.4g} s, half the record "
-        f"(rule: at least 20 cycles of omega_max = {shortest:.4g} s)"
-    )
-    advice = "Lengthen the record, or raise omega_max"
-    return _guideline("window", longest, shortest, said, advice)
-
-
-def _low_end(design: Excitation, omega_bandwidth: Number) -> Guideline:
-    value, limit = design.omega_min, 0.5 * omega_bandwidth
-    said = f"low end {_in_hertz(value)} (rule: at most half the bandwidth = {_in_hertz(limit)})"
-    return _guideline("low end", value, limit, said, "Lower omega_min", highest=True)
-
-
-def _high_end(design: Excitation, omega_180: Number) -> Guideline:
-    value, limit = design.omega_max, 2.5 * omega_180
-    said = f"high end {_in_hertz(value)} (rule: at least 2.5 omega_180 = {_in_hertz(limit)})"
-    return _guideline("high end", value, limit, said, "Raise omega_max")
-
-
-def _lead_in(design: Excitation) -> Guideline:
-    cycles = design.lead_in * design.omega_min / (2 * np.pi)
-    said = f"lead-in {cycles:.3g} cycles of omega_min (rule: at least 2)"
-    return _guideline("lead-in", cycles, 2.0, said, "Use lead_in_cycles=2")
-
-
-def _trim(design: Excitation) -> Guideline:
-    value = min(design.lead, design.tail)
-    said = f"trim {value:.3g} s of zeros at each end (rule: at least 3 s)"
-    return _guideline("trim", value, 3.0, said, "Use trim=3, or record 3 s of trim at each end")
-
-
-def _in_hertz(omega: Number) -> str:
-    return f"{omega:.4g} rad/s = {omega / (2 * np.pi):.3g} Hz"
 
 
 def _guideline(

@@ -2,7 +2,7 @@ from collections.abc import Sequence
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from jaxquad._core import Number, require_all_positive, require_band, whole_samples
 
@@ -96,7 +96,19 @@ def multisine(
     count = whole_samples("period", period, sample_rate)
     time = np.arange(count * periods) / sample_rate
     orders = np.round(omega * period / (2 * np.pi)).astype(int)
-    wave = _least_peak(orders, _schroeder(omega, period), count)
+    # Schroeder's phases give each line a delay in proportion to the power of the lines below it;
+    # the wave is that of the lowest peak of 500, each with the phases of the clipped one before.
+    delay = period * np.arange(omega.size - 1) / omega.size
+    phase = -np.concatenate([[0.0], np.cumsum(delay * np.diff(omega))])
+    spectrum = np.zeros(count // 2 + 1, dtype=np.complex128)
+    wave, lowest = np.zeros(count), np.inf
+    for _ in range(500):
+        spectrum[orders] = np.exp(1j * phase)
+        candidate = np.fft.irfft(spectrum, count)
+        peak = np.abs(candidate).max()
+        if peak < lowest:
+            wave, lowest = candidate, peak
+        phase = np.angle(np.fft.rfft(np.clip(candidate, -0.8 * peak, 0.8 * peak))[orders])
     wave = np.roll(wave, -int(np.abs(wave).argmin()))
     return Excitation(
         time,
@@ -109,29 +121,6 @@ def multisine(
         sample_rate=float(sample_rate),
         duration=float(period * periods),
     )
-
-
-def _schroeder(omega: Lines, period: Number) -> Lines:
-    """Phases that give each line a delay in proportion to the power of the lines below it."""
-    delay = period * np.arange(omega.size - 1) / omega.size
-    return -np.concatenate([[0.0], np.cumsum(delay * np.diff(omega))])
-
-
-def _least_peak(
-    orders: Int[np.ndarray, " frequencies"], phase: Lines, count: int
-) -> Float[np.ndarray, " samples"]:
-    """The wave with the lowest peak of 500, each with the phases of the clipped previous one."""
-    spectrum = np.zeros(count // 2 + 1, dtype=np.complex128)
-    best, lowest = np.zeros(count), np.inf
-    for _ in range(500):
-        spectrum[orders] = np.exp(1j * phase)
-        wave = np.fft.irfft(spectrum, count)
-        peak = np.abs(wave).max()
-        if peak < lowest:
-            best, lowest = wave, peak
-        clipped = np.clip(wave, -0.8 * peak, 0.8 * peak)
-        phase = np.angle(np.fft.rfft(clipped)[orders])
-    return best
 
 
 def check_lines(omega: Lines, period: Number, sample_rate: Number) -> None:

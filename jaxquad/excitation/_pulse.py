@@ -1,7 +1,6 @@
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Float
 
 from jaxquad._core import Number, require_all_positive, whole_samples
 
@@ -81,30 +80,23 @@ def _pulses(
         np.asarray(steps, dtype=np.float64), whole_samples("width", width, sample_rate)
     )
     signal = amplitude * np.pad(shape, (before, after))
-    omega_min, omega_max = _half_power_band(shape, sample_rate)
+    # The band within 3 dB of the peak of the spectrum.
+    power = np.abs(np.fft.rfft(shape, 256 * shape.size)) ** 2
+    peak = int(power.argmax())
+    weak = np.flatnonzero(power < 0.5 * power[peak])
+    low = weak[weak < peak].max(initial=-1) + 1
+    high = weak[weak > peak].min(initial=power.size) - 1
+    spacing = 2 * np.pi * sample_rate / (256 * shape.size)
     return Excitation(
         np.arange(signal.size) / sample_rate,
         signal,
         np.empty(0),
         kind=kind,
-        omega_min=float(omega_min),
-        omega_max=float(omega_max),
+        omega_min=float(low * spacing),
+        omega_max=float(high * spacing),
         amplitude=float(amplitude),
         sample_rate=float(sample_rate),
         duration=float(shape.size / sample_rate),
         lead=float(lead),
         tail=float(tail),
     )
-
-
-def _half_power_band(
-    shape: Float[np.ndarray, " samples"], sample_rate: Number
-) -> tuple[float, float]:
-    power = np.abs(np.fft.rfft(shape, 256 * shape.size)) ** 2
-    peak = int(power.argmax())
-    weak = np.flatnonzero(power < 0.5 * power[peak])
-    above = weak[weak > peak]
-    low = weak[weak < peak].max(initial=-1) + 1
-    high = above.min(initial=power.size) - 1
-    spacing = 2 * np.pi * sample_rate / (256 * shape.size)
-    return float(low * spacing), float(high * spacing)

@@ -57,17 +57,37 @@ def sweep(
     require_band(omega_min, omega_max, sample_rate)
     require_all_positive(duration=duration, amplitude=amplitude)
     require_all_nonnegative(lead_in_cycles=lead_in_cycles, trim=trim)
-    lead_in = _lead_in(lead_in_cycles, omega_min, duration)
+    if lead_in_cycles != round(lead_in_cycles):
+        raise ValueError(f"lead_in_cycles is {lead_in_cycles}: use a whole number of cycles.")
+    longest = 2 * np.pi / omega_min
+    lead_in = lead_in_cycles * longest
+    if lead_in >= duration:
+        raise ValueError(
+            f"duration {duration:.6g} s leaves no time for the sweep after {lead_in_cycles} "
+            f"lead-in cycles of {longest:.6g} s: use at least 4 to 5 cycles of omega_min, "
+            f"{4 * longest:.6g} s or more."
+        )
     default = min(4 * np.pi / omega_max, duration - lead_in)
     fade_in = lead_in / 2 if fade_in is None else fade_in
     fade_out = default if fade_out is None else fade_out
-    _check_fades(fade_in, fade_out, duration)
+    require_all_nonnegative(fade_in=fade_in, fade_out=fade_out)
+    if fade_in + fade_out > duration:
+        raise ValueError(
+            f"fade_in {fade_in:.6g} s and fade_out {fade_out:.6g} s do not fit into the duration "
+            f"of {duration:.6g} s: use shorter fades."
+        )
     time = np.arange(round((duration + 2 * trim) * sample_rate) + 1) / sample_rate
     clock = time - trim
-    wave = np.sin(_phase(clock - lead_in, omega_min, omega_max, duration - lead_in))
+    # The phase is zero where the lead-in, a whole number of cycles, ends.
+    span = duration - lead_in
+    sweeping = np.clip(clock - lead_in, 0, span)
+    grown = span / _C1 * np.expm1(_C1 * sweeping / span) - sweeping
+    phase = omega_min * (clock - lead_in) + _C2 * grown * (omega_max - omega_min)
+    fades = _ramp(clock, fade_in) * _ramp(duration - clock, fade_out)
+    envelope = np.where((clock >= 0) & (clock <= duration), fades, 0.0)
     return Excitation(
         time,
-        amplitude * _envelope(clock, duration, fade_in, fade_out) * wave,
+        amplitude * envelope * np.sin(phase),
         np.empty(0),
         kind="sweep",
         omega_min=float(omega_min),
@@ -100,48 +120,10 @@ def sweep_frequency(excitation: Excitation) -> Samples:
         )
     clock = excitation.time - excitation.lead
     span = excitation.duration - excitation.lead_in
-    omega = _frequency(clock - excitation.lead_in, excitation.omega_min, excitation.omega_max, span)
+    sweeping = np.clip(clock - excitation.lead_in, 0, span)
+    band = excitation.omega_max - excitation.omega_min
+    omega = excitation.omega_min + _C2 * np.expm1(_C1 * sweeping / span) * band
     return np.where((clock >= 0) & (clock <= excitation.duration), omega, np.nan)
-
-
-def _lead_in(cycles: int, omega_min: Number, duration: Number) -> float:
-    if cycles != round(cycles):
-        raise ValueError(f"lead_in_cycles is {cycles}: use a whole number of cycles.")
-    longest = 2 * np.pi / omega_min
-    if cycles * longest >= duration:
-        raise ValueError(
-            f"duration {duration:.6g} s leaves no time for the sweep after {cycles} lead-in cycles "
-            f"of {longest:.6g} s: use at least 4 to 5 cycles of omega_min, {4 * longest:.6g} s or "
-            f"more."
-        )
-    return cycles * longest
-
-
-def _check_fades(fade_in: Number, fade_out: Number, duration: Number) -> None:
-    require_all_nonnegative(fade_in=fade_in, fade_out=fade_out)
-    if fade_in + fade_out > duration:
-        raise ValueError(
-            f"fade_in {fade_in:.6g} s and fade_out {fade_out:.6g} s do not fit into the duration "
-            f"of {duration:.6g} s: use shorter fades."
-        )
-
-
-def _frequency(clock: Samples, omega_min: Number, omega_max: Number, span: Number) -> Samples:
-    sweeping = np.clip(clock, 0, span)
-    return omega_min + _C2 * np.expm1(_C1 * sweeping / span) * (omega_max - omega_min)
-
-
-def _phase(clock: Samples, omega_min: Number, omega_max: Number, span: Number) -> Samples:
-    """Integral of the frequency; zero where the lead-in, a whole number of cycles, ends."""
-    sweeping = np.clip(clock, 0, span)
-    grown = span / _C1 * np.expm1(_C1 * sweeping / span) - sweeping
-    return omega_min * clock + _C2 * grown * (omega_max - omega_min)
-
-
-def _envelope(clock: Samples, duration: Number, fade_in: Number, fade_out: Number) -> Samples:
-    rise = _ramp(clock, fade_in)
-    fall = _ramp(duration - clock, fade_out)
-    return np.where((clock >= 0) & (clock <= duration), rise * fall, 0.0)
 
 
 def _ramp(clock: Samples, width: Number) -> Samples:

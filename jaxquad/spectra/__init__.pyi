@@ -1,14 +1,11 @@
-from ._broken_loop import (
+from ._closed_loop import (
     BrokenLoop as BrokenLoop,
+    deembed as deembed,
     Entry as Entry,
     estimate_broken_loop as estimate_broken_loop,
-)
-from ._closed_loop import (
-    deembed as deembed,
     feedback_bias as feedback_bias,
     FeedbackBias as FeedbackBias,
 )
-from ._density import spectral_density as spectral_density, SpectralDensity as SpectralDensity
 from ._error_covariance import (
     ErrorCovariance as ErrorCovariance,
     independent_errors as independent_errors,
@@ -25,3 +22,4 @@ from ._frequency_response import Distortion as Distortion, FrequencyResponse as 
 from ._lines import find_line as find_line, SpectralLine as SpectralLine
 from ._remarks import DOMINATED as DOMINATED, EARLY as EARLY, Remark as Remark
 from ._step_response import estimate_step as estimate_step, StepResponse as StepResponse
+from ._welch import spectral_density as spectral_density, SpectralDensity as SpectralDensity

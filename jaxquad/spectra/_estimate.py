@@ -20,7 +20,7 @@ from ._estimators import Composite, JointInputOutput, LocalPolynomial, Periodic,
 from ._feedback import remarks_on_feedback
 from ._frequency_response import FrequencyResponse
 from ._invariance import remarks_on_linearity
-from ._local_estimate import estimate_local_polynomial, LocalEstimate
+from ._local_polynomial import estimate_local_polynomial, LocalEstimate
 from ._periodic import estimate_periodic, PeriodicEstimate
 from ._remarks import Remark, Remarks
 from ._welch import average_windows

@@ -11,13 +11,8 @@ from jaxtyping import Bool, Complex, Float, Int
 from jaxquad.records import Record
 
 from ._checks import in_hertz
-from ._directed import Share, share_from_output
 from ._error_covariance import ErrorCovariance
 from ._remarks import DOMINATED, EARLY, Remark
-
-
-Grid = Float[np.ndarray, " frequencies"]
-Pairs = Float[np.ndarray, "frequencies outputs inputs"]
 
 
 COHERENT = 0.6  # magnitude-squared coherence from which a frequency is commonly used
@@ -28,103 +23,28 @@ _NEARLY_ALL, _MORE = 0.9, 0.5  # median shares of the input's power, output firs
 _FEWEST = 8  # frequencies for a slope
 _TOP = 4.0  # ratio of frequencies, at the top of the coherent band, over which the phase must fall
 
-
-def dominated_by_feedback(
-    direct: Float[np.ndarray, " frequencies"], by_reference: Float[np.ndarray, " frequencies"]
-) -> Bool[np.ndarray, " frequencies"]:
-    """Where input and output are coherent although the reference explains neither."""
-    return (direct >= COHERENT) & (by_reference < COHERENT)
-
-
+Grid = Float[np.ndarray, " frequencies"]
+Pairs = Float[np.ndarray, "frequencies outputs inputs"]
 Covariance = Callable[[], Complex[np.ndarray, "frequencies frequencies"]]
 
-
-class _Slope(NamedTuple):
-    """That of the phase over the top of the coherent band, in rad per rad/s."""
-
-    top: Int[np.ndarray, " top"]  # places of the frequencies
-    pull: Float[np.ndarray, " top"]  # from their phases to the slope
-    value: float
-    variance: float  # were their errors independent
-    span: float  # rad/s
-    order: float  # of the magnitude: -1 where it falls as 1/omega
-
-
-def phase_rises(
-    omega: Grid,
-    response: Complex[np.ndarray, " frequencies"],
-    error: Grid,
-    coherence: Grid,
-    covariance: Covariance | None = None,
-    clear: float = 3.0,
-) -> bool:
-    """Whether the phase increases, by `clear` standard errors, at the top of the coherent band.
-
-    Every actuator lags, so a plant's phase decreases there. That of -1/C, with a controller that
-    filters and delays, increases. Neighbours share noise, which makes a slope less certain than its
-    many points say: the response's `covariance` is asked for where these say that it rises.
-    """
-    slope = _slope_at_top(omega, response, error, coherence)
-    return slope is not None and _is_rise(slope, response, covariance, clear)
-
-
-def _slope_at_top(
-    omega: Grid, response: Complex[np.ndarray, " frequencies"], error: Grid, coherence: Grid
-) -> _Slope | None:
-    top = _top(omega, np.flatnonzero(coherence >= COHERENT))
-    if top is None:
-        return None
-    weight = 1 / np.maximum(error[top], 1e-3) ** 2
-    weight = np.minimum(weight, 4 * np.median(weight))
-    centred = omega[top] - np.average(omega[top], weights=weight)
-    level = np.unwrap(np.angle(response[top]))
-    level = level - np.average(level, weights=weight)
-    spread = np.sum(weight * centred**2)
-    pull = weight * centred / spread
-    slope = float(pull @ level)
-    scatter = np.sum(weight * (level - slope * centred) ** 2) / (len(top) - 2)
-    variance = max(float(scatter), 1.0) / spread
-    span = float(omega[top[-1]] - omega[top[0]])
-    order = np.polyfit(np.log(omega[top]), np.log(np.abs(response[top])), 1, w=np.sqrt(weight))[0]
-    return _Slope(top, pull, slope, float(variance), span, float(order))
-
-
-def _top(omega: Grid, good: Int[np.ndarray, " good"]) -> Int[np.ndarray, " top"] | None:
-    """The highest of the good places that has enough others below it, and these."""
-    for end in range(len(good), _FEWEST - 1, -1):
-        top = good[:end][omega[good[:end]] >= omega[good[end - 1]] / _TOP]
-        if len(top) >= _FEWEST:
-            return top
-    return None
-
-
-def _is_rise(
-    slope: _Slope,
-    response: Complex[np.ndarray, " frequencies"],
-    covariance: Covariance | None,
-    clear: float,
-) -> bool:
-    variance, top = slope.variance, slope.top
-    if covariance is not None and slope.value > clear * np.sqrt(variance):
-        turned = slope.pull / np.conj(response[top])
-        shared = turned.conj() @ covariance()[np.ix_(top, top)] @ turned
-        variance = max(variance, 0.5 * float(np.real(shared)))
-    return bool(slope.value > clear * np.sqrt(variance))
-
-
-class _Pair(NamedTuple):
-    """One output and one input: names, places, and the response between them."""
-
-    names: tuple[str, str]
-    place: tuple[int, int]
-    omega: Grid
-    response: Complex[np.ndarray, " frequencies"]  # 1 where unknown
-    error: Grid
-    coherence: Grid  # 0 where unknown
-
-    @property
-    def coherent(self) -> Grid:
-        return self.omega[self.coherence >= COHERENT]
+_RISES = (
+    "feedback-dominated: the phase increases with frequency at the top of the coherent "
+    "band, like that of -1/C and unlike that of any actuator; the coherence there "
+    "comes from the controller. Add excitation, and name it as the reference. Without a "
+    "controller, input and output are swapped, or the output's time stamps are at least "
+    "{lead:.2g} ms early"
+)
+_EARLY = (
+    "the phase increases with frequency at the top of the coherent band, unlike that of any "
+    "actuator, as if the output came at least {lead:.2g} ms before the input: exchange input and "
+    "output if they are swapped, or correct their time stamps"
+)
+_FED_BACK = (
+    "feedback-dominated: {share:.0f} % of the input's power (median) {where} comes from the "
+    "output's own disturbances and noise: most of the response there is -1/C, that of the "
+    "controller, and not the plant's (one without any lag in this band would look alike). Name the "
+    "external reference; without one, excite the axis, and record what excites it"
+)
 
 
 def remarks_on_feedback(
@@ -147,90 +67,34 @@ def remarks_on_feedback(
 
     remarks, clear = [], float(ndtri(1 - _CHANCE / (len(names[0]) * len(names[1]))))
     for (o, output), (i, source) in itertools.product(*map(enumerate, names)):
-        known = np.isfinite(response[:, o, i])
-        pair = _Pair(
-            (output, source),
-            (o, i),
-            omega,
-            np.where(known, response[:, o, i], 1.0),
-            np.where(known, error[:, o, i], np.inf),
-            np.where(known, coherence[:, o, i], 0.0),
-        )
+        pair = output, source
         if method == "joint":
-            explained = coherence[:, o, i], direct[:, o, i]
-            remarks += _explained_by_reference(omega, *explained, pair.names)
-        remarks += _remarks_on_phase(records, method, pair, errors, clear)
+            remarks += _explained_by_reference(omega, coherence[:, o, i], direct[:, o, i], pair)
+        finite = np.isfinite(response[:, o, i])
+        values = np.where(finite, response[:, o, i], 1.0)
+        doubt = np.where(finite, error[:, o, i], np.inf)
+        coherent = np.where(finite, coherence[:, o, i], 0.0)
+        slope = phase_slope(omega, values, doubt, coherent)
+        if slope is None:
+            continue
+        # What the phase at the top of the coherent band says, where it falls as no actuator's does.
+        covariance = None if errors is None else ft.partial(errors.between, (o, i), (o, i))
+        rises, lead = slope.rises(values, covariance, clear), 1e3 * slope.value
+        used = omega[coherent >= COHERENT]
+        if method == "joint":
+            remarks += [Remark(_EARLY.format(lead=lead), used, pair, EARLY)] if rises else []
+            continue
+        signals = [np.stack([x.outputs[:, o], x.inputs[:, i]]) for x in records]
+        share = share_from_output(signals, records[0].dt, used)
+        by_controller = _is_made_by_controller(omega, values, doubt, coherent, share)
+        if rises:
+            where = used if by_controller else omega[slope.top]
+            remarks.append(Remark(_RISES.format(lead=lead), where, pair, DOMINATED))
+        elif by_controller:
+            power = 100 * np.median(share.output_first)
+            text = _FED_BACK.format(share=power, where="{where}")
+            remarks.append(Remark(text, used, pair, DOMINATED))
     return tuple(dict.fromkeys(remarks))
-
-
-def _remarks_on_phase(
-    records: Sequence[Record],
-    method: Literal["direct", "joint"],
-    pair: _Pair,
-    errors: ErrorCovariance | None,
-    clear: float,
-) -> list[Remark]:
-    """What the phase at the top of the coherent band says, where it falls as no actuator's does."""
-    slope = _slope_at_top(pair.omega, pair.response, pair.error, pair.coherence)
-    if slope is None:
-        return []
-    covariance = None if errors is None else ft.partial(errors.between, pair.place, pair.place)
-    rises = _is_rise(slope, pair.response, covariance, clear)
-    if method == "joint":
-        text = _EARLY.format(lead=1e3 * slope.value)
-        return [Remark(text, pair.coherent, pair.names, EARLY)] if rises else []
-    share = _share_from_output(records, pair)
-    made = _is_made_by_controller(pair, share)
-    if rises:
-        text = _RISES.format(lead=1e3 * slope.value)
-        omega = pair.coherent if made else pair.omega[slope.top]
-        return [Remark(text, omega, pair.names, DOMINATED)]
-    text = _FED_BACK.format(share=100 * np.median(share.output_first), where="{where}")
-    return [Remark(text, pair.coherent, pair.names, DOMINATED)] if made else []
-
-
-def _share_from_output(records: Sequence[Record], pair: _Pair) -> Share:
-    """At the coherent frequencies."""
-    o, i = pair.place
-    signals = [np.stack([x.outputs[:, o], x.inputs[:, i]]) for x in records]
-    return share_from_output(signals, records[0].dt, pair.coherent)
-
-
-def _is_made_by_controller(pair: _Pair, share: Share) -> bool:
-    """Whether the output makes nearly all of the input at most of the coherent frequencies.
-
-    The same holds of a plant whose answer is logged beside its cause, as far as nothing else moves
-    either. It lags: where the output makes the input, its phase and magnitude fall. Where they do,
-    the input's past must follow the output's, too.
-    """
-    if np.median(share.output_first) <= _NEARLY_ALL:
-        return False
-    if np.median(share.input_first) > _MORE:
-        return True
-    level = np.zeros(pair.omega.size)
-    level[pair.coherence >= COHERENT] = share.output_first > _NEARLY_ALL
-    slope = _slope_at_top(pair.omega, pair.response, pair.error, level)
-    return slope is not None and slope.value * slope.span >= -_FALLS and slope.order >= -_LESS
-
-
-_RISES = (
-    "feedback-dominated: the phase increases with frequency at the top of the coherent "
-    "band, like that of -1/C and unlike that of any actuator; the coherence there "
-    "comes from the controller. Add excitation, and name it as the reference. Without a "
-    "controller, input and output are swapped, or the output's time stamps are at least "
-    "{lead:.2g} ms early"
-)
-_EARLY = (
-    "the phase increases with frequency at the top of the coherent band, unlike that of any "
-    "actuator, as if the output came at least {lead:.2g} ms before the input: exchange input and "
-    "output if they are swapped, or correct their time stamps"
-)
-_FED_BACK = (
-    "feedback-dominated: {share:.0f} % of the input's power (median) {where} comes from the "
-    "output's own disturbances and noise: most of the response there is -1/C, that of the "
-    "controller, and not the plant's (one without any lag in this band would look alike). Name the "
-    "external reference; without one, excite the axis, and record what excites it"
-)
 
 
 def _explained_by_reference(
@@ -246,3 +110,181 @@ def _explained_by_reference(
         "no information on the plant. Excite these frequencies by the reference"
     )
     return [Remark(text, pair=pair, kind=DOMINATED)]
+
+
+def dominated_by_feedback(direct: Grid, by_reference: Grid) -> Bool[np.ndarray, " frequencies"]:
+    """Where input and output are coherent although the reference explains neither."""
+    return (direct >= COHERENT) & (by_reference < COHERENT)
+
+
+class PhaseSlope(NamedTuple):
+    """That of the phase over the top of the coherent band, in rad per rad/s."""
+
+    top: Int[np.ndarray, " top"]  # places of the frequencies
+    pull: Float[np.ndarray, " top"]  # from their phases to the slope
+    value: float
+    variance: float  # were their errors independent
+    span: float  # rad/s
+    order: float  # of the magnitude: -1 where it falls as 1/omega
+
+    def rises(
+        self,
+        response: Complex[np.ndarray, " frequencies"],
+        covariance: Covariance | None = None,
+        clear: float = 3.0,
+    ) -> bool:
+        """Whether the phase increases, by `clear` standard errors.
+
+        Every actuator lags, so a plant's phase decreases there. That of -1/C, with a controller
+        that filters and delays, increases. Neighbours share noise, which makes a slope less certain
+        than its many points say: the response's `covariance` is asked for where these say that it
+        rises.
+        """
+        variance, top = self.variance, self.top
+        if covariance is not None and self.value > clear * np.sqrt(variance):
+            turned = self.pull / np.conj(response[top])
+            shared = turned.conj() @ covariance()[np.ix_(top, top)] @ turned
+            variance = max(variance, 0.5 * float(np.real(shared)))
+        return bool(self.value > clear * np.sqrt(variance))
+
+
+def phase_slope(
+    omega: Grid, response: Complex[np.ndarray, " frequencies"], error: Grid, coherence: Grid
+) -> PhaseSlope | None:
+    """At the highest coherent frequency that has enough others below it; `None` without any."""
+    good, top = np.flatnonzero(coherence >= COHERENT), np.zeros(0, int)
+    for end in range(len(good), _FEWEST - 1, -1):
+        top = good[:end][omega[good[:end]] >= omega[good[end - 1]] / _TOP]
+        if len(top) >= _FEWEST:
+            break
+    if len(top) < _FEWEST:
+        return None
+    weight = 1 / np.maximum(error[top], 1e-3) ** 2
+    weight = np.minimum(weight, 4 * np.median(weight))
+    centred = omega[top] - np.average(omega[top], weights=weight)
+    level = np.unwrap(np.angle(response[top]))
+    level = level - np.average(level, weights=weight)
+    spread = np.sum(weight * centred**2)
+    pull = weight * centred / spread
+    slope = float(pull @ level)
+    scatter = np.sum(weight * (level - slope * centred) ** 2) / (len(top) - 2)
+    variance = max(float(scatter), 1.0) / spread
+    span = float(omega[top[-1]] - omega[top[0]])
+    order = np.polyfit(np.log(omega[top]), np.log(np.abs(response[top])), 1, w=np.sqrt(weight))[0]
+    return PhaseSlope(top, pull, slope, float(variance), span, float(order))
+
+
+def _is_made_by_controller(
+    omega: Grid,
+    response: Complex[np.ndarray, " frequencies"],
+    error: Grid,
+    coherence: Grid,
+    share: "Share",
+) -> bool:
+    """Whether the output makes nearly all of the input at most of the coherent frequencies.
+
+    The same holds of a plant whose answer is logged beside its cause, as far as nothing else moves
+    either. It lags: where the output makes the input, its phase and magnitude fall. Where they do,
+    the input's past must follow the output's, too.
+    """
+    if np.median(share.output_first) <= _NEARLY_ALL:
+        return False
+    if np.median(share.input_first) > _MORE:
+        return True
+    level = np.zeros(omega.size)
+    level[coherence >= COHERENT] = share.output_first > _NEARLY_ALL
+    slope = phase_slope(omega, response, error, level)
+    return slope is not None and slope.value * slope.span >= -_FALLS and slope.order >= -_LESS
+
+
+_ORDER = 12  # samples of both that the model remembers
+_ENOUGH = 20 * _ORDER  # samples for a model
+_LEVELS = (16.0, 4.0, 2.0, 1.0)  # half the sample rate over the highest frequency of interest
+_ROUNDING = 1e-9  # of a signal's power, added as white noise: what rounding may make
+_CONFIRMED = 0.5  # of the largest median share, at the highest rate
+_EXACT = 1e-7  # of its power: new parts of the output below it say nothing
+
+
+class Share(NamedTuple):
+    """Of the input's power at each frequency, that which the output's innovations make.
+
+    Innovations are what the past of both signals does not predict. What both have in common at one
+    sample counts as the output's in `output_first`, because a plant takes time to answer, and as
+    the input's in `input_first`, because a logger may write an answer beside its cause.
+    """
+
+    output_first: Grid
+    input_first: Grid
+
+
+def share_from_output(
+    records: Sequence[Float[np.ndarray, "2 _samples"]], dt: float, omega: Grid
+) -> Share:
+    """The directed share of Geweke (1982); zero where the records are too short for a model.
+
+    It is that of a joint autoregressive model of both. At which sample rate innovations tell a
+    loop's directions apart depends on its noise: of several rates, the one with the largest median
+    counts. At a rate so slow that a plant answers within one sample, it can be mistaken for its
+    controller: the highest rate has to show half of it, too.
+
+    **Arguments:**
+
+    - `records`: output and input, sampled every `dt` seconds.
+    - `omega`: frequencies in rad/s, increasing.
+    """
+    flat = []
+    for x in records:  # without offset and trend, in units of the standard deviation
+        time = np.linspace(-1.0, 1.0, x.shape[1])
+        slope = x @ time / (time @ time)
+        flat.append(x - np.mean(x, axis=1, keepdims=True) - slope[:, None] * time)
+    squares = sum(np.einsum("cs,cs->c", x, x) for x in flat)
+    size = np.sqrt(squares / sum(x.shape[1] for x in flat))
+    signals = [x / np.maximum(size, 1e-300)[:, None] for x in flat]
+    shares = [Share(np.zeros(omega.size), np.zeros(omega.size))]
+    for every in dict.fromkeys(max(int(np.pi / (dt * n * omega[-1])), 1) for n in _LEVELS):
+        slow = []
+        for x in signals:  # every so many samples, of what lies below half the new rate
+            if x.shape[1] < 2 * _ORDER * every:
+                continue
+            count = x.shape[1] // every
+            spectrum = np.fft.rfft(x[:, : count * every])[:, : count // 2 + 1]
+            slow.append(x if every == 1 else np.fft.irfft(spectrum, count))
+        samples = sum(x.shape[1] - _ORDER for x in slow)
+        if samples >= _ENOUGH:
+            products = sum(lagged_products(x) for x in slow) / samples
+            products += _ROUNDING * np.diag(np.tile(np.diag(products)[:2], _ORDER + 1))
+            shares.append(_share_at(products, omega * dt * every))
+    medians = [float(np.median(share.output_first)) for share in shares]
+    best, quickest = int(np.argmax(medians)), min(1, len(shares) - 1)
+    return shares[best if medians[quickest] > _CONFIRMED * medians[best] else quickest]
+
+
+def lagged_products(x: Float[np.ndarray, "2 samples"]) -> Float[np.ndarray, "lags lags"]:
+    """Sums of x[t - i] and x[t - j] over t: by their distance, but for the record's ends."""
+    n, p = x.shape[1], _ORDER
+    sums = np.zeros((p + 1, 2, p + 1, 2))
+    for k in range(p + 1):
+        i, s = np.arange(p + 1 - k), np.arange(p - k)
+        first, last = p - 1 - s, n - 1 - s
+        entering = np.einsum("as,bs->sab", x[:, first], x[:, first - k])
+        leaving = np.einsum("as,bs->sab", x[:, last], x[:, last - k])
+        blocks = np.zeros((p + 1 - k, 2, 2)) + x[:, p:] @ x[:, p - k : n - k].T
+        blocks[1:] += np.cumsum(entering - leaving, axis=0)
+        sums[i, :, i + k], sums[i + k, :, i] = blocks, blocks.transpose(0, 2, 1)
+    return sums.reshape(2 * p + 2, 2 * p + 2)
+
+
+def _share_at(products: Float[np.ndarray, "lags lags"], angle: Grid) -> Share:
+    """By the model's response at these angles per sample."""
+    past = np.linalg.solve(products[2:, 2:], products[2:, :2])
+    new = products[:2, :2] - products[:2, 2:] @ past
+    if not new[0, 0] > _EXACT * products[0, 0]:
+        return Share(np.zeros(angle.size), np.zeros(angle.size))
+    # From the innovations of output and input to the input.
+    late = np.exp(-1j * angle[:, None] * np.arange(1, _ORDER + 1))
+    taken = np.einsum("fk,kij->fji", late, past.reshape(_ORDER, 2, 2))
+    from_output, from_input = paths = np.linalg.inv(np.eye(2) - taken)[:, 1].T
+    power = np.maximum(np.einsum("if,ij,jf->f", paths.conj(), new, paths).real, 1e-300)
+    both = new[0, 0] * np.abs(from_output + new[1, 0] / new[0, 0] * from_input) ** 2
+    alone = max(new[0, 0] - new[0, 1] ** 2 / max(new[1, 1], 1e-300), 0.0)
+    return Share(both / power, alone * np.abs(from_output) ** 2 / power)

@@ -26,7 +26,7 @@ _THIN = 256  # samples that show a constant well enough
 _TRENDS = ("none", "constant", "linear")
 
 Angles = Float[np.ndarray, " frequencies"]
-Sums = Complex[np.ndarray, "frequencies channels windows"]
+Sums = Complex[np.ndarray, "frequencies _ windows"]
 
 
 class Taper(NamedTuple):

@@ -25,15 +25,15 @@ def check_count_of_references(record: Record, inputs: int) -> None:
 
 def joint_factors(fit: LocalFit, inputs: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Where T_ru has an inverse, [-G, 1], and that inverse: dG = [-G, 1] dT T_ru^-1."""
-    known = np.isfinite(fit.response[:, 0, 0])
-    through = np.where(known[:, None, None], fit.response[:, :inputs], np.eye(inputs))
+    invertible = fit.determined
+    through = np.where(invertible[:, None, None], fit.response[:, :inputs], np.eye(inputs))
     strength = np.linalg.svd(through, compute_uv=False)
-    known &= strength[:, -1] > _DEPENDENT * strength[:, 0]
-    back = np.linalg.inv(np.where(known[:, None, None], through, np.eye(inputs)))
+    invertible &= strength[:, -1] > _DEPENDENT * strength[:, 0]
+    back = np.linalg.inv(np.where(invertible[:, None, None], through, np.eye(inputs)))
     response = fit.response[:, inputs:] @ back
     outputs = response.shape[1]
     ones = np.broadcast_to(np.eye(outputs), (len(back), outputs, outputs))
-    return known, np.concatenate([-response, ones], axis=2), back
+    return invertible, np.concatenate([-response, ones], axis=2), back
 
 
 def joint_fit(fit: LocalFit, inputs: int) -> LocalFit:
@@ -43,9 +43,9 @@ def joint_fit(fit: LocalFit, inputs: int) -> LocalFit:
     references taken through T_ru^-1. Source: Pintelon and Schoukens, System Identification,
     2nd ed., section 2.6 (several inputs: 7.2.7).
     """
-    known, left, back = joint_factors(fit, inputs)
+    invertible, left, back = joint_factors(fit, inputs)
     through, response = fit.response[:, :inputs], -left[:, :, :inputs]
-    blank = np.where(known, 1.0, np.nan)[:, None, None]
+    blank = np.where(invertible, 1.0, np.nan)[:, None, None]
     effect = np.swapaxes(back, 1, 2) @ fit.effect * blank
     scatter = left @ fit.scatter @ _adjoint(left) * blank
     boosted = left * fit.boost[:, None, :]
@@ -53,7 +53,7 @@ def joint_fit(fit: LocalFit, inputs: int) -> LocalFit:
     boost = np.sqrt(boosted / np.maximum(_diagonal(scatter), 1e-300))
     gain = boost[:, :, None] ** 2 * np.vecdot(effect, effect).real[:, None, :]
     power = through @ fit.power @ _adjoint(through)
-    freedom = np.where(known, fit.freedom, 0.0)
+    freedom = np.where(invertible, fit.freedom, 0.0)
     return LocalFit(response * blank, effect, boost, gain, fit.first, scatter, freedom, power)
 
 
@@ -87,10 +87,10 @@ def share_of_inputs(
     `left` is [-G, 1]; half of what both make together counts.
     """
     root = noise.root()[at]
-    whole = left @ root
+    total = left @ root
     of_inputs = left[:, :, :inputs] @ root[:, :inputs]
-    power = np.vecdot(whole, whole).real
-    mine = np.sum(np.real(of_inputs * np.conj(whole)), axis=2)
+    power = np.vecdot(total, total).real
+    mine = np.sum(np.real(of_inputs * np.conj(total)), axis=2)
     share = np.clip(mine / np.maximum(power, 1e-300), 0.0, 1.0)
     return np.repeat(share[:, :, None], inputs, axis=2)
 
@@ -102,10 +102,10 @@ def find_unmoved(
 
     There the joint ratio is that of two noises: -1 over the controller, with hardly any residual.
     """
-    known, _, back = joint_factors(moved, inputs)
+    invertible, _, back = joint_factors(moved, inputs)
     effect = np.sum(np.abs(np.swapaxes(back, 1, 2) @ moved.effect) ** 2, axis=2)
     relative = np.sqrt(noise.power[at][:, :inputs] * effect / 2)
-    return known & np.any(relative > DIVISIBLE, axis=1)
+    return invertible & np.any(relative > DIVISIBLE, axis=1)
 
 
 def _diagonal(x: Complex[np.ndarray, "frequencies a a"]) -> Float[np.ndarray, "frequencies a"]:

@@ -1,9 +1,11 @@
-"""Averages over the periods of a periodic excitation, at its own harmonics."""
+"""Averages over the periods of a periodic excitation, at its own harmonics.
+
+Source: Pintelon and Schoukens, System Identification, 2nd ed., sections 2.5 and 4.3.1.
+"""
 
 from collections.abc import Sequence
 from typing import Literal, NamedTuple
 
-import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
 
@@ -19,9 +21,19 @@ from ._remarks import Remark
 
 _CHANCE = 1e-4  # of taking noise for an excited line, for distortion, or for a line in the noise
 _FAINT = 1e-4  # power of a line, to that of the strongest, below which it counts as unexcited
+_DEPENDENT = 1e-8  # smallest singular value of the inputs' cross powers, to the largest
+_ROUNDING = 1e-24  # power of rounding errors, to that of the output
+_UNKNOWN = 1e60  # error of what is not determined: infinity, but products with zero are zero
+_UNSETTLED = 4.0  # power of the first period's departure, to that of the noise
+
+Lines = Int[np.ndarray, " frequencies"]
+Averages = Complex[np.ndarray, "frequencies _ realisations"]  # over a record's periods
+Levels = Float[np.ndarray, "frequencies outputs"]
+Pairs = Float[np.ndarray, "frequencies outputs inputs"]
+Covariances = Complex[np.ndarray, "frequencies outputs outputs"]
 
 
-class Periods(eqx.Module):
+class Periods(NamedTuple):
     """Transforms of one record's periods: their mean, and the covariance of a single one.
 
     Scaled so that noise of unit variance has unit power; channels are in the order of
@@ -30,8 +42,8 @@ class Periods(eqx.Module):
 
     mean: Complex[np.ndarray, "lines channels"]
     covariance: Complex[np.ndarray, "lines channels channels"]  # of a single period
-    count: int = eqx.field(static=True)
-    settled: float = eqx.field(static=True)  # difference of the first period, relative to noise
+    count: int
+    departure: float  # power of the first period's difference, to that by noise
 
 
 def record_periods(record: Record, options: Periodic) -> Periods:
@@ -54,33 +66,21 @@ def record_periods(record: Record, options: Periodic) -> Periods:
     mean = spectra.mean(axis=0)
     deviation = spectra - mean
     covariance = np.einsum("mka,mkb->kab", deviation, np.conj(deviation)) / (count - 1)
-    return Periods(mean, covariance, count, _departure(spectra, record.inputs.shape[1]))
+    departure = 1.0
+    if count > 2:
+        first, later = spectra[0], spectra[1:]
+        scatter = np.sum(np.abs(later - later.mean(axis=0)) ** 2, axis=0) / (count - 2)
+        power = np.abs(first - later.mean(axis=0)) ** 2 / (1 + 1 / (count - 1))
+        slow = slice(0, max(len(first) // 20, 8))  # A transient is slow, most noise is not.
+        ratio = np.sum(power[slow], axis=0) / np.maximum(np.sum(scatter[slow], axis=0), 1e-300)
+        departure = float(np.max(ratio[record.inputs.shape[1] :]))
+    return Periods(mean, covariance, count, departure)
 
 
-def _departure(spectra: Complex[np.ndarray, "periods lines channels"], inputs: int) -> float:
-    """Power of the first period's difference from the later ones, relative to that by noise."""
-    if len(spectra) < 3:
-        return 1.0
-    first, later = spectra[0], spectra[1:]
-    scatter = np.sum(np.abs(later - later.mean(axis=0)) ** 2, axis=0) / (len(later) - 1)
-    deviation = np.abs(first - later.mean(axis=0)) ** 2 / (1 + 1 / len(later))
-    slow = slice(0, max(len(first) // 20, 8))  # A transient is slow, most noise is not.
-    ratio = np.sum(deviation[slow], axis=0) / np.maximum(np.sum(scatter[slow], axis=0), 1e-300)
-    return float(np.max(ratio[inputs:]))
-
-
-def line_frequencies(record: Record, options: Periodic) -> Float[np.ndarray, " lines"]:
-    """All harmonics below the Nyquist frequency, in rad/s."""
-    samples = options.samples(record)
-    return 2 * np.pi * np.arange(1, (samples - 1) // 2 + 1) / (samples * record.dt)
-
-
-def pooled(
-    periods: Sequence[Periods],
-) -> Complex[np.ndarray, "lines channels channels"]:
+def pooled(periods: Sequence[Periods]) -> Complex[np.ndarray, "lines channels channels"]:
     """Covariance of all channels' noise in a single period, over all records."""
-    weights = [float(each.count - 1) for each in periods]
-    sums = sum(w * each.covariance for w, each in zip(weights, periods, strict=True))
+    weights = [float(one.count - 1) for one in periods]
+    sums = sum(w * one.covariance for w, one in zip(weights, periods, strict=True))
     return np.asarray(sums) / sum(weights)
 
 
@@ -88,31 +88,22 @@ def excited_lines(periods: Sequence[Periods], channels: slice) -> Int[np.ndarray
     """Places of the harmonics at which one of `channels` has power beyond its noise."""
     from scipy.special import fdtri
 
-    power = np.mean([np.abs(each.mean[:, channels]) ** 2 for each in periods], axis=0)
+    power = np.mean([np.abs(one.mean[:, channels]) ** 2 for one in periods], axis=0)
     noise = np.real(np.diagonal(pooled(periods), axis1=1, axis2=2))[:, channels]
-    noise = noise * np.mean([1 / each.count for each in periods])
-    freedom = 2.0 * sum(each.count - 1 for each in periods)
+    noise = noise * np.mean([1 / one.count for one in periods])
+    freedom = 2.0 * sum(one.count - 1 for one in periods)
     clear = power > fdtri(2.0 * len(periods), freedom, 1 - _CHANCE / len(power)) * noise
     return np.flatnonzero(np.any(clear & (power > _FAINT * np.max(power, axis=0)), axis=1))
 
 
-_DEPENDENT = 1e-8  # smallest singular value of the inputs' cross powers, to the largest
-_ROUNDING = 1e-24  # power of rounding errors, to that of the output
-
-Lines = Int[np.ndarray, " frequencies"]
-Averaged = Complex[np.ndarray, "frequencies channels realisations"]
-Levels = Float[np.ndarray, "frequencies outputs"]
-Covariances = Complex[np.ndarray, "frequencies outputs outputs"]
-
-
-class Averages(NamedTuple):
+class Fit(NamedTuple):
     """The error of `response` is `sum_r v[f, o, r] effect[f, i, r]`, v the averages' noise."""
 
     u: Complex[np.ndarray, "frequencies inputs realisations"]
     y: Complex[np.ndarray, "frequencies outputs realisations"]
     response: Complex[np.ndarray, "frequencies outputs inputs"]
     effect: Complex[np.ndarray, "frequencies inputs realisations"]
-    known: Bool[np.ndarray, " frequencies"]
+    determined: Bool[np.ndarray, " frequencies"]
 
 
 class Scatter(NamedTuple):
@@ -131,24 +122,21 @@ class Scatter(NamedTuple):
         return np.maximum(total - self.noise, 0.0)
 
 
-def instrumental(u: Averaged, y: Averaged, z: Averaged) -> Averages:
+def instrumental(u: Averages, y: Averages, z: Averages) -> Fit:
     """G = Y Z^H (U Z^H)^-1 at each line."""
     adjoint = np.conj(np.swapaxes(z, 1, 2))
     cross = u @ adjoint
     size = np.linalg.norm(u, axis=2)[:, :, None] * np.linalg.norm(z, axis=2)[:, None, :]
     strength = np.linalg.svd(cross / np.maximum(size, 1e-300), compute_uv=False)
-    known = strength[:, -1] > _DEPENDENT * np.maximum(strength[:, 0], 1e-300)
-    inverse = np.linalg.inv(np.where(known[:, None, None], cross, np.eye(u.shape[1])))
+    determined = strength[:, -1] > _DEPENDENT * np.maximum(strength[:, 0], 1e-300)
+    inverse = np.linalg.inv(np.where(determined[:, None, None], cross, np.eye(u.shape[1])))
     effect = np.swapaxes(adjoint @ inverse, 1, 2)
     response = np.swapaxes(effect @ np.swapaxes(y, 1, 2), 1, 2)
-    return Averages(u, y, response, effect, known)
+    return Fit(u, y, response, effect, determined)
 
 
 def estimate_scatter(
-    omega: Float[np.ndarray, " frequencies"],
-    fit: Averages,
-    periods: Sequence[Periods],
-    lines: Lines,
+    omega: Float[np.ndarray, " frequencies"], fit: Fit, periods: Sequence[Periods], lines: Lines
 ) -> Scatter:
     """Noise between periods, from v = y - G u, and scatter between realisations.
 
@@ -158,23 +146,21 @@ def estimate_scatter(
     from scipy.special import fdtri
 
     inputs, outputs = fit.u.shape[1], fit.y.shape[1]
-    count = 1 / float(np.mean([1 / each.count for each in periods]))
-    freedom = float(sum(each.count - 1 for each in periods))
-    left = np.concatenate(
-        [-fit.response, np.broadcast_to(np.eye(outputs), (len(lines), outputs, outputs))], axis=2
-    )
-    channels = slice(0, inputs + outputs)
+    count = 1 / float(np.mean([1 / one.count for one in periods]))
+    freedom = float(sum(one.count - 1 for one in periods))
+    ones = np.broadcast_to(np.eye(outputs), (len(lines), outputs, outputs))
+    left, channels = np.concatenate([-fit.response, ones], axis=2), slice(0, inputs + outputs)
     covariance = pooled(periods)[lines][:, channels, channels] / count
     noise = left @ covariance @ np.conj(np.swapaxes(left, 1, 2))
-    power, root = _smooth(omega, noise, freedom, fit.known)
+    power, root = _smooth(omega, noise, freedom, fit.determined)
     spare = float(fit.u.shape[2] - inputs)
     if spare <= 0:
         return Scatter(power, None, np.zeros(outputs, bool), root, count, freedom)
     residual = fit.y - fit.response @ fit.u
     between = residual @ np.conj(np.swapaxes(residual, 1, 2)) / spare
-    total, total_root = _smooth(omega, between, spare, fit.known)
-    ratio = np.sum(_diagonal(between) / power * fit.known[:, None], axis=0)
-    size = 2.0 * max(np.sum(fit.known), 1)
+    total, total_root = _smooth(omega, between, spare, fit.determined)
+    ratio = np.sum(_diagonal(between) / power * fit.determined[:, None], axis=0)
+    size = 2.0 * max(np.sum(fit.determined), 1)
     ratio = 2 * ratio / size
     significant = ratio > fdtri(size * spare, size * freedom, 1 - _CHANCE)
     # Rounding errors repeat from period to period, and not from one realisation to the next.
@@ -190,13 +176,13 @@ def _smooth(
     omega: Float[np.ndarray, " frequencies"],
     covariance: Covariances,
     freedom: float,
-    known: Bool[np.ndarray, " frequencies"],
+    determined: Bool[np.ndarray, " frequencies"],
 ) -> tuple[Levels, Covariances]:
     """Powers and roots, smooth along frequency except at lines that stand out."""
     from scipy.special import gammaincinv
 
     spacing = np.gradient(omega) if omega.size > 1 else omega
-    smooth = smooth_noise(omega, spacing, covariance, np.where(known, freedom, 0.0))
+    smooth = smooth_noise(omega, spacing, covariance, np.where(determined, freedom, 0.0))
     raw = _diagonal(covariance)
     high = gammaincinv(freedom, 1 - _CHANCE) / freedom
     power = np.where(raw > high * smooth.power, raw, smooth.power)
@@ -207,20 +193,14 @@ def _diagonal(x: Covariances) -> Levels:
     return np.real(np.diagonal(x, axis1=1, axis2=2))
 
 
-_UNKNOWN = 1e60  # error of what is not determined: infinity, but products with zero are zero
-_UNSETTLED = 4.0  # power of the first period's departure, to that of the noise
-
-Coherence = Float[np.ndarray, "frequencies outputs inputs"]
-
-
 class PeriodicEstimate(NamedTuple):
     """Responses at the excited lines; nan and a huge error where undetermined."""
 
     omega: Float[np.ndarray, " frequencies"]  # rad/s
     response: Complex[np.ndarray, "frequencies outputs inputs"]
-    coherence: Float[np.ndarray, "frequencies outputs inputs"]
-    direct_coherence: Float[np.ndarray, "frequencies outputs inputs"]
-    multiple_coherence: Float[np.ndarray, "frequencies outputs"]  # of an output with all inputs
+    coherence: Pairs
+    direct_coherence: Pairs
+    multiple_coherence: Levels  # of an output with all inputs
     errors: ErrorCovariance
     distortion: Distortion
     log_noise_covariance: Float[np.ndarray, "frequencies frequencies"]
@@ -229,7 +209,7 @@ class PeriodicEstimate(NamedTuple):
 
 def estimate_periodic(
     records: Sequence[Record],
-    omega: Float[np.ndarray, " asked"] | None,
+    omega: Float[np.ndarray, " response"] | None,
     options: Periodic,
     method: Literal["direct", "joint"],
 ) -> PeriodicEstimate:
@@ -244,24 +224,54 @@ def estimate_periodic(
     _check(records, inputs, options, method)
     periods = [record_periods(record, options) for record in records]
     first = inputs + outputs if method == "joint" else 0
-    instruments = slice(first, first + inputs)
-    grid = line_frequencies(records[0], options)
-    lines = _chosen(excited_lines(periods, instruments), grid, omega)
-    averages = np.stack([each.mean[lines] for each in periods], axis=2)
+    instruments, samples = slice(first, first + inputs), options.samples(records[0])
+    harmonics = np.arange(1, (samples - 1) // 2 + 1)  # below the Nyquist frequency
+    grid = 2 * np.pi * harmonics / (samples * records[0].dt)
+    lines = _choose_lines(excited_lines(periods, instruments), grid, omega)
+    averages, omega = np.stack([one.mean[lines] for one in periods], axis=2), grid[lines]
     u, y, z = averages[:, :inputs], averages[:, inputs : inputs + outputs], averages[:, instruments]
     fit = instrumental(u, y, z)
-    scatter = estimate_scatter(grid[lines], fit, periods, lines)
-    direct, lesser = _coherence(fit, scatter, periods, lines)
+    scatter = estimate_scatter(omega, fit, periods, lines)
+    determined = fit.determined[:, None, None]
+    # Coherence is that of one period: the share of an output that an input explains, and of the
+    # joint estimate the smaller of that and of the repeated share of the input.
+    power = np.einsum("fir,fjr->fij", u, np.conj(u)) / u.shape[2]
+    inverse = np.linalg.inv(np.where(determined, power, np.eye(inputs)))
+    alone = 1 / np.real(np.diagonal(inverse, axis1=1, axis2=2))
+    explained = np.abs(fit.response) ** 2 * alone[:, None, :]
+    left = scatter.noise * scatter.periods + scatter.nonlinear()
+    direct = np.where(determined, explained / (explained + left[:, :, None]), 0.0)
+    jitter = np.real(np.diagonal(pooled(periods)[lines], axis1=1, axis2=2))[:, :inputs]
+    steady = np.minimum(direct, (alone / (alone + jitter))[:, None, :] * determined)
+    together = np.mean(np.abs(np.nan_to_num(fit.response) @ u) ** 2, axis=2)
+    # The noise of each line is independent: as many atoms as inputs at each.
+    kernel = np.einsum("fir,fjr->fij", fit.effect, np.conj(fit.effect))
+    kernel = np.where(determined, kernel, _UNKNOWN**2 * np.eye(inputs))
+    values, vectors = np.linalg.eigh(kernel)
+    effect = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
+    noise = np.where(determined, scatter.root, np.eye(outputs))
+    weight = np.where(fit.determined, scatter.freedom, 1e-9)
+    blank = np.nan if scatter.total is None else 1.0
+    total = scatter.noise if scatter.total is None else scatter.total
     return PeriodicEstimate(
-        grid[lines],
-        np.where(fit.known[:, None, None], fit.response, np.nan),
-        lesser if method == "joint" else direct,
+        omega,
+        np.where(determined, fit.response, np.nan),
+        steady if method == "joint" else direct,
         direct,
-        _multiple(fit, scatter),
-        _errors(grid[lines], fit, scatter),
-        _distortion(grid[lines], fit, scatter, records[0], len(records)),
-        _log_noise_covariance(grid[lines], fit, scatter),
-        _remarks(grid[lines], fit, scatter, periods),
+        together / (together + scatter.noise * scatter.periods + scatter.nonlinear()),
+        ErrorCovariance(omega, effect, noise, first=inputs * np.arange(omega.size)),
+        Distortion(
+            omega,
+            np.sqrt(np.mean(np.abs(fit.response @ u) ** 2, axis=2)),
+            np.sqrt(scatter.noise),
+            np.sqrt(total) * blank,
+            np.sqrt(scatter.nonlinear()) * blank,
+            scatter.significant,
+            records[0].output_names,
+            len(records),
+        ),
+        smoothed(omega, np.eye(omega.size) / scatter.freedom, weight),
+        _remarks(omega, fit, scatter, periods),
     )
 
 
@@ -289,10 +299,10 @@ def _check(
         )
 
 
-def _chosen(
+def _choose_lines(
     lines: Int[np.ndarray, " excited"],
     grid: Float[np.ndarray, " lines"],
-    omega: Float[np.ndarray, " asked"] | None,
+    omega: Float[np.ndarray, " response"] | None,
 ) -> Int[np.ndarray, " chosen"]:
     """The excited lines, or those of `omega`."""
     if lines.size == 0:
@@ -312,89 +322,21 @@ def _chosen(
     return nearest
 
 
-def _coherence(
-    fit: Averages, scatter: Scatter, periods: Sequence[Periods], lines: Lines
-) -> tuple[Coherence, Coherence]:
-    """Of one period: the share of an output that an input explains, and the smaller of that and
-    of the repeated share of the input."""
-    inputs = fit.u.shape[1]
-    power = np.einsum("fir,fjr->fij", fit.u, np.conj(fit.u)) / fit.u.shape[2]
-    power = np.where(fit.known[:, None, None], power, np.eye(inputs))
-    alone = 1 / np.real(np.diagonal(np.linalg.inv(power), axis1=1, axis2=2))
-    explained = np.abs(fit.response) ** 2 * alone[:, None, :]
-    left = scatter.noise * scatter.periods + scatter.nonlinear()
-    direct = np.where(fit.known[:, None, None], explained / (explained + left[:, :, None]), 0.0)
-    jitter = pooled(periods)[lines][:, :inputs, :inputs]
-    steady = alone / (alone + np.real(np.diagonal(jitter, axis1=1, axis2=2)))
-    return direct, np.minimum(direct, steady[:, None, :] * fit.known[:, None, None])
-
-
-def _multiple(fit: Averages, scatter: Scatter) -> Float[np.ndarray, "frequencies outputs"]:
-    """Of one period: the share of an output that all inputs together explain."""
-    explained = np.mean(np.abs(np.nan_to_num(fit.response) @ fit.u) ** 2, axis=2)
-    return explained / (explained + scatter.noise * scatter.periods + scatter.nonlinear())
-
-
-def _errors(
-    omega: Float[np.ndarray, " frequencies"], fit: Averages, scatter: Scatter
-) -> ErrorCovariance:
-    """The noise of each line is independent: as many atoms as inputs at each."""
-    count, inputs, _ = fit.effect.shape
-    kernel = np.einsum("fir,fjr->fij", fit.effect, np.conj(fit.effect))
-    kernel = np.where(fit.known[:, None, None], kernel, _UNKNOWN**2 * np.eye(inputs))
-    values, vectors = np.linalg.eigh(kernel)
-    root = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
-    noise = np.where(fit.known[:, None, None], scatter.root, np.eye(scatter.root.shape[1]))
-    return ErrorCovariance(omega, root, noise, first=inputs * np.arange(count))
-
-
-def _log_noise_covariance(
-    omega: Float[np.ndarray, " frequencies"], fit: Averages, scatter: Scatter
-) -> Float[np.ndarray, "frequencies frequencies"]:
-    weight = np.where(fit.known, scatter.freedom, 1e-9)
-    return smoothed(omega, np.eye(omega.size) / scatter.freedom, weight)
-
-
-def _distortion(
-    omega: Float[np.ndarray, " frequencies"],
-    fit: Averages,
-    scatter: Scatter,
-    record: Record,
-    realisations: int,
-) -> Distortion:
-    explained = np.abs(fit.response @ fit.u) ** 2
-    unknown = np.nan if scatter.total is None else 1.0
-    total = scatter.noise if scatter.total is None else scatter.total
-    return Distortion(
-        omega,
-        np.sqrt(np.mean(explained, axis=2)),
-        np.sqrt(scatter.noise),
-        np.sqrt(total) * unknown,
-        np.sqrt(scatter.nonlinear()) * unknown,
-        scatter.significant,
-        record.output_names,
-        realisations,
-    )
-
-
 def _remarks(
-    omega: Float[np.ndarray, " frequencies"],
-    fit: Averages,
-    scatter: Scatter,
-    periods: Sequence[Periods],
+    omega: Float[np.ndarray, " frequencies"], fit: Fit, scatter: Scatter, periods: Sequence[Periods]
 ) -> tuple[Remark, ...]:
-    remarks, lost = [], omega[~fit.known]
+    remarks, lost = [], omega[~fit.determined]
     if lost.size:
         text = (
             "undetermined {where}: the inputs cannot be separated there. Use different phases in "
             "each record"
         )
         remarks.append(Remark(text, lost))
-    unsettled = [each.settled for each in periods if each.settled > _UNSETTLED]
-    if unsettled:
+    departures = [one.departure for one in periods if one.departure > _UNSETTLED]
+    if departures:
         text = (
-            f"the first period differs from the later ones by {max(unsettled):.3g} times the noise "
-            "power, because a transient remains: discard more periods"
+            f"the first period differs from the later ones by {max(departures):.3g} times the "
+            "noise power, because a transient remains: discard more periods"
         )
         remarks.append(Remark(text))
     if np.any(scatter.significant):

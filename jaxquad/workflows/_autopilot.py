@@ -28,10 +28,9 @@ from jaxquad.records import AXES, Proposal
 from ._autopilot_adrc import flew_adrc, tune_adrc
 from ._command_line import in_options
 from ._identify import identify_plant
-from ._kinds import SettingsError
 from ._log import propose_settings, read_records
-from ._settings import IdentifySettings
-from ._tune_settings import AutopilotSettings
+from ._options import SettingsError
+from ._settings import AutopilotSettings, IdentifySettings
 
 
 def autopilot(

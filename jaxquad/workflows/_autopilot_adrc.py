@@ -30,10 +30,9 @@ from jaxquad.identify import gain_over_throttle, GainOverThrottle, UndeterminedE
 from jaxquad.records import Proposal, RecordError, RecordWarning
 from jaxquad.spectra import frequency_response, JointInputOutput, LocalPolynomial
 
-from ._kinds import SettingsError
 from ._log import read_records
-from ._settings import IdentifySettings
-from ._tune_settings import AutopilotSettings
+from ._options import SettingsError
+from ._settings import AutopilotSettings, IdentifySettings
 
 
 _LINES = 40  # frequencies of a reproduced response

@@ -1,268 +1,59 @@
-"""Identify one log: from its path and settings to fits, text, figures and a folder."""
+"""Identify a log: its response, the fit to it, fits to parts of the band, and a second record."""
 
 import dataclasses
-import functools as ft
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import NamedTuple
 
 import numpy as np
 
-from jaxquad._core import announce, as_messages, marked_text, Message
-from jaxquad.autopilot import flown_law, FlownLaw
+from jaxquad._core import announce, as_messages
+from jaxquad.autopilot import flown_law
 from jaxquad.identify import (
-    Bands,
     behind_filters,
-    Combination,
-    Explanation,
-    factors,
+    CoherenceWeighted,
     Fit,
+    fit,
     fit_damped,
+    fit_transfer_function,
+    guess_lagged_integrator,
     KnownFilter,
+    MaximumLikelihood,
     MISFIT,
-    UndeterminedError,
+    usable,
     Verification,
     verify,
+    WIDER_BAND,
+    without_filters,
 )
-from jaxquad.models import LaggedIntegrator
-from jaxquad.records import (
-    Proposal,
-    Record,
-)
+from jaxquad.models import LaggedIntegrator, parameter_units, TransferFunction
+from jaxquad.records import Proposal, Record
 from jaxquad.report import reason_of
 from jaxquad.spectra import (
+    Composite,
+    DOMINATED,
+    EARLY,
+    frequency_response,
     FrequencyResponse,
+    JointInputOutput,
+    LocalPolynomial,
+    Welch,
 )
 
-from ._fits import (
-    EXCITE,
-    fit_best,
-    fit_parts,
-    fit_response,
-    in_option_words,
-    respond,
-    sums_of,
-    with_remedies,
-    with_units,
-)
-from ._log import mix_of, open_logs, OpenedLogs, read_records
-from ._result_file import default_folder
+from ._command_line import in_options
+from ._identification import EXPLAINED, HALVES, Identification
+from ._log import mix_of, open_again, open_logs, OpenedLogs, read_records
+from ._result_file import load_result, StoredResult
 from ._settings import IdentifySettings
 
 
-if TYPE_CHECKING:
-    from jaxquad.plot import Panels
-
-
-@dataclasses.dataclass(frozen=True)
-class Identification:
-    """One identified log, as `identify` returns it; `str()` is its report as text.
-
-    **Attributes:**
-
-    - `path`: of the log.
-    - `settings`: those that were used, a proposal included.
-    - `records`: one for each segment of each log.
-    - `responses`: the frequency response by method, the one to trust first.
-    - `fits`: the fit to each of them.
-    - `parts`: where the misfit is large, the fit beside those to the upper and to the lower part of
-      the band; None for one that diverged.
-    - `bands`: the same parameters from the lower and the upper half of the band, where there is a
-      fit.
-    - `explanation`: which further term the response wants, where `settings.explain` asks for it and
-      the misfit exceeds 1.5 random errors.
-    - `check`: the second record simulated, where `settings.verify` names one.
-    - `proposal`: where the log itself said what is input and output.
-    - `more`: the logs that were taken together with the first.
-    - `failures`: by title, why something beside the fit could not be computed.
-    - `flown`: the gyro's filters and the law of an autopilot's log, up to whose filters the model
-      is, unless `settings.keep_gyro_filters`.
-    """
-
-    path: Path
-    settings: IdentifySettings
-    records: tuple[Record, ...]
-    responses: Mapping[str, FrequencyResponse]
-    fits: Mapping[str, Fit]
-    parts: Mapping[str, Fit | None]
-    check: Verification | None
-    proposal: Proposal | None
-    bands: Bands | None = None
-    explanation: Explanation | None = None
-    more: tuple[Path, ...] = ()
-    failures: Mapping[str, str] = dataclasses.field(default_factory=dict)
-    flown: FlownLaw | None = None
-
-    @property
-    def filters(self) -> tuple[KnownFilter, ...]:
-        """Those of the gyro that are divided out of the responses."""
-        if self.flown is None or self.settings.keep_gyro_filters:
-            return ()
-        return self.flown.filters
-
-    @property
-    def filters_text(self) -> str:
-        """What is divided out, or why nothing is; empty where the log is no autopilot's."""
-        if self.flown is None:
-            return ""
-        if self.flown.filters and not self.filters:
-            return "the gyro's filters are in the model, as `keep_gyro_filters` asks"
-        return self.flown.text
-
-    @property
-    def paths(self) -> tuple[Path, ...]:
-        """All logs that were identified together."""
-        return self.path, *self.more
-
-    @property
-    def title(self) -> str:
-        """The name of the log, and how many others were taken with it."""
-        others = f" and {len(self.more)} more" if self.more else ""
-        return f"{self.path.name}{others}"
-
-    @property
-    def method(self) -> str:
-        """The estimate to trust: joint with an external reference, else direct."""
-        return next(iter(self.responses))
-
-    @property
-    def frf(self) -> FrequencyResponse:
-        """The frequency response that was fitted."""
-        return self.responses[self.method]
-
-    @property
-    def fit(self) -> Fit:
-        """The fit to it, with its verdict."""
-        return self.fits[self.method]
-
-    @property
-    def band(self) -> tuple[float, float]:
-        """The band of the response that was fitted, in rad/s."""
-        omega = np.asarray(self.frf.omega)
-        return float(omega[0]), float(omega[-1])
-
-    @property
-    def largest_command(self) -> float:
-        """How far the input went from its mean to either side, in its unit."""
-        inputs = [np.asarray(record.inputs)[:, 0] for record in self.records]
-        return max(float(np.max(np.abs(x - np.mean(x)))) for x in inputs)
-
-    @property
-    def formula(self) -> str:
-        """The structure of the model in words."""
-        return model_formula(self.settings, damped="damping" in self.fit.names)
-
-    @ft.cached_property
-    def combinations(self) -> tuple[Combination, ...]:
-        """The sum of lag and delay, where the record determines it."""
-        try:
-            return tuple(map(self._sum, sums_of(self.settings)))
-        except UndeterminedError:
-            return ()
-
-    def _sum(self, name: str) -> Combination:
-        return self.fit.derived(sums_of(self.settings)[name], name)._replace(unit="s")
-
-    @property
-    def beside(self) -> dict[str, str]:
-        """What goes with the fit as text, by title: halves of the band, what explains a misfit."""
-        found: dict[str, Bands | Explanation | None] = {
-            _HALVES: self.bands,
-            _EXPLAINED: self.explanation,
-        }
-        texts = {title: str(each) for title, each in found.items() if each is not None}
-        return texts | {
-            title: Message(f"could not be computed: {marked_text(why)}")
-            for title, why in self.failures.items()
-        }
-
-    @property
-    def figure_names(self) -> tuple[str, ...]:
-        """The names of the files of `figures()`, without drawing any."""
-        numbers = ("", *(f"_{k}" for k in range(2, len(self.records) + 1)))
-        records = [f"record{number}.png" for number in numbers]
-        return *records, "bode.png", *(() if self.check is None else ("verification.png",))
-
-    def figures(self) -> "dict[str, Panels]":
-        """The figures by file name: records, Bode diagram, and the check on a second record."""
-        return {name: draw() for name, draw in self.drawings().items()}
-
-    def drawings(self) -> "dict[str, Callable[[], Panels]]":
-        """What draws each of the `figures()`, by file name."""
-        from jaxquad.plot import bode, compare, headless, record_figure  # here: matplotlib is slow
-
-        stopped = self.fit.verdict.kind in ("no model", "no minimum")
-        name = f"{self.fit.verdict.kind}: where the fit stopped" if stopped else "identified"
-        models = {name: self.fit} if self.fit.verdict.fitted else {}
-        others = {f"{name} estimate": self.responses[name] for name in list(self.responses)[1:]}
-        drawings = [ft.partial(record_figure, record) for record in self.records]
-        drawings += [ft.partial(bode, self.frf, others, models, title=self.title)]
-        if self.check is not None:
-            verified = Path(self.settings.verify or "").name
-            drawings += [ft.partial(compare, self.check, title=verified)]
-        silent = [headless()(draw) for draw in drawings]
-        return dict(zip(self.figure_names, silent, strict=True))
-
-    def write(self, folder: str | Path | None = None) -> Path:
-        """Write `result.json`, `report.html` and the figures, by default to results/NAME.
-
-        **Returns:** the path of `result.json`.
-        """
-        from ._stored import write_identification
-
-        return write_identification(self, Path(folder or default_folder(self.path)))
-
-    def __str__(self) -> str:
-        return str(self.message())
-
-    def message(self) -> Message:
-        """What it prints, as a message that the command line puts into its own words."""
-        from jaxquad.report import compare_fits  # here: with it come the templates of pages
-
-        first, *others = map(str, self.records)
-        record = "\n".join([first, *(f"and {text.splitlines()[1].strip()}" for text in others)])
-        frf = dataclasses.replace(self.frf, remarks=())  # the fit repeats what concerns it
-        parts = [f"{record}\n\n{frf}"]
-        parts += [f"\n{self.filters_text}"] if self.filters_text else []
-        parts += [f"\n{self.formula}, {self.method} estimate:\n{self.fit}"]
-        sums, known = sums_of(self.settings), [each.name for each in self.fit.combinations]
-        if self.settings.poles is not None and self.fit.verdict.fitted:
-            parts += [_text_or_reason(lambda: factors(self.fit))]
-        if self.settings.reference:
-            parts += [f"\n{compare_fits(self.fits, sums)}"]
-        elif self.fit.verdict.fitted:
-            parts += [
-                _text_or_reason(ft.partial(self._sum, name)) for name in sums if name not in known
-            ]
-        parts += _on_negative_gain(self.fit, self.frf)
-        if self.parts:
-            parts += [f"\nFits to parts of the band:\n{compare_fits(self.parts, sums)}"]
-        parts += [f"\n{title}:\n{marked_text(text)}" for title, text in self.beside.items()]
-        parts += [f"\n{self.check}"] if self.check else []
-        return Message("\n".join(map(marked_text, parts)))
-
-
-_HALVES, _EXPLAINED = "Lower and upper half of the band", "What explains the misfit"
-
-
-def _on_negative_gain(fit: Fit, frf: FrequencyResponse) -> list[str]:
-    """What to check where the output moves against the input; that is no fault of the fit."""
-    above = [name == "gain" or name.startswith("numerator[") for name in fit.names]
-    if not np.all(fit.determined[above] & (fit.values[above] < 0)):
-        return []
-    source, output = frf.input_names[0], frf.output_names[0]
-    return [
-        f"the gain is negative: when {source} rises, {output} falls. If it should rise, check the "
-        f"signs of both channels and of the axis; jaxquad tune needs a positive gain "
-        "(--input NAME=-CHANNEL)"
-    ]
-
-
-def _text_or_reason(made: Callable[[], object]) -> str:
-    try:
-        return str(made())
-    except UndeterminedError as error:
-        return marked_text(error)
+_COSTS = {"ml": MaximumLikelihood(), "coherence": CoherenceWeighted()}
+_POINTS = 100  # frequencies, log-spaced over the band
+_LONGEST = 0.02  # of the record: a longer delay is no delay of the vehicle
+_NEAR = 1.5  # samples: a delay that is taken out as precisely as that need not be better
+_MISFIT = 3.0  # ratio of misfit to random error from which parts of the band are fitted, too
+_CHANGE = 0.1  # of the gain, between parts of the band: more than that is not noise
+_EXCITE = "excite the axis more, over a wider band (jaxquad design sweep), or record longer"
 
 
 def identify(
@@ -304,6 +95,21 @@ def identify(
     return identify_opened(open_logs(path, settings, proposal))
 
 
+def identify_again(
+    result: str | Path | StoredResult, *, log: str | Path | None = None
+) -> Identification:
+    """Identify the log of a stored result with its settings.
+
+    **Arguments:**
+
+    - `result`: the folder of the result, its `result.json`, or what `load_result` returns.
+    - `log`: where the log lies, if it was moved; of several logs, the folder in which all lie.
+
+    **Raises:** ValueError where a log is gone, or is not the same file by its SHA-256.
+    """
+    return identify_opened(open_again(result, log=log))
+
+
 def identify_opened(opened: OpenedLogs) -> Identification:
     """Identify logs that are open, as `identify` does those of a path.
 
@@ -311,15 +117,34 @@ def identify_opened(opened: OpenedLogs) -> Identification:
 
     - `opened`: what `open_logs`, or `open_again` of a stored result, returned.
     """
-    settings = opened.settings
-    flown = flown_law(
-        opened.paths, mix_of(settings.output), mix_of(settings.input), opened.proposal, settings
-    )
-    filters = () if flown is None or opened.settings.keep_gyro_filters else flown.filters
-    found, delay = _identify(opened, compare=True, filters=filters, vehicle=flown is not None)
-    found = dataclasses.replace(found, flown=flown)
-    found = _with_fits_again(dataclasses.replace(found, check=_checked(found)))
-    return _with_direct(found, delay) if found.settings.reference else found
+    paths, settings, proposal, records = opened
+    flown = flown_law(paths, mix_of(settings.output), mix_of(settings.input), proposal, settings)
+    filters = () if flown is None or settings.keep_gyro_filters else flown.filters
+    estimate = _estimate(opened, filters, vehicle=flown is not None, compare=True)
+    method, frf, fit, parts, delay = estimate
+    responses, fits, failures = {method: frf}, {method: fit}, {}
+
+    def attempt(title: str, compute: Callable[[], object]):
+        try:
+            return compute()
+        except Exception as error:
+            failures[title] = reason_of(error)
+
+    check = _verified(fit, settings, filters)
+    bands = explanation = None
+    if fit.verdict.fitted and fit.verdict.kind != "no minimum":
+        bands = attempt(HALVES, fit.bands)
+        if settings.explain and fit.chi_squared > MISFIT**2:
+            explanation = attempt(EXPLAINED, fit.explain)
+    if settings.reference:
+        announce("fit to the direct response")
+        direct = attempt("The direct estimate", lambda: _fit_direct(opened, filters, delay))
+        if direct is not None:
+            responses["direct"], fits["direct"] = direct
+    return Identification(
+        paths[0], settings, records, responses, fits, parts, proposal, paths[1:], flown, check,
+        bands, explanation, failures,
+    )  # fmt: skip
 
 
 def identify_fit(opened: OpenedLogs) -> Identification:
@@ -332,115 +157,287 @@ def identify_fit(opened: OpenedLogs) -> Identification:
     - `opened`: what `open_logs`, or `open_again` of a stored result, returned.
     """
     settings = dataclasses.replace(opened.settings, keep_gyro_filters=True)
-    return _identify(opened._replace(settings=settings))[0]
+    return _of_estimate(opened._replace(settings=settings))
 
 
 def identify_plant(
     path: Path, settings: IdentifySettings, proposal: Proposal, filters: Sequence[KnownFilter]
 ) -> Identification:
     """Likewise, up to what the `filters` of the output were given; its remedies are flights."""
-    found, _ = _identify(open_logs(path, settings, proposal), filters=filters, vehicle=True)
-    fits = {method: _with_remedy(each, EXCITE) for method, each in found.fits.items()}
-    return dataclasses.replace(found, fits=fits)
+    opened = open_logs(path, settings, proposal)
+    return _of_estimate(opened, filters, vehicle=True, remedies=[_EXCITE])
 
 
-def _with_remedy(found: Fit, remedy: str) -> Fit:
-    """With this alone where something is not determined."""
-    verdict = found.verdict
-    if verdict.kind == "identifiable":
-        return found
-    verdict = dataclasses.replace(verdict, remedies=as_messages([remedy]))
-    return dataclasses.replace(found, verdict=verdict)
+def _of_estimate(
+    opened: OpenedLogs, filters: Sequence[KnownFilter] = (), *, vehicle: bool = False,
+    remedies: Sequence[str] | None = None,
+) -> Identification:  # fmt: skip
+    method, frf, fit, parts, _ = _estimate(opened, filters, vehicle=vehicle, remedies=remedies)
+    paths, settings, proposal, records = opened
+    responses, fits = {method: frf}, {method: fit}
+    return Identification(paths[0], settings, records, responses, fits, parts, proposal, paths[1:])
 
 
-def _identify(
-    opened: OpenedLogs, *, compare: bool = False, filters: Sequence[KnownFilter] = (),
-    vehicle: bool = False,
-) -> tuple[Identification, float]:  # fmt: skip
-    """The estimate to trust and its fit; the delay in s that is taken out, also to `compare`.
+class _Estimate(NamedTuple):
+    """The response to trust and the fit to it; `delay`, in s, was taken out of the response."""
 
-    The rate of a `vehicle` may be damped by the air.
+    method: str
+    frf: FrequencyResponse
+    fit: Fit
+    parts: Mapping[str, Fit | None]
+    delay: float
+
+
+def _estimate(
+    opened: OpenedLogs,
+    filters: Sequence[KnownFilter],
+    *,
+    vehicle: bool,
+    compare: bool = False,
+    remedies: Sequence[str] | None = None,
+) -> _Estimate:
+    """The estimate to trust, its fit, and those to parts of the band where the misfit is large.
+
+    Taken out of the response is the delay that a fit to a quick one finds; where the fit to the
+    response itself finds another, it is estimated again. Known `filters` are divided out. The rate
+    of a `vehicle` may be damped by the air. `compare` says that the direct estimate comes later.
     """
-    (path, *more), settings, proposal, records = opened
-    best, *others = ("joint", "direct") if settings.reference else ("direct",)
-    methods = (best, *(others if compare else ()))
-    estimated = fit_best(records, methods, settings, filters)
-    fit = estimated.fit
+    settings, records = opened.settings, opened.records
+    method = "joint" if settings.reference else "direct"
+    said = f"{method} response"
+    if compare and settings.reference:
+        said = "joint and direct responses"
+    announce(f"quick {method} response, for the delay")
+    quick = _respond(records, method, settings, filters, quick=True)
+    # To find the remarks takes as long as the fit.
+    first = _fit_response(dataclasses.replace(quick, remarks=()), settings)
+    delay = _delay_of(first, records)
+    announce(f"{said}, {delay:.4g} s of delay taken out" if delay else said)
+    frf = _respond(records, method, settings, filters, delay)
+    announce(f"fit to the {method} response")
+    fit = _fit_response(frf, settings)
+    other = _delay_of(fit, records)
+    if other and abs(other - delay) > _NEAR * records[0].dt:
+        delay = other
+        announce(f"{said}, {delay:.4g} s of delay taken out")
+        frf = _respond(records, method, settings, filters, delay)
+        fit = _fit_response(frf, settings)
     if vehicle and isinstance(fit.model, LaggedIntegrator) and settings.integrators:
         fit = fit_damped(fit)
-    fit = with_units(with_remedies(fit, settings), records[0])
     announce("fits to parts of the band")
-    fit, parts = fit_parts(fit, estimated.frf, settings)
-    responses, fits = {best: estimated.frf}, {best: in_option_words(fit)}
-    found = Identification(
-        path, settings, records, responses, fits, parts, None, proposal, more=tuple(more)
-    )
-    return found, estimated.delay
+    span, parts = _fit_parts(fit, frf, settings)
+    changes = [_gain_change(where, part, fit) for where, part in parts.items()]
+    fit = finish_fit(fit, settings, records[0], [*filter(None, changes)], remedies)
+    return _Estimate(method, frf, fit, {span: fit} | parts if parts else {}, delay)
 
 
-def _with_direct(found: Identification, delay: float) -> Identification:
-    """The direct estimate, with `delay` (s) taken out, beside the joint one, and the fit to it."""
-    announce("fit to the direct response")
-    try:
-        response = respond(found.records, "direct", found.settings, found.filters, delay)
-        fit = with_remedies(fit_response(response, found.settings), found.settings)
-    except Exception as error:
-        failures = {**found.failures, "The direct estimate": reason_of(error)}
-        return dataclasses.replace(found, failures=failures)
-    fit = in_option_words(with_units(fit, found.records[0]))
-    responses, fits = {**found.responses, "direct": response}, {**found.fits, "direct": fit}
-    return dataclasses.replace(found, responses=responses, fits=fits)
+def _fit_direct(
+    opened: OpenedLogs, filters: Sequence[KnownFilter], delay: float
+) -> tuple[FrequencyResponse, Fit]:
+    settings, records = opened.settings, opened.records
+    frf = _respond(records, "direct", settings, filters, delay)
+    return frf, finish_fit(_fit_response(frf, settings), settings, records[0])
 
 
-def _with_fits_again(found: Identification) -> Identification:
-    """With the halves of the band, and the explanation of a misfit that was asked for."""
-    fit, failures = found.fit, dict(found.failures)
-    if not fit.verdict.fitted or fit.verdict.kind == "no minimum":
-        return found
-    wanted: dict[str, tuple[str, Callable[[], object]]] = {"bands": (_HALVES, fit.bands)}
-    if found.settings.explain and fit.chi_squared > MISFIT**2:
-        wanted["explanation"] = (_EXPLAINED, fit.explain)
-    computed = {}
-    for field, (title, compute) in wanted.items():
-        try:
-            computed[field] = compute()
-        except Exception as error:
-            failures[title] = reason_of(error)
-    return dataclasses.replace(found, failures=failures, **computed)
+def _respond(
+    records: tuple[Record, ...], method: str, settings: IdentifySettings,
+    filters: Sequence[KnownFilter], delay: float = 0.0, *, quick: bool = False,
+) -> FrequencyResponse:  # fmt: skip
+    """The response by a method, `delay` (s) and `filters` of the output taken out."""
+    shape = {"integrators": settings.integrators, "delay": delay}
+    if settings.window is not None or settings.estimator == "welch":
+        estimator = Welch(settings.window, **shape)
+    elif settings.estimator == "composite":
+        estimator = Composite(**shape)
+    elif quick:
+        estimator = LocalPolynomial(**shape, global_order=0)
+    else:
+        estimator = LocalPolynomial(**shape)
+    if method == "joint":
+        estimator = JointInputOutput(estimator)
+    band = settings.band_rad
+    if settings.band is not None:
+        band = 2 * np.pi * settings.band[0], 2 * np.pi * settings.band[1]
+    omega = None if band is None else np.geomspace(*band, _POINTS)
+    return without_filters(frequency_response(list(records), omega, estimator=estimator), filters)
 
 
-def model_formula(settings: IdentifySettings, *, damped: bool = False) -> str:
-    """The structure of the model, such as `q / M = K e^(-delay s) / (s (lag s + 1))`."""
-    n = settings.integrators
-    [output], [source] = mix_of(settings.output), mix_of(settings.input)
+def _delay_of(fit: Fit, records: tuple[Record, ...]) -> float:
+    """In s, whole samples; 0 where nothing is fitted, and for one that is none of a vehicle."""
+    if not fit.verdict.fitted:
+        return 0.0
+    model, dt = fit.model, records[0].dt
+    late = (model.delay,) if isinstance(model, TransferFunction) else (model.lag, model.delay)
+    total = dt * round(sum(map(float, late)) / dt)
+    return total if 0 < total < _LONGEST * max(record.duration for record in records) else 0.0
+
+
+def _fit_response(frf: FrequencyResponse, settings: IdentifySettings) -> Fit:
+    """The model of the settings, or K e^(-delay s) / (s^n (lag s + 1)), fitted to a response."""
+    cost, n = _COSTS[settings.cost], settings.integrators
     if settings.poles is not None:
-        kind = f"{settings.zeros} zeros over {settings.poles} poles and {n} integrators"
-        return f"{output} / {source}, {kind}{', delayed' if settings.delay else ''}"
-    pure = n - damped
-    powers = [] if pure == 0 else ["s"] if pure == 1 else [f"s^{pure}"]
-    powers += ["(s + damping)"] if damped else []
-    below = powers + (["(lag s + 1)"] if settings.lag else [])
-    above = "K e^(-delay s)" if settings.delay else "K"
-    product = " ".join(below)
-    ratio = f" / ({product})" if len(below) > 1 else f" / {product}" if below else ""
-    return f"{output} / {source} = {above}{ratio}"
+        return fit_transfer_function(
+            frf, zeros=settings.zeros, poles=settings.poles + n, integrators=n,
+            delay="free" if settings.delay else 0.0, cost=cost,
+        )  # fmt: skip
+    free = ["gain", *(["lag"] if settings.lag else []), *(["delay"] if settings.delay else [])]
+    if not np.any(np.isfinite(frf.response)):  # the fit says so
+        return fit(LaggedIntegrator(1.0, 0.1, 0.1, n), frf, free=free, cost=cost)
+    guess = guess_lagged_integrator(frf, n)
+    total = np.asarray(guess.lag) + np.asarray(guess.delay)  # what is fixed at 0 adds to the other
+    lag = 0.0 if not settings.lag else guess.lag if settings.delay else total
+    delay = 0.0 if not settings.delay else guess.delay if settings.lag else total
+    return fit(LaggedIntegrator(guess.gain, lag, delay, n), frf, free=free, cost=cost)
 
 
-def _checked(found: Identification) -> Verification | None:
+def _fit_parts(
+    whole: Fit, frf: FrequencyResponse, settings: IdentifySettings
+) -> tuple[str, dict[str, Fit | None]]:
+    """The band in words, and fits to its upper and lower two thirds where the misfit is large.
+
+    There are none for a misfit below three times the noise, for other models than the lagged
+    integrator, and for a response that feedback dominates or whose phase rises: no part of it
+    would be better. None for a part in which the solver diverged.
+    """
+    small = not whole.chi_squared >= _MISFIT**2 or not isinstance(whole.model, LaggedIntegrator)
+    no_plant = any(remark.kind in (DOMINATED, EARLY) for remark in frf.remarks)
+    if not whole.verdict.fitted or small or no_plant:
+        return "", {}
+
+    def fit_part(band: tuple[float, float]) -> Fit | None:
+        try:  # from where the fit stopped
+            return fit(whole.model, frf, free=whole.names, cost=_COSTS[settings.cost], band=band)
+        except ValueError:
+            return None
+
+    hertz = lambda omega: f"{omega / (2 * np.pi):.3g} Hz"
+    used = np.asarray(frf.omega)[usable(frf, None, 0.6)[:, 0, 0]]
+    low, first, second, high = np.geomspace(used[0], used[-1], 4).tolist()
+    span = f"{low:.3g} .. {high:.3g} rad/s ({low / (2 * np.pi):.3g} .. {hertz(high)})"
+    return span, {
+        f"above {first:.3g} rad/s ({hertz(first)})": fit_part((first, high)),
+        f"below {second:.3g} rad/s ({hertz(second)})": fit_part((low, second)),
+    }
+
+
+def _gain_change(where: str, part: Fit | None, whole: Fit) -> str:
+    """A remark on a part of the band in which the gain is another one; empty where it is not."""
+    sure = whole.determined[0] or whole.verdict.kind == "no model"
+    if part is None or not (part.determined[0] and sure):
+        return ""
+    before, after = whole.values[0], part.values[0]
+    if not abs(after - before) > max(_CHANGE * abs(before), 2 * part.standard_errors[0]):
+        return ""
+    ratio, ratio_before = part.chi_squared**0.5, whole.chi_squared**0.5
+    return (
+        f"{where} the gain is {after:.4g} instead of {before:.4g}, with a misfit of {ratio:.1f} "
+        f"instead of {ratio_before:.1f}: the model does not hold over the whole band. Fit the part "
+        "where it does (--band, --band-rad), or a model of higher order (--poles)"
+    )
+
+
+def finish_fit(
+    fit: Fit,
+    settings: IdentifySettings,
+    record: Record,
+    further: Sequence[str] = (),
+    remedies: Sequence[str] | None = None,
+) -> Fit:
+    """The fit in the words of the command line, with the `further` remarks and with units.
+
+    The `remedies` are by default options of `jaxquad identify`. In units, a channel without one
+    stands for itself.
+    """
+    verdict, units = fit.verdict, fit.parameter_units
+    if not verdict.identifiable:
+        remedies = _options_for(fit, settings) if remedies is None else remedies
+        verdict = dataclasses.replace(verdict, remedies=as_messages(remedies))
+    if verdict.fitted:
+        [output], [source] = record.output_units, record.input_units
+        units = parameter_units(
+            fit.model, fit.names,
+            output=output or record.output_names[0], input=source or record.input_names[0],
+        )  # fmt: skip
+        of_parameters = dict(zip(fit.names, units, strict=True))
+        combinations = []
+        for combination in verdict.combinations:
+            of_terms = {of_parameters.get(name, "") for name in combination.sum_of}
+            alike = len(combination.sum_of) > 1 and len(of_terms) == 1
+            combinations.append(combination._replace(unit=of_terms.pop() if alike else ""))
+        verdict = dataclasses.replace(verdict, combinations=tuple(combinations))
+    remarks = tuple(map(in_options, (*fit.remarks, *further)))
+    return dataclasses.replace(fit, verdict=verdict, remarks=remarks, parameter_units=units)
+
+
+def _options_for(fit: Fit, settings: IdentifySettings) -> list[str]:
+    """What may determine the parameters of a fit that are open, as options."""
+    kind, remarked = fit.verdict.kind, {remark.kind for remark in fit.remarks}
+    wider = [remedy for remedy in fit.verdict.remedies if remedy.kind == WIDER_BAND]
+    excite = in_options(wider[0]) if wider else _EXCITE
+    if kind == "too few points":
+        return [excite, "use longer windows (--estimator welch --window S)"]
+    if kind == "no model" and DOMINATED in remarked:
+        name = [] if settings.reference else ["name the external reference (--reference)"]
+        record = "excite the axis (jaxquad design sweep), and record what excites it as the "
+        return [*name, f"{record}reference"]
+    if kind == "no model" and EARLY in remarked:
+        return ["exchange --input and --output if they are swapped, or correct time stamps"]
+    if kind == "no model":
+        return [
+            "fit the part of the band where it holds (--band, --band-rad)",
+            "fit a model of higher order (--poles), or ask which term is missing (--explain)",
+        ]
+    if settings.poles is not None:
+        return ["fit fewer poles and zeros (--poles, --zeros)", excite]
+    if {"lag", "delay"} & {*fit.verdict.undetermined} and settings.lag and settings.delay:
+        return ["fit without the lag (--no-lag) or without the delay (--no-delay)", excite]
+    return [excite]
+
+
+def _verified(
+    fit: Fit, settings: IdentifySettings, filters: Sequence[KnownFilter]
+) -> Verification | None:
     """The second record simulated, within the band of the points that the fit used.
 
     Where gaps cut it into several, it is the longest of them.
     """
-    settings = found.settings
-    if settings.verify is None or not found.fit.verdict.fitted:
+    if settings.verify is None or not fit.verdict.fitted:
         return None
-    other = dataclasses.replace(
-        settings,
-        start=settings.verify_start,
-        stop=settings.verify_stop,
-        segments=(),
-        reference=None,
-    )
-    records = read_records(Path(settings.verify), other)
-    longest = max(records, key=lambda record: record.samples)
-    return verify(found.fit, behind_filters(longest, found.filters))
+    part = {"start": settings.verify_start, "stop": settings.verify_stop, "segments": ()}
+    other = dataclasses.replace(settings, **part, reference=None)
+    return verify(fit, behind_filters(_longest(Path(settings.verify), other), filters))
+
+
+def _longest(path: Path, settings: IdentifySettings) -> Record:
+    return max(read_records(path, settings), key=lambda record: record.samples)
+
+
+def verify_result(
+    result: str | Path | StoredResult,
+    path: str | Path,
+    changes: Mapping[str, object] | None = None,
+) -> Verification:
+    """Simulate an identified model on another record, and compare.
+
+    **Arguments:**
+
+    - `result`: the folder of the result, its `result.json`, or what `load_result` returns.
+    - `path`: the other log.
+    - `changes`: settings that differ for this log (keys of `IdentifySettings`): another channel's
+      name, another part, another band. Otherwise its whole time is used, with the channels and the
+      rate of the result, in the band of the points that its fit used.
+
+    **Raises:** `UndeterminedError` (a ValueError) for a result without a model, `RecordError` for a
+    log that cannot be used.
+    """
+    stored = result if isinstance(result, StoredResult) else load_result(result)
+    every = {"start": None, "stop": None, "segments": (), "reference": None}
+    settings = dataclasses.replace(stored.settings, **every, band=None, band_rad=stored.band)
+    settings = settings.changed(changes or {})
+    model, band = stored.model, stored.used_band
+    if settings.band_rad != stored.band:
+        band = settings.band_rad
+    if settings.band is not None:
+        band = 2 * np.pi * settings.band[0], 2 * np.pi * settings.band[1]
+    record = _longest(Path(path), settings)
+    return verify(model, behind_filters(record, stored.filters), band=band)

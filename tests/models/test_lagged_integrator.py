@@ -7,7 +7,7 @@ from synthetic import response_of
 
 import jaxquad as jq
 from jaxquad.models import evaluate_response, imaginary, parameter_units
-from jaxquad.workflows._identify import model_formula
+from jaxquad.workflows._identification import model_formula
 
 
 OMEGA = jnp.geomspace(0.3, 300.0, 50)

@@ -25,8 +25,8 @@ from jaxquad.records.formats._betaflight_header import with_derived
 from jaxquad.records.proposals._flown_span import flown_span, in_flight
 from jaxquad.spectra import frequency_response, JointInputOutput
 from jaxquad.workflows import autopilot, AutopilotSettings, IdentifySettings, SettingsError
+from jaxquad.workflows._identification import _record_with_throttle
 from jaxquad.workflows._log import open_logs, propose_settings, read_logs
-from jaxquad.workflows._stored import _with_throttle
 
 
 FIRMWARE = "betaflight_firmware"
@@ -300,7 +300,7 @@ def test_a_gap_that_is_allowed_is_allowed_for_the_spectrum_over_the_throttle(
     with pytest.warns(RecordWarning, match="gaps filled"):
         records = read_logs([path], settings)
     opened: Any = SimpleNamespace(path=path, settings=settings, proposal=proposal, records=records)
-    both = _with_throttle(opened)
+    both = _record_with_throttle(opened)
     assert both is not None and both.samples == records[0].samples
     assert both.input_names[1] == "throttle"
 

@@ -8,7 +8,7 @@ from scipy import signal
 
 from jaxquad.records import Record
 from jaxquad.spectra import DOMINATED, EARLY, frequency_response, JointInputOutput, Welch
-from jaxquad.spectra._directed import _ORDER, _sums_of_products, share_from_output
+from jaxquad.spectra._feedback import _ORDER, lagged_products, share_from_output
 
 
 DT, SAMPLES = 0.01, 6000
@@ -166,4 +166,4 @@ def test_too_short_a_record_says_nothing():
 def test_sums_of_products_are_those_of_the_shifted_samples():
     x = np.random.default_rng(0).standard_normal((2, 300))
     rows = np.concatenate([x[:, _ORDER - k : 300 - k] for k in range(_ORDER + 1)])
-    np.testing.assert_allclose(_sums_of_products(x), rows @ rows.T, atol=1e-10)
+    np.testing.assert_allclose(lagged_products(x), rows @ rows.T, atol=1e-10)

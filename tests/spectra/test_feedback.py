@@ -6,7 +6,7 @@ from scipy import signal
 
 from jaxquad.records import read, Record, RecordWarning
 from jaxquad.spectra import DOMINATED, frequency_response, JointInputOutput, Welch
-from jaxquad.spectra._feedback import dominated_by_feedback, phase_rises
+from jaxquad.spectra._feedback import dominated_by_feedback, phase_slope
 
 
 RATE, SAMPLES = 50.0, 3000
@@ -27,6 +27,11 @@ def closed_loop(seed, *, sweep=1.0, noise=1.0):
     loop = [1.0, -0.8 + 0.4 * GAIN]
     y = filtered([0.0, 0.4], loop, r) + filtered([1.0, -0.8], loop, e)
     return Record(np.arange(SAMPLES) / RATE, r - GAIN * y, y, r)
+
+
+def phase_rises(omega, response, error, coherence, covariance=None):
+    slope = phase_slope(omega, response, error, coherence)
+    return slope is not None and slope.rises(response, covariance)
 
 
 def mean_response(estimator, noise):

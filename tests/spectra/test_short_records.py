@@ -6,7 +6,7 @@ from scipy.signal import lfilter
 
 import jaxquad as jq
 from jaxquad.spectra._estimate import _remarks_on_length
-from jaxquad.spectra._local_estimate import _remark_on_unmoved
+from jaxquad.spectra._local_polynomial import _remark_on_unmoved
 
 
 DT = 0.004

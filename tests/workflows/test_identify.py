@@ -13,7 +13,7 @@ from synthetic import response_of
 import jaxquad as jq
 from jaxquad.cli import main
 from jaxquad.workflows import (
-    _fits,
+    _identification,
     _identify,
     identify,
     identify_again,
@@ -94,13 +94,13 @@ def test_numbers_and_figures_are_at_hand_without_a_folder(found):
 def test_where_the_quick_response_finds_a_wrong_delay_the_right_one_is_taken_out(
     log, found, monkeypatch
 ):
-    known, taken_out = _fits._delay_of, []
+    known, taken_out = _identify._delay_of, []
 
     def wrong_at_first(*given):
         taken_out.append(known(*given) + (0.0 if taken_out else 0.1))
         return taken_out[-1]
 
-    monkeypatch.setattr(_fits, "_delay_of", wrong_at_first)
+    monkeypatch.setattr(_identify, "_delay_of", wrong_at_first)
     again = identify(log, found.settings)
     assert taken_out[0] > 0.1 > 2 * taken_out[1]
     assert np.all(np.abs(again.fit.values - found.fit.values) < 0.1 * found.fit.standard_errors)
@@ -147,7 +147,8 @@ def test_a_narrow_band_is_named_in_options():
     truth = jq.LaggedIntegrator(8.0, 0.05, 0.03)
     omega = np.geomspace(5.0, 8.0, 4)
     few = jq.fit(truth, response_of(truth, omega=omega))
-    remedies = _fits.with_remedies(few, IdentifySettings()).verdict.remedies
+    record = jq.Record(np.arange(16.0) / 10, np.arange(16.0), np.arange(16.0))
+    remedies = _identify.finish_fit(few, IdentifySettings(), record).verdict.remedies
     advice = "excite the axis (jaxquad design sweep) over more than 5 to 8 rad/s"
     assert remedies[0].startswith(advice)
 
@@ -162,7 +163,8 @@ def test_a_sum_has_the_unit_of_all_its_terms(terms, unit):
     combination = jq.identify.Combination("a sum", 1.0, 0.1, sum_of=terms)
     verdict = dataclasses.replace(fit.verdict, combinations=(combination,))
     record = jq.Record(np.arange(16.0) / 10, np.arange(16.0), np.arange(16.0))
-    [found] = _fits.with_units(dataclasses.replace(fit, verdict=verdict), record).combinations
+    fit = dataclasses.replace(fit, verdict=verdict)
+    [found] = _identify.finish_fit(fit, IdentifySettings(), record).combinations
     assert found.unit == unit and f"0.1{unit and ' '}{unit} (std. error" in str(found)
 
 
@@ -229,9 +231,9 @@ def test_a_negative_gain_is_told_with_what_to_check(gain, said):
     """As many conventions have it: the elevator's trailing edge down, the nose down."""
     frf = response_of(jq.LaggedIntegrator(gain, 0.05, 0.03), omega=np.geomspace(1.0, 30.0, 40))
     fit = jq.fit(jq.LaggedIntegrator(gain / 2, 0.05, 0.03), frf)
-    assert [text[:46] for text in _identify._on_negative_gain(fit, frf)] == said
+    assert [text[:46] for text in _identification._on_negative_gain(fit, frf)] == said
     turns = dataclasses.replace(fit, names=("numerator[0]", "numerator[1]", "delay"))
-    assert _identify._on_negative_gain(turns, frf) == []  # of a zero in the right half plane
+    assert _identification._on_negative_gain(turns, frf) == []  # of a zero in the right half plane
 
 
 @pytest.mark.slow

@@ -44,35 +44,39 @@ def with_mixed_axes(
     given where the motors are seen to be mixed as those of a quadrotor X without a thrust curve of
     the firmware's: where none is at an end they must follow `axisSum`.
     """
-    ends = _ends(settings)
     names = [f"motor[{k}]" for k in range(4)]
-    if ends is None or any(name not in columns for name in names) or "motor[4]" in columns:
+    try:
+        low, high = (float(x) for x in settings["motorOutput"].split(",")[:2])
+    except (KeyError, ValueError):
         return dict(columns)
-    low, high = ends
+    quad = all(name in columns for name in names) and "motor[4]" not in columns
+    if not quad or not np.isfinite(high) or not high > low:
+        return dict(columns)
     motors = (np.stack([np.asarray(columns[x], float) for x in names], axis=1) - low) / (high - low)
-    slopes = {axis: _shown(axis, motors, columns) for axis in _QUAD_X}
-    seen = {axis: slope for axis, slope in slopes.items() if slope}
-    if not seen:
+    slopes = {axis: _slope(axis, motors, columns) for axis in _QUAD_X}
+    slopes = {axis: slope for axis, slope in slopes.items() if slope}
+    if not slopes:
         return dict(columns)
     dt = float(np.median(np.diff(time)))
-    collective = _mean_at_throttle(motors.mean(axis=1), columns)
-    thrust = _linear_thrust(motors, _lag_of(columns, motors, seen, dt), dt)
-    slope = 1 - _CURVE + 2 * _CURVE * collective
+    # The motors' mean over all samples in flight with about the throttle of each sample.
+    mean = motors.mean(axis=1)
+    throttle = columns.get("rcCommand[3]", columns.get("setpoint[3]"))
+    throttle = np.zeros(mean.size) if throttle is None else np.asarray(throttle, float) / 1000
+    level = np.rint((throttle - np.median(throttle)) / _LEVEL).astype(int)
+    level -= level.min()
+    weight = np.where(mean > _ARMED, 1.0, 1e-9)
+    total, count = np.bincount(level, weight * mean), np.bincount(level, weight)
+    collective = (total / np.where(count > 0, count, 1.0))[level]
+    # The command whose lag has the thrust that the motors have, by a curve behind their lag: with v
+    # the lagged command and T its thrust, T(v) + lag dT/dt = T'(v) t + T(v) - T'(v) v.
+    lagged = _lagged(motors, _lag_of(columns, motors, slopes, dt), dt)
+    thrust = (1 - _CURVE + 2 * _CURVE * lagged) * motors - _CURVE * lagged**2
+    gain = 1 - _CURVE + 2 * _CURVE * collective
     mixed = {
-        f"axisMixed[{axis}]": 250 * (thrust @ np.array(_QUAD_X[axis])) / (shown * slope)
-        for axis, shown in seen.items()
+        f"axisMixed[{axis}]": 250 * (thrust @ np.array(_QUAD_X[axis])) / (slope * gain)
+        for axis, slope in slopes.items()
     }
     return {**columns, **mixed, "collective": collective}
-
-
-def _linear_thrust(motors: Motors, lag: float, dt: float) -> Motors:
-    """The command whose lag has the thrust that the motors have, by a curve behind their lag.
-
-    With v the lagged command and T its thrust, it is T(v) + lag dT/dt = T'(v) t + T(v) - T'(v) v.
-    """
-    lagged = _lagged(motors, lag, dt)
-    slope = 1 - _CURVE + 2 * _CURVE * lagged
-    return slope * motors - _CURVE * lagged**2
 
 
 def _lagged(motors: np.ndarray, lag: float, dt: float) -> np.ndarray:
@@ -83,37 +87,36 @@ def _lagged(motors: np.ndarray, lag: float, dt: float) -> np.ndarray:
 
 
 def _lag_of(
-    columns: Mapping[str, np.ndarray], motors: Motors, shown: Mapping[int, float], dt: float
+    columns: Mapping[str, np.ndarray], motors: Motors, slopes: Mapping[int, float], dt: float
 ) -> float:
     """The motors' lag that explains most of an axis' acceleration, of the axis that moved most."""
     from scipy.signal import butter, sosfiltfilt
 
-    rates = {axis: columns.get(f"gyroADC[{axis}]") for axis in shown if axis < 2}
+    rates = {axis: columns.get(f"gyroADC[{axis}]") for axis in slopes if axis < 2}
     moved = {axis: np.asarray(rate, float) for axis, rate in rates.items() if rate is not None}
     if not moved or 1 / dt < 4 * _BAND[1]:
         return _USUAL_LAG
-    axis = max(moved, key=lambda each: float(np.std(moved[each])))
+    axis = max(moved, key=lambda axis: float(np.std(moved[axis])))
     sections = butter(2, _BAND, "bandpass", fs=1 / dt, output="sos")
     turned = sosfiltfilt(sections, np.gradient(moved[axis], dt))
-    command = sosfiltfilt(sections, shown[axis] * motors @ np.array(_QUAD_X[axis]))
+    command = sosfiltfilt(sections, slopes[axis] * motors @ np.array(_QUAD_X[axis]))
     shares = []
     for lag in _LAGS:
-        made = _lagged(command, float(lag), dt)
-        power = float(made @ made) * float(turned @ turned)
-        shares.append(float(made @ turned) ** 2 / power if power > 0 else 0.0)
+        torque = _lagged(command, float(lag), dt)
+        power = float(torque @ torque) * float(turned @ turned)
+        shares.append(float(torque @ turned) ** 2 / power if power > 0 else 0.0)
     best = int(np.argmax(shares))
     return float(_LAGS[best]) if shares[best] > _SHOWN else _USUAL_LAG
 
 
-def _shown(axis: int, motors: Motors, columns: Mapping[str, np.ndarray]) -> float:
+def _slope(axis: int, motors: Motors, columns: Mapping[str, np.ndarray]) -> float:
     """By what the motors show of an axis' command, with its sign; 0 where they do not show it.
 
     It is near 1, and beyond it where the firmware makes up for a battery that sags.
     """
-    command = columns.get(f"axisSum[{axis}]")
-    if command is None:
+    command = np.asarray(columns.get(f"axisSum[{axis}]", np.empty(0)), float)
+    if not command.size:
         return 0.0
-    command = np.asarray(command, float)
     free = np.all((motors > _AT_END) & (motors < 1 - _AT_END), axis=1)
     within = free & (np.abs(command) < _UNLIMITED)
     shown, command = 250 * (motors @ np.array(_QUAD_X[axis]))[within], command[within]
@@ -124,23 +127,3 @@ def _shown(axis: int, motors: Motors, columns: Mapping[str, np.ndarray]) -> floa
     least, share = _SCATTER
     scatter = float(np.std(shown - slope * command))
     return slope if follows and scatter < max(least, share * float(np.std(command))) else 0.0
-
-
-def _mean_at_throttle(mean: Samples, columns: Mapping[str, np.ndarray]) -> Samples:
-    """Of the motors, over all samples in flight with about the throttle of each sample."""
-    throttle = columns.get("rcCommand[3]", columns.get("setpoint[3]"))
-    asked = np.zeros(mean.size) if throttle is None else np.asarray(throttle, float) / 1000
-    level = np.rint((asked - np.median(asked)) / _LEVEL).astype(int)
-    level -= level.min()
-    weight = np.where(mean > _ARMED, 1.0, 1e-9)
-    total, count = np.bincount(level, weight * mean), np.bincount(level, weight)
-    return (total / np.where(count > 0, count, 1.0))[level]
-
-
-def _ends(settings: Mapping[str, str]) -> tuple[float, float] | None:
-    """Lowest and highest command of a motor."""
-    try:
-        low, high = (float(x) for x in settings["motorOutput"].split(",")[:2])
-    except (KeyError, ValueError):
-        return None
-    return (low, high) if np.isfinite(high) and high > low else None

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 from .._firmwares import firmware_log
 from .._log import flattened, Log, Signals
 from ._firmware_log import throttle_of
-from ._setup import Setup, values_of
+from ._setup import array_of, Setup, values_of
 
 
 class FlownSpan(NamedTuple):
@@ -43,7 +43,7 @@ def in_flight(
         inside = tuple((a, b) for a, b in cut if a < b)
         if not inside:
             return setup._replace(start=start, stop=stop, segments=())
-        a, b = max(inside, key=lambda each: each[1] - each[0])
+        a, b = max(inside, key=lambda span: span[1] - span[0])
         return setup._replace(start=a, stop=b, segments=inside if len(inside) > 1 else ())
     if start is not None and stop is not None:
         return setup._replace(start=start, stop=stop)
@@ -86,9 +86,30 @@ def flown_span(log: Log) -> FlownSpan:
     if not powered.any():
         remark = f"the throttle stays below {100 * _IDLE:.0f} %: the log seems to hold no flight"
         return FlownSpan(remarks=(remark,))
-    flying = powered & _is_moving(grid, signals, names, powered)
-    lost = _is_lost(grid, signals, names, [_logged(signals, x) for x in firmware.setpoints])
-    return _span(grid, flying, flying & ~lost)
+    # The gyro shows more than at rest; everywhere where the log does not show rest.
+    power = np.zeros(grid.count)
+    for name in names:
+        mean = grid.mean(signals, name)
+        square = grid.mean(signals, name, values_of(signals, name) ** 2)
+        power += np.nan_to_num(np.maximum(square - mean**2, 0.0))
+    under_power = np.flatnonzero(powered)
+    rest = np.delete(power, slice(under_power[0], under_power[-1] + 1))
+    flying = powered
+    if rest.size * _WINDOW >= _SHORTEST / 4:
+        flying = powered & (power > _REST**2 * np.quantile(rest, 0.1))
+    controlled = flying & ~_is_lost(grid, signals, names, firmware.setpoints)
+    # From the first two windows of flight to the last two.
+    first = np.flatnonzero(flying[:-1] & flying[1:])
+    last = np.flatnonzero(controlled[:-1] & controlled[1:])
+    if not first.size or not last.size or (last[-1] + 2 - first[0]) * _WINDOW < _SHORTEST:
+        return FlownSpan()
+    begins, ends = int(first[0]), int(last[-1]) + 2
+    start = grid.begin + begins * _WINDOW if begins > 0 else None
+    stop = grid.begin + ends * _WINDOW if ends + 1 < grid.count else None
+    kind = "a crash" if flying[ends:].any() else "landed"
+    before = "" if start is None else f"t = {grid.begin:.6g} .. {start:.6g} s (on the ground)"
+    after = "" if stop is None else f"t = {stop:.6g} .. {grid.end:.6g} s ({kind})"
+    return FlownSpan(start, stop, before, after)
 
 
 def _logged(signals: Signals, name: str) -> str:
@@ -128,10 +149,6 @@ class _Windows(NamedTuple):
         total = np.bincount(rows, weights=values[good], minlength=self.count)
         return np.divide(total, number, out=np.full(self.count, np.nan), where=number > 0)
 
-    def edge(self, window: int) -> float:
-        """Where a window begins, in s."""
-        return self.begin + window * _WINDOW
-
 
 def _clock(signals: Signals, name: str) -> np.ndarray | None:
     array = name if name in signals.arrays else name.rpartition("[")[0]
@@ -139,56 +156,18 @@ def _clock(signals: Signals, name: str) -> np.ndarray | None:
     return None if signal is None else signals.clocks.get(signal.clock)
 
 
-def _is_moving(
-    grid: _Windows, signals: Signals, names: Sequence[str], powered: np.ndarray
-) -> Bool[np.ndarray, " windows"]:
-    """Whether the gyro shows more than at rest; everywhere where the log does not show rest."""
-    power = np.zeros(grid.count)
-    for name in names:
-        values = values_of(signals, name)
-        mean, square = grid.mean(signals, name), grid.mean(signals, name, values**2)
-        power += np.nan_to_num(np.maximum(square - mean**2, 0.0))
-    under_power = np.flatnonzero(powered)
-    rest = np.delete(power, slice(under_power[0], under_power[-1] + 1))
-    if rest.size * _WINDOW < _SHORTEST / 4:
-        return np.ones(grid.count, bool)
-    return power > _REST**2 * np.quantile(rest, 0.1)
-
-
 def _is_lost(
-    grid: _Windows, signals: Signals, names: Sequence[str], setpoints: Sequence[str]
+    grid: _Windows, signals: Signals, rates: Sequence[str], setpoints: Sequence[str]
 ) -> Bool[np.ndarray, " windows"]:
     """Whether a rate is far from its set-point."""
     lost = np.zeros(grid.count, bool)
-    for rate, setpoint in zip(names, setpoints, strict=False):
+    for rate, setpoint in zip(rates, setpoints, strict=False):
+        setpoint = _logged(signals, setpoint)
         times = _clock(signals, rate), _clock(signals, setpoint) if setpoint else None
         if times[0] is None or times[1] is None:
             continue
-        factor = 180 / np.pi if signals.arrays[_array(signals, rate)].unit == "rad/s" else 1.0
+        factor = 180 / np.pi if array_of(signals, rate)[1] == "rad/s" else 1.0
         wanted = np.interp(times[0], times[1], values_of(signals, setpoint))
         square = grid.mean(signals, rate, (factor * (values_of(signals, rate) - wanted)) ** 2)
         lost |= np.nan_to_num(square) > _LOST**2
     return lost
-
-
-def _array(signals: Signals, name: str) -> str:
-    return name if name in signals.arrays else name.rpartition("[")[0]
-
-
-def _span(
-    grid: _Windows, flying: Bool[np.ndarray, " windows"], controlled: Bool[np.ndarray, " windows"]
-) -> FlownSpan:
-    """From the first two windows of flight to the last two."""
-    first = np.flatnonzero(flying[:-1] & flying[1:])
-    last = np.flatnonzero(controlled[:-1] & controlled[1:])
-    if not first.size or not last.size or (last[-1] + 2 - first[0]) * _WINDOW < _SHORTEST:
-        return FlownSpan()
-    begins, ends = int(first[0]), int(last[-1]) + 2
-    start = grid.edge(begins) if begins > 0 else None
-    stop = grid.edge(ends) if ends + 1 < grid.count else None
-    kind = "a crash" if flying[ends:].any() else "landed"
-    return FlownSpan(
-        start, stop,
-        "" if start is None else f"t = {grid.begin:.6g} .. {start:.6g} s (on the ground)",
-        "" if stop is None else f"t = {stop:.6g} .. {grid.end:.6g} s ({kind})",
-    )  # fmt: skip

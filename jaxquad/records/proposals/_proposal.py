@@ -174,8 +174,16 @@ def _split(setup: Setup, changes: Sequence[SettingChange], signals: Signals) -> 
     inside = [change for change in changes if first < change.time < last]
     if not inside:
         return setup
-    parts = _parts(spans, sorted({change.time for change in inside}))
-    said = f"parameters of the loop changed in flight: {_in_words(inside)}"
+    more = f" and {len(inside) - _SHOWN} more" if len(inside) > _SHOWN else ""
+    said = f"parameters of the loop changed in flight: {', '.join(map(str, inside[:_SHOWN]))}{more}"
+    cuts = sorted({change.time for change in inside})
+    limits = zip([-np.inf, *cuts], [*cuts, np.inf], strict=True)
+    parts = [  # of the spans between the cuts, with the number of cuts before
+        (number, (max(start, low), min(stop, high)))
+        for number, (low, high) in enumerate(limits)
+        for start, stop in spans
+    ]
+    parts = [(number, (a, b)) for number, (a, b) in parts if b - a >= _SHORTEST]
     if not parts:
         remark = f"{said}; no part of {_SHORTEST:g} s has the same ones"
         return setup._replace(remarks=(*setup.remarks, remark))
@@ -183,8 +191,8 @@ def _split(setup: Setup, changes: Sequence[SettingChange], signals: Signals) -> 
     for number, (a, b) in parts:
         lasting[number] = lasting.get(number, 0.0) + b - a
     regime = max(lasting, key=lambda number: lasting[number])
-    alike = tuple(each for number, each in parts if number == regime)
-    start, stop = max(alike, key=lambda each: each[1] - each[0])
+    alike = tuple(span for number, span in parts if number == regime)
+    start, stop = max(alike, key=lambda span: span[1] - span[0])
     others = ", ".join(f"{a:.6g} .. {b:.6g} s" for number, (a, b) in parts if number != regime)
     rest = f" (others: {others})" if others else ""
     remark = f"{said}; split there, what lasted longest with the same ones is taken{rest}"
@@ -194,21 +202,3 @@ def _split(setup: Setup, changes: Sequence[SettingChange], signals: Signals) -> 
         segments=alike if len(alike) > 1 else (),
         remarks=(*setup.remarks, remark),
     )
-
-
-def _parts(
-    spans: Sequence[tuple[float, float]], cuts: Sequence[float]
-) -> list[tuple[int, tuple[float, float]]]:
-    """What the cuts leave of the spans, each with the number of cuts before it."""
-    limits = zip([-np.inf, *cuts], [*cuts, np.inf], strict=True)
-    found = [
-        (number, (max(start, low), min(stop, high)))
-        for number, (low, high) in enumerate(limits)
-        for start, stop in spans
-    ]
-    return [(number, (a, b)) for number, (a, b) in found if b - a >= _SHORTEST]
-
-
-def _in_words(changes: Sequence[SettingChange]) -> str:
-    more = f" and {len(changes) - _SHOWN} more" if len(changes) > _SHOWN else ""
-    return f"{', '.join(map(str, changes[:_SHOWN]))}{more}"

@@ -1,3 +1,6 @@
+"""The channels of an axis that a log proposes, and the flights of a file: one for each arming."""
+
+import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -8,11 +11,35 @@ from .._errors import printable, RecordError
 from .._firmwares import firmware_log, firmware_names
 from .._log import Log
 from ..formats import load_log
-from ._firmware_log import FirmwareLog
-from ._flights import choose_flight
+from ._firmware_log import Flight, one_flight
 from ._flown_span import in_flight
 from ._proposal import complete, Proposal
 from ._setup import AXES, Selection
+
+
+def flights(path: str | Path) -> list[Flight]:
+    """List the flights that a file holds.
+
+    A Betaflight file from a flash chip holds one for each arming. Logs of other vehicles count as
+    one flight.
+
+    **Arguments:**
+
+    - `path`: a log of an autopilot.
+
+    **Returns:** a `Flight` for each, in the order of the file.
+
+    **Raises:**
+
+    - `ReadError`: where the file is missing, damaged or of an unknown format.
+    """
+    return list(_flights_of(load_log(path)))
+
+
+def _flights_of(log: Log) -> tuple[Flight, ...]:
+    """Those that have enough samples for a record."""
+    firmware = firmware_log(log.vehicle)
+    return one_flight(log) if firmware is None else firmware.flights(log)
 
 
 def propose(
@@ -55,9 +82,9 @@ def propose(
     log = load_log(path)
     firmware = firmware_log(log.vehicle)
     if firmware is None:
-        known = ", ".join(firmware_names())
+        names = ", ".join(firmware_names())
         raise RecordError(
-            f"{path}: not a log of a known autopilot ({known}), so the meaning of its channels is "
+            f"{path}: not a log of a known autopilot ({names}), so the meaning of its channels is "
             "unknown. jaxquad identify takes it all the same: list them (jaxquad channels"
             "«, jq.records.channels») and «name inputs, outputs and references yourself»."
         )
@@ -68,7 +95,18 @@ def propose(
         )
     try:
         low, high = (None if end is None else float(end) for end in (start, stop))
-        return _proposed(str(path), log, firmware, Selection(axis, chirp, low, high), flight)
+        wanted = Selection(axis, chirp, low, high)
+        log, choice = _choose_flight(log, axis, flight)
+        setup = in_flight(log, firmware.setup(log, wanted), low, high)
+        setup = setup._replace(remarks=(*choice, *setup.remarks))
+        proposal = complete(str(path), log, firmware, setup)
+        setup = proposal.setup
+        used = [
+            (-np.inf if start is None else start, np.inf if stop is None else stop)
+            for start, stop in setup.segments or ((setup.start, setup.stop),)
+        ]
+        further = firmware.remarks_on(log, setup, used)
+        return proposal._replace(setup=setup._replace(remarks=(*setup.remarks, *further)))
     except RecordError as error:
         raise RecordError(f"{path}: {marked_text(error)}") from error
     # A log may call anything by the names that its vehicle uses.
@@ -80,16 +118,36 @@ def propose(
         ) from error
 
 
-def _proposed(
-    path: str, log: Log, firmware: FirmwareLog, wanted: Selection, flight: int | None
-) -> Proposal:
-    log, choice = choose_flight(log, wanted.axis, flight)
-    setup = in_flight(log, firmware.setup(log, wanted), wanted.start, wanted.stop)
-    proposal = complete(path, log, firmware, setup._replace(remarks=(*choice, *setup.remarks)))
-    setup = proposal.setup
-    used = [
-        (-np.inf if start is None else start, np.inf if stop is None else stop)
-        for start, stop in setup.segments or ((setup.start, setup.stop),)
-    ]
-    further = firmware.remarks_on(log, setup, used)
-    return proposal._replace(setup=setup._replace(remarks=(*setup.remarks, *further)))
+def _choose_flight(log: Log, axis: str | None, number: int | None) -> tuple[Log, tuple[str, ...]]:
+    """The log of one flight, and a remark on the choice where the file holds several.
+
+    By default the longest with a chirp, without one the longest with sticks that move, else the
+    longest. Channels keep their names in the file; settings have the names of a single log. Raises
+    RecordError for a number that the file does not have.
+    """
+    every = _flights_of(log)
+    if not every and number is None:
+        return log, ()
+    if number is None:
+        chosen = max(every, key=lambda flight: (flight.rank(axis), flight.duration))
+    else:
+        chosen = next((flight for flight in every if flight.number == number), None)
+    if chosen is None:
+        listed = "; ".join(map(str, every)) or "none"
+        raise RecordError(
+            f"flight is {number}, but the file holds: {listed}. Choose one («flight=»)."
+        )
+    if not (name := chosen.log):
+        return log, ()
+    on = f" on {axis}" if axis else ""
+    kinds = (f", as none is excited{on}", f" with sticks that move{on}", f" with a chirp{on}")
+    reason = "" if number is not None else f", the longest{kinds[chosen.rank(axis)]}"
+    others = "; ".join(str(flight) for flight in every if flight is not chosen)
+    remark = f"{chosen} is used{reason}; others of this file (--flight N): {others or 'none'}"
+    tables = {k: t for k, t in log.tables.items() if k == name or k.startswith(f"{name}.")}
+    settings = {
+        key.removeprefix(f"{name} "): text
+        for key, text in log.settings.items()
+        if key.startswith(f"{name} ")
+    }
+    return dataclasses.replace(log, tables=tables, settings=settings), (remark,)

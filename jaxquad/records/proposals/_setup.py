@@ -95,19 +95,19 @@ class Setup(NamedTuple):
 def with_injections(setup: Setup, runs: Sequence[Injection], what: str) -> Setup:
     """The `setup` with what was injected and when: all `runs` of one kind."""
     best = max(runs, key=lambda run: run.stop - run.start)
-    known = [run for run in runs if 0 < run.low < run.high]
-    band = (min(r.low for r in known), max(r.high for r in known)) if known else None
+    swept = [run for run in runs if 0 < run.low < run.high]
+    band = (min(r.low for r in swept), max(r.high for r in swept)) if swept else None
     lasted = " + ".join(f"{run.stop - run.start:.4g}" for run in runs)
     times = f"{len(runs)} times: " if len(runs) > 1 else ""
-    swept = ""
+    span = ""
     if band:
         low, high = (2 * np.pi * end for end in band)
-        swept = f"{band[0]:.4g} .. {band[1]:.4g} Hz ({low:.3g} .. {high:.3g} rad/s), "
+        span = f"{band[0]:.4g} .. {band[1]:.4g} Hz ({low:.3g} .. {high:.3g} rad/s), "
     return setup._replace(
         start=best.start,
         stop=best.stop,
         band=band,
-        excitation=f"{what}, {times}{swept}{lasted} s",
+        excitation=f"{what}, {times}{span}{lasted} s",
         segments=tuple((run.start, run.stop) for run in runs) if len(runs) > 1 else (),
     )
 
@@ -119,7 +119,22 @@ def choose_chirps(chirps: Sequence[NumberedChirp], wanted: Selection) -> list[Nu
     no other. Raises RecordError for a number that no chirp has.
     """
     if wanted.chirp is not None:
-        return [_numbered(chirps, wanted)]
+        listed = "; ".join(map(str, chirps)) or "none"
+        chirp = next((x for x in chirps if x.number == wanted.chirp), None)
+        if chirp is None:
+            raise RecordError(f"there is no chirp {wanted.chirp}. Chirps of this log: {listed}.")
+        if wanted.axis not in (None, chirp.axis):
+            raise RecordError(
+                f"chirp {wanted.chirp} is not on the axis {wanted.axis}: leave one of them out. "
+                f"Chirps of this log: {listed}."
+            )
+        part = wanted.part_of(chirp)
+        if part is None:
+            raise RecordError(
+                f"chirp {wanted.chirp} lies outside the span of start and stop: leave them out. "
+                f"Chirps of this log: {listed}."
+            )
+        return [part]
     inside = [part for chirp in chirps if (part := wanted.part_of(chirp))]
     turning = [chirp for chirp in inside if chirp.axis]
     candidates = [chirp for chirp in turning if wanted.axis in (None, chirp.axis)]
@@ -128,25 +143,6 @@ def choose_chirps(chirps: Sequence[NumberedChirp], wanted: Selection) -> list[Nu
         return []
     best = max(candidates, key=lambda chirp: chirp.stop - chirp.start)
     return [x for x in candidates if (x.axis, x.place) == (best.axis, best.place)]
-
-
-def _numbered(chirps: Sequence[NumberedChirp], wanted: Selection) -> NumberedChirp:
-    listed = "; ".join(map(str, chirps)) or "none"
-    chirp = next((x for x in chirps if x.number == wanted.chirp), None)
-    if chirp is None:
-        raise RecordError(f"there is no chirp {wanted.chirp}. Chirps of this log: {listed}.")
-    if wanted.axis not in (None, chirp.axis):
-        raise RecordError(
-            f"chirp {wanted.chirp} is not on the axis {wanted.axis}: leave one of them out. Chirps "
-            f"of this log: {listed}."
-        )
-    part = wanted.part_of(chirp)
-    if part is None:
-        raise RecordError(
-            f"chirp {wanted.chirp} lies outside the span of start and stop: leave them out. Chirps "
-            f"of this log: {listed}."
-        )
-    return part
 
 
 def channel_rate(signals: Signals, name: str) -> float:
@@ -191,10 +187,10 @@ def moves(signals: Signals, name: str) -> bool:
 
 def most_active_axis(signals: Signals, rates: Mapping[str, str]) -> str:
     """The axis whose rate varies most; one of them has to have a name."""
-    spread = {axis: _spread(values_of(signals, name)) for axis, name in rates.items() if name}
+    spread = {}
+    for axis, name in rates.items():
+        values = values_of(signals, name)
+        finite = values[np.isfinite(values)]
+        if name:
+            spread[axis] = float(finite.std()) if finite.size else 0.0
     return max(spread, key=lambda axis: spread[axis])
-
-
-def _spread(values: np.ndarray) -> float:
-    finite = values[np.isfinite(values)]
-    return float(finite.std()) if finite.size else 0.0

@@ -1,0 +1,408 @@
+"""An identified log: its parameters and responses as text, figures, a page and a result file."""
+
+import dataclasses
+import functools as ft
+import shlex
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxquad._core import announce, marked_text, Message
+from jaxquad.autopilot import FlownLaw
+from jaxquad.identify import (
+    Bands,
+    Combination,
+    Explanation,
+    factors,
+    Fit,
+    KnownFilter,
+    UndeterminedError,
+    Verification,
+)
+from jaxquad.models import LaggedIntegrator, TransferFunction
+from jaxquad.records import (
+    clock_start,
+    Proposal,
+    read,
+    Record,
+    RecordError,
+    RecordWarning,
+    show_times,
+)
+from jaxquad.report import LawLoop, PageWarning, provenance, reason_of, write_results
+from jaxquad.spectra import FrequencyResponse
+
+from ._log import mix_of
+from ._result_file import default_folder
+from ._settings import IdentifySettings
+
+
+if TYPE_CHECKING:
+    from jaxquad.plot import Panels
+
+
+Model = LaggedIntegrator | TransferFunction
+HALVES, EXPLAINED = "Lower and upper half of the band", "What explains the misfit"
+
+
+@dataclasses.dataclass(frozen=True)
+class Identification:
+    """One identified log, as `identify` returns it; `str()` is its report as text.
+
+    **Attributes:**
+
+    - `path`: of the log.
+    - `settings`: those that were used, a proposal included.
+    - `records`: one for each segment of each log.
+    - `responses`: the frequency response by method, the one to trust first.
+    - `fits`: the fit to each of them.
+    - `parts`: where the misfit is large, the fit beside those to the upper and to the lower part of
+      the band; None for one that diverged.
+    - `proposal`: where the log itself said what is input and output.
+    - `more`: the logs that were taken together with the first.
+    - `flown`: the gyro's filters and the law of an autopilot's log, up to whose filters the model
+      is, unless `settings.keep_gyro_filters`.
+    - `check`: the second record simulated, where `settings.verify` names one.
+    - `bands`: the same parameters from the lower and the upper half of the band, where there is a
+      fit.
+    - `explanation`: which further term the response wants, where `settings.explain` asks for it and
+      the misfit exceeds 1.5 random errors.
+    - `failures`: by title, why something beside the fit could not be computed.
+    """
+
+    path: Path
+    settings: IdentifySettings
+    records: tuple[Record, ...]
+    responses: Mapping[str, FrequencyResponse]
+    fits: Mapping[str, Fit]
+    parts: Mapping[str, Fit | None]
+    proposal: Proposal | None = None
+    more: tuple[Path, ...] = ()
+    flown: FlownLaw | None = None
+    check: Verification | None = None
+    bands: Bands | None = None
+    explanation: Explanation | None = None
+    failures: Mapping[str, Message] = dataclasses.field(default_factory=dict)
+
+    @property
+    def filters(self) -> tuple[KnownFilter, ...]:
+        """Those of the gyro that are divided out of the responses."""
+        if self.flown is None or self.settings.keep_gyro_filters:
+            return ()
+        return self.flown.filters
+
+    @property
+    def filters_text(self) -> str:
+        """What is divided out, or why nothing is; empty where the log is no autopilot's."""
+        if self.flown is None:
+            return ""
+        if self.flown.filters and not self.filters:
+            return "the gyro's filters are in the model, as `keep_gyro_filters` asks"
+        return self.flown.text
+
+    @property
+    def paths(self) -> tuple[Path, ...]:
+        """All logs that were identified together."""
+        return self.path, *self.more
+
+    @property
+    def title(self) -> str:
+        """The name of the log, and how many others were taken with it."""
+        others = f" and {len(self.more)} more" if self.more else ""
+        return f"{self.path.name}{others}"
+
+    @property
+    def method(self) -> str:
+        """The estimate to trust: joint with an external reference, else direct."""
+        return next(iter(self.responses))
+
+    @property
+    def frf(self) -> FrequencyResponse:
+        """The frequency response that was fitted."""
+        return self.responses[self.method]
+
+    @property
+    def fit(self) -> Fit:
+        """The fit to it, with its verdict."""
+        return self.fits[self.method]
+
+    @property
+    def band(self) -> tuple[float, float]:
+        """The band of the response that was fitted, in rad/s."""
+        omega = np.asarray(self.frf.omega)
+        return float(omega[0]), float(omega[-1])
+
+    @property
+    def largest_command(self) -> float:
+        """How far the input went from its mean to either side, in its unit."""
+        inputs = [np.asarray(record.inputs)[:, 0] for record in self.records]
+        return max(float(np.max(np.abs(x - np.mean(x)))) for x in inputs)
+
+    @property
+    def formula(self) -> str:
+        """The structure of the model in words."""
+        return model_formula(self.settings, damped="damping" in self.fit.names)
+
+    @property
+    def sums(self) -> Mapping[str, Callable[[Model], Float[Array, ""]]]:
+        """The quantities that are shown beside the parameters, all in s."""
+        settings = self.settings
+        both = settings.poles is None and settings.lag and settings.delay
+        return {"lag + delay": total_delay} if both else {}
+
+    @ft.cached_property
+    def combinations(self) -> tuple[Combination, ...]:
+        """The sum of lag and delay, where the record determines it."""
+        try:
+            return tuple(map(self._sum, self.sums))
+        except UndeterminedError:
+            return ()
+
+    def _sum(self, name: str) -> Combination:
+        return self.fit.derived(self.sums[name], name)._replace(unit="s")
+
+    @property
+    def supplements(self) -> dict[str, str]:
+        """What goes with the fit as text, by title: halves of the band, what explains a misfit."""
+        texts = {HALVES: self.bands, EXPLAINED: self.explanation}
+        return {title: str(text) for title, text in texts.items() if text is not None} | {
+            title: Message(f"could not be computed: {why.marked}")
+            for title, why in self.failures.items()
+        }
+
+    @property
+    def figure_names(self) -> tuple[str, ...]:
+        """The names of the files of `figures()`, without drawing any."""
+        numbers = ("", *(f"_{k}" for k in range(2, len(self.records) + 1)))
+        records = [f"record{number}.png" for number in numbers]
+        return *records, "bode.png", *(() if self.check is None else ("verification.png",))
+
+    def figures(self) -> "dict[str, Panels]":
+        """The figures by file name: records, Bode diagram, and the check on a second record."""
+        return {name: draw() for name, draw in self.drawings().items()}
+
+    def drawings(self) -> "dict[str, Callable[[], Panels]]":
+        """What draws each of the `figures()`, by file name."""
+        from jaxquad.plot import bode, compare, headless, record_figure  # here: matplotlib is slow
+
+        stopped = self.fit.verdict.kind in ("no model", "no minimum")
+        name = f"{self.fit.verdict.kind}: where the fit stopped" if stopped else "identified"
+        models = {name: self.fit} if self.fit.verdict.fitted else {}
+        drawings = [ft.partial(record_figure, record) for record in self.records]
+        drawings += [ft.partial(bode, self.frf, self._other_responses, models, title=self.title)]
+        if self.check is not None:
+            verified = Path(self.settings.verify or "").name
+            drawings += [ft.partial(compare, self.check, title=verified)]
+        silent = [headless()(draw) for draw in drawings]
+        return dict(zip(self.figure_names, silent, strict=True))
+
+    @property
+    def _other_responses(self) -> dict[str, FrequencyResponse]:
+        return {f"{name} estimate": self.responses[name] for name in list(self.responses)[1:]}
+
+    def __str__(self) -> str:
+        return str(self.message())
+
+    def message(self) -> Message:
+        """What it prints, as a message that the command line puts into its own words."""
+        from jaxquad.report import compare_fits  # here: with it come the templates of pages
+
+        def text_or_reason(compute: Callable[[], object]) -> str:
+            try:
+                return str(compute())
+            except UndeterminedError as error:
+                return marked_text(error)
+
+        first, *others = map(str, self.records)
+        record = "\n".join([first, *(f"and {text.splitlines()[1].strip()}" for text in others)])
+        frf = dataclasses.replace(self.frf, remarks=())  # the fit repeats what concerns it
+        parts = [f"{record}\n\n{frf}"]
+        parts += [f"\n{self.filters_text}"] if self.filters_text else []
+        parts += [f"\n{self.formula}, {self.method} estimate:\n{self.fit}"]
+        if self.settings.poles is not None and self.fit.verdict.fitted:
+            parts += [text_or_reason(lambda: factors(self.fit))]
+        if self.settings.reference:
+            parts += [f"\n{compare_fits(self.fits, self.sums)}"]
+        elif self.fit.verdict.fitted:
+            shown = [combination.name for combination in self.fit.combinations]
+            sums = [name for name in self.sums if name not in shown]
+            parts += [text_or_reason(ft.partial(self._sum, name)) for name in sums]
+        parts += _on_negative_gain(self.fit, self.frf)
+        if self.parts:
+            parts += [f"\nFits to parts of the band:\n{compare_fits(self.parts, self.sums)}"]
+        parts += [f"\n{title}:\n{marked_text(x)}" for title, x in self.supplements.items()]
+        parts += [f"\n{self.check}"] if self.check else []
+        return Message("\n".join(parts))
+
+    def write(self, folder: str | Path | None = None) -> Path:
+        """Write `result.json`, `report.html` and the figures, by default to results/NAME.
+
+        **Returns:** the path of `result.json`.
+        """
+        announce("figures and report")
+        folder, settings, first = Path(folder or default_folder(self.path)), self.settings, self.fit
+        sources = [*self.paths, *([settings.verify] if settings.verify else [])]
+        command = shlex.join(["jaxquad", "identify", *map(str, self.paths), *settings.words()])
+        origin = provenance(*sources, command=command)
+        spans = [[float(record.time[0]), float(record.time[-1])] for record in self.records]
+        extra = {
+            "record": {
+                "file": str(self.path),
+                "more_files": [str(path) for path in self.more],
+                "start_s": min(start for start, _ in spans),
+                "stop_s": max(stop for _, stop in spans),
+                "segments_s": spans,
+                "sample_rate_hz": self.records[0].sample_rate,
+                "largest_command": self.largest_command,
+            },
+            "settings": settings.content(),
+            "band_rad_per_s": self.band,
+            "band_hz": [omega / (2 * np.pi) for omega in self.band],
+            "used_band_rad_per_s": first.used_band,
+            "derived": [combination.content() for combination in self.combinations],
+            "provenance": origin.content(),
+        }
+        if self.flown and self.filters:
+            extra["gyro_filters"] = self.flown.content()
+        extra |= _supplements_content(self.bands, self.explanation)
+        if first.verdict.fitted:
+            numbers = vars(first.model).items()
+            plain = {k: v if isinstance(v, int) else np.asarray(v).tolist() for k, v in numbers}
+            extra["model"] = {"kind": type(first.model).__name__} | plain
+        path = write_results(folder, fit=first, frf=self.frf, check=self.check, extra=extra)
+        from jaxquad.report import write_report  # here: with it comes matplotlib
+
+        write_report(
+            folder / "report.html",
+            fit=first,
+            frf=self.frf,
+            others=self._other_responses,
+            record={_record_title(record, self.more): record for record in self.records},
+            spectrum=_record_with_throttle(self),
+            checks={} if self.check is None else {Path(sources[-1]).name: self.check},
+            derived=self.combinations,
+            provenance=origin,
+            filters=self.filters,
+            law=_law_if_any(self),
+            formula="; ".join(filter(None, (self.formula, self.filters_text))),
+            beside=self.supplements,
+        )
+        self._write_figures(folder)
+        return path
+
+    def _write_figures(self, folder: Path) -> None:
+        """Those that can be drawn; a `PageWarning` for each other one, of which no file is left."""
+        for earlier in (folder / "verification.png", *folder.glob("record_*.png")):
+            if earlier.name not in self.figure_names:
+                earlier.unlink(missing_ok=True)
+        for name, draw in self.drawings().items():
+            try:
+                draw().figure.savefig(folder / name, dpi=130)
+            except OSError:
+                raise
+            except Exception as error:
+                (folder / name).unlink(missing_ok=True)
+                text = f"{name} could not be drawn: {reason_of(error).marked}"
+                warnings.warn(text, PageWarning, stacklevel=3)
+
+
+def total_delay(model: Model) -> Float[Array, ""]:
+    """The sum of lag and delay, which a record determines better than either of them."""
+    return model.delay if isinstance(model, TransferFunction) else model.lag + model.delay
+
+
+def model_formula(settings: IdentifySettings, *, damped: bool = False) -> str:
+    """The structure of the model, such as `q / M = K e^(-delay s) / (s (lag s + 1))`."""
+    n = settings.integrators
+    [output], [source] = mix_of(settings.output), mix_of(settings.input)
+    if settings.poles is not None:
+        kind = f"{settings.zeros} zeros over {settings.poles} poles and {n} integrators"
+        return f"{output} / {source}, {kind}{', delayed' if settings.delay else ''}"
+    pure = n - damped
+    below = [] if pure == 0 else ["s"] if pure == 1 else [f"s^{pure}"]
+    below += ["(s + damping)"] if damped else []
+    below += ["(lag s + 1)"] if settings.lag else []
+    above, product = "K e^(-delay s)" if settings.delay else "K", " ".join(below)
+    ratio = f" / ({product})" if len(below) > 1 else f" / {product}" if below else ""
+    return f"{output} / {source} = {above}{ratio}"
+
+
+def _on_negative_gain(fit: Fit, frf: FrequencyResponse) -> list[str]:
+    """What to check where the output moves against the input; that is no fault of the fit."""
+    above = [name == "gain" or name.startswith("numerator[") for name in fit.names]
+    if not np.all(fit.determined[above] & (fit.values[above] < 0)):
+        return []
+    source, output = frf.input_names[0], frf.output_names[0]
+    return [
+        f"the gain is negative: when {source} rises, {output} falls. If it should rise, check the "
+        f"signs of both channels and of the axis; jaxquad tune needs a positive gain "
+        "(--input NAME=-CHANNEL)"
+    ]
+
+
+def _record_title(record: Record, more: Sequence[Path]) -> str:
+    start = clock_start(record.time)
+    span = f"t = {show_times(record.time[0], record.time[-1], start=start)}"
+    return f"{Path(record.source).name}, {span}" if more else span
+
+
+def _law_if_any(found: Identification) -> LawLoop | None:
+    from jaxquad.autopilot import loop_of_law
+
+    try:
+        [unit] = found.records[0].output_units
+        return loop_of_law(found.flown, found.fit, found.frf, found.filters, unit)
+    except Exception as error:  # the record shows its loop without the law, too
+        text = f"the loop by its law is missing: {reason_of(error).marked}"
+        warnings.warn(text, PageWarning, stacklevel=2)
+        return None
+
+
+def _record_with_throttle(found: Identification) -> Record | None:
+    """The first record with the throttle that the log's proposal names; None without one."""
+    proposal, first = found.proposal, found.records[0]
+    if proposal is None or not proposal.setup.throttle:
+        return None
+    options = proposal.options_with_throttle
+    options |= {"start": float(first.time[0]), "stop": float(first.time[-1])}
+    options |= {"sample_rate": first.sample_rate, "max_gap": found.settings.max_gap}
+    try:
+        with warnings.catch_warnings():  # the record has said what was repaired
+            warnings.simplefilter("ignore", RecordWarning)
+            return read(found.path, **options)
+    except RecordError as error:
+        announce(f"no spectrum over the throttle: {error}")
+        return None
+
+
+def _supplements_content(bands: Bands | None, explanation: Explanation | None) -> dict[str, object]:
+    """The halves of the band, and what explains the misfit."""
+    content: dict[str, object] = {}
+    if bands is not None:
+        halves = {"lower": bands.lower, "upper": bands.upper}
+        content["half_bands"] = {"split_rad_per_s": bands.split} | {
+            name: None if half is None else _intervals(half) for name, half in halves.items()
+        }
+    if explanation is not None:
+        tried = [
+            {"term": x.title, "factor": x.formula, "bic_lower_by": x.gain}
+            for x in explanation.candidates
+        ]
+        content["explanation"] = {"summary": explanation.summary, "tried": tried}
+    return content
+
+
+def _intervals(fit: Fit) -> list[dict[str, object]]:
+    return [
+        {
+            "name": name,
+            "value": fit.values[k],
+            "interval_95": fit.interval(name),
+            "determined": bool(fit.determined[k]),
+        }
+        for k, name in enumerate(fit.names if fit.verdict.fitted else ())
+    ]
