@@ -26,7 +26,7 @@ from jaxquad.simulation import (
     Window,
 )
 from jaxquad.simulation._evaluate import _run
-from jaxquad.simulation._over_devices import devices_for, where_put
+from jaxquad.simulation._parallel import devices_for, where_put
 
 
 MEMBERS, SAMPLES = 67, 120  # no multiple of two

@@ -1,7 +1,6 @@
 from ._autopilot import autopilot as autopilot
-from ._batch._jobs import Job as Job
-from ._batch._run import batch as batch, find_logs as find_logs
-from ._batch._settings import BatchSettings as BatchSettings, Override as Override
+from ._batch import batch as batch, find_logs as find_logs
+from ._batch_workers import Job as Job
 from ._command_line import in_options as in_options
 from ._demo import (
     DEMO as DEMO,
@@ -16,12 +15,12 @@ from ._identify import (
     identify_opened as identify_opened,
     verify_result as verify_result,
 )
-from ._kinds import SettingsError as SettingsError
 from ._log import (
     open_logs as open_logs,
     OpenedLogs as OpenedLogs,
     propose_settings as propose_settings,
 )
+from ._options import SettingsError as SettingsError
 from ._result_file import (
     default_folder as default_folder,
     free_folder as free_folder,
@@ -31,11 +30,11 @@ from ._result_file import (
     StoredTuning as StoredTuning,
 )
 from ._settings import (
+    AutopilotSettings as AutopilotSettings,
+    BatchSettings as BatchSettings,
     GROUPS as GROUPS,
     IdentifySettings as IdentifySettings,
-)
-from ._tune import tune as tune, Tuning as Tuning
-from ._tune_settings import (
-    AutopilotSettings as AutopilotSettings,
+    Override as Override,
     TuneSettings as TuneSettings,
 )
+from ._tune import tune as tune, Tuning as Tuning

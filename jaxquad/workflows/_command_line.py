@@ -6,9 +6,7 @@ option, `--max-gap`, or the command, `jaxquad verify`.
 
 from jaxquad._core import marked_text, Message
 
-from ._batch._settings import BatchSettings
-from ._settings import IdentifySettings
-from ._tune_settings import AutopilotSettings, TuneSettings
+from ._settings import AutopilotSettings, BatchSettings, IdentifySettings, TuneSettings
 
 
 _FLAGS = {

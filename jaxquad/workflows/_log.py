@@ -21,7 +21,7 @@ from jaxquad.records import (
 )
 from jaxquad.report import sha256_of
 
-from ._kinds import mix_text, SettingsError
+from ._options import mix_text, SettingsError
 from ._result_file import load_result, StoredResult
 from ._settings import IdentifySettings
 

@@ -8,8 +8,7 @@ from typing import Any, NamedTuple, TYPE_CHECKING
 
 import numpy as np
 
-from ._settings import IdentifySettings
-from ._tune_settings import TuneSettings
+from ._settings import IdentifySettings, TuneSettings
 
 
 if TYPE_CHECKING:

@@ -1,169 +1,41 @@
 """Settings of the workflows: the same in Python, on the command line, in TOML and in results."""
 
 import dataclasses
-import difflib
-import tomllib
-from collections.abc import Iterable, Mapping, Sequence
-from pathlib import Path
-from typing import Literal, NamedTuple, TypeVar
+import functools as ft
+from collections.abc import Iterator, Mapping, Sequence
+from fnmatch import fnmatchcase
+from typing import Literal, NamedTuple
 
-from . import _kinds as kinds
-from ._kinds import convert, Pair, SettingsError, Value
-
-
-class Option(NamedTuple):
-    """How a setting is said on the command line, and what its help says."""
-
-    kind: kinds.Kind
-    help: str
-    group: str
-    flag: str
-
-
-def option_field(
-    kind: kinds.Kind, default: Value, help: str, *, group: str = "", flag: str = ""
-) -> Value:
-    metadata = {"option": Option(kind, help, group, flag)}
-    if isinstance(default, dict):
-        return dataclasses.field(default_factory=default.copy, metadata=metadata)
-    return dataclasses.field(default=default, metadata=metadata)
+from . import _options as kinds
+from ._options import (
+    check_keys,
+    convert,
+    option_field,
+    Pair,
+    REPLACED,
+    S,
+    Settings,
+    SettingsError,
+    updated,
+    Value,
+    within_file,
+)
 
 
-_REQUIRED = dataclasses.MISSING
-THE_RECORD = _PART = "the record"
-_ESTIMATE, _MODEL, _CHECK = "the estimate", "the model", "a second record"
-GROUPS = (THE_RECORD, _ESTIMATE, _MODEL, _CHECK)  # in the order in which help shows them
-REPLACED: Mapping[str, Sequence[str]] = {  # the keys that a key takes the place of
-    "segments": ("start", "stop"),
-    "start": ("segments",),
-    "stop": ("segments",),
-    "band": ("band_rad",),
-    "band_rad": ("band",),
-}
-
-
-S = TypeVar("S", bound="Settings")
-
-
-class Settings:
-    """Frozen dataclasses whose fields are declared by `option_field`, which says what they take."""
-
-    __no_type_check__ = True  # in tests: fields are converted, such as a list to a tuple
-
-    @classmethod
-    def options(cls) -> dict[str, Option]:
-        """How each setting is said, by its key."""
-        fields = dataclasses.fields(cls)  # pyright: ignore[reportArgumentType]
-        found = {field.name: field.metadata["option"] for field in fields}
-        flags = {key: each.flag or f"--{key.replace('_', '-')}" for key, each in found.items()}
-        return {key: each._replace(flag=flags[key]) for key, each in found.items()}
-
-    @classmethod
-    def defaults(cls) -> dict[str, Value]:
-        fields = dataclasses.fields(cls)  # pyright: ignore[reportArgumentType]
-        return {f.name: {} if f.default is _REQUIRED else f.default for f in fields}
-
-    @classmethod
-    def from_mapping(cls: type[S], content: Mapping[str, object], where: str = "") -> S:
-        """Settings from what TOML or JSON hold; `where` begins the message of an error.
-
-        Raises SettingsError for an unknown key, with the most similar known one, for a required
-        key that is missing, and for values that cannot be.
-        """
-        try:
-            check_keys(content, cls.options())
-            missing = [
-                each.name
-                for each in dataclasses.fields(cls)  # pyright: ignore[reportArgumentType]
-                if each.default is each.default_factory is _REQUIRED and each.name not in content
-            ]
-            if missing:
-                keys = " and ".join(f"`{key}`" for key in missing)
-                raise SettingsError(f"{keys} must be given")
-            return cls(**content)
-        except SettingsError as error:
-            raise within_file(where, error) from error
-
-    @classmethod
-    def from_toml(cls: type[S], path: str | Path) -> S:
-        """As `from_mapping`, from a TOML file."""
-        return cls.from_mapping(read_toml(path), str(path))
-
-    def content(self) -> dict[str, Value]:
-        """All settings, for JSON; `from_mapping` reads them."""
-        return {key: vars(self)[key] for key in self.options()}
-
-    def given(self) -> dict[str, Value]:
-        """The settings that differ from their defaults."""
-        defaults = self.defaults()
-        return {key: value for key, value in self.content().items() if value != defaults[key]}
-
-    def changed(self: S, changes: Mapping[str, object]) -> S:
-        """These settings with others for some keys; `band` takes the place of `band_rad`, etc."""
-        return self.from_mapping(updated(self.given(), changes))
-
-    def words(self) -> list[str]:
-        """The options on the command line that stand for these settings."""
-        options = self.options()
-        return [w for key, value in self.given().items() for w in _words(options[key], value)]
-
-    def __post_init__(self):
-        for key, option in self.options().items():
-            object.__setattr__(self, key, self._converted(key, option.kind))
-        self._check_together()
-
-    def _converted(self, key: str, kind: kinds.Kind) -> Value:
-        value = vars(self)[key]
-        if value is None and self.defaults()[key] is None:
-            return None
-        return convert(key, kind, value)
-
-    def _check_together(self) -> None:
-        pass
-
-
-def _words(option: Option, value: Value) -> list[str]:
-    kind, flag = option.kind, option.flag
-    if kind.words == 0:
-        return [flag]
-    if kind.repeated:
-        items = value.items() if isinstance(value, Mapping) else value
-        texts = [kind.write(each) for each in items]
-        # A negative start by itself would be taken for an option.
-        each = [[f"{flag}={text}"] if text.startswith("-") else [flag, text] for text in texts]
-        return [word for words in each for word in words]
-    return [flag, *(kind.write(each) for each in (value if kind.words > 1 else [value]))]
-
-
-def within_file(where: str, error: SettingsError) -> SettingsError:
-    """In a file, keys are what they are: no flags of the command line stand for them."""
-    return SettingsError(f"{where}: {error}".replace("`", "") if where else str(error))
-
-
-def check_keys(content: Mapping[str, object], known: Iterable[str]) -> None:
-    """Raise SettingsError for the first key that is not known."""
-    known = list(known)
-    for key in content:
-        if key not in known:
-            near = difflib.get_close_matches(key, known, n=1, cutoff=0.4)
-            hint = f"did you mean {near[0]!r}?" if near else f"known keys: {', '.join(known)}"
-            raise SettingsError(f"unknown key {key!r}; {hint}")
-
-
-def read_toml(path: str | Path) -> dict[str, object]:
-    """Raises SettingsError for a file that is not TOML, and for none."""
-    try:
-        return tomllib.loads(Path(path).read_text())
-    except FileNotFoundError as error:
-        raise SettingsError(f"{path}: there is no such file in {Path.cwd()}") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise SettingsError(f"{path}: not TOML: {error}") from error
-
-
-def updated(content: Mapping[str, object], changes: Mapping[str, object]) -> dict[str, object]:
-    """`content` with `changes`; keys that say the same in another way go (band for band_rad)."""
-    gone = {old for key in changes for old in REPLACED.get(key, ()) if old not in changes}
-    return {key: value for key, value in content.items() if key not in gone} | dict(changes)
+_MISSING = dataclasses.MISSING
+# In the order in which help shows them.
+GROUPS = ("the record", "the estimate", "the model", "a second record")
+_record, _estimate, _model, _check = (ft.partial(option_field, group) for group in GROUPS)
+_which_chirp = ft.partial(
+    _record, kinds.SIZE, None,
+    "the number of the one to use of the chirps that a log's proposal lists; by default the "
+    "longest, with all others on its axis at its place",
+)  # fmt: skip
+_which_flight = ft.partial(
+    _record, kinds.SIZE, None,
+    "the number of the flight in a file with several; by default the longest with a chirp, "
+    "else the longest with sticks that move",
+)  # fmt: skip
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -185,232 +57,422 @@ class IdentifySettings(Settings):
         ```
     """
 
-    input: str | None = option_field(
+    input: str | None = _record(
         kinds.MIX,
         None,
         "a channel, or a weighted sum NAME=-a+b+0.5*c, also with powers: NAME=0.1*a^2; "
         "by default the log of a known autopilot proposes input and output",
-        group=THE_RECORD,
     )
-    output: str | None = option_field(kinds.MIX, None, "likewise", group=THE_RECORD)
-    reference: str | None = option_field(
+    output: str | None = _record(kinds.MIX, None, "likewise")
+    reference: str | None = _record(
         kinds.MIX,
         None,
         "an external signal that no feedback computes; with it, the joint input-output "
         "estimate is made beside the direct one",
-        group=THE_RECORD,
     )
-    axis: str | None = option_field(
-        kinds.AXIS, None, "the axis to propose input and output for", group=THE_RECORD
+    axis: str | None = _record(kinds.AXIS, None, "the axis to propose input and output for")
+    chirp: int | None = _which_chirp()
+    flight: int | None = _which_flight()
+    units: Mapping[str, str] = _record(
+        kinds.UNITS, {}, "the unit of a channel, such as q=rad/s; may be repeated", flag="--unit"
     )
-    chirp: int | None = option_field(
-        kinds.SIZE,
-        None,
-        "the number of the one to use of the chirps that a log's proposal lists; by default the "
-        "longest, with all others on its axis at its place",
-        group=THE_RECORD,
-    )
-    flight: int | None = option_field(
-        kinds.SIZE,
-        None,
-        "the number of the flight in a file with several; by default the longest with a chirp, "
-        "else the longest with sticks that move",
-        group=THE_RECORD,
-    )
-    units: Mapping[str, str] = option_field(
-        kinds.UNITS,
-        {},
-        "the unit of a channel, such as q=rad/s; may be repeated",
-        group=THE_RECORD,
-        flag="--unit",
-    )
-    time: str | None = option_field(
+    time: str | None = _record(
         kinds.TEXT,
         None,
         "the channel that holds the time, or the two with seconds and nanoseconds: sec+nanosec",
-        group=THE_RECORD,
     )
-    time_unit: Literal["s", "ms", "us", "ns"] | None = option_field(
-        kinds.TIME_UNIT, None, "its unit", group=THE_RECORD
-    )
-    dt: float | None = option_field(
+    time_unit: Literal["s", "ms", "us", "ns"] | None = _record(kinds.TIME_UNIT, None, "its unit")
+    dt: float | None = _record(
         kinds.DURATION,
         None,
         "the sampling interval of a table without time, whose rows are equally spaced",
-        group=THE_RECORD,
     )
-    time_factor: float | None = option_field(
+    time_factor: float | None = _record(
         kinds.POSITIVE,
         None,
         "of the time stamps, where their clock runs slow or fast: 1.0119 (85/84) for a Crazyflie's "
         "micro-SD log with firmware before August 2026",
-        group=THE_RECORD,
     )
-    rate: float | None = option_field(
-        kinds.HERTZ,
-        None,
-        "resample to this rate; by default the slowest channel's own",
-        group=_PART,
+    rate: float | None = _record(
+        kinds.HERTZ, None, "resample to this rate; by default the slowest channel's own"
     )
-    hold: float | Literal["dt"] | None = option_field(
+    hold: float | Literal["dt"] | None = _record(
         kinds.HOLD,
         None,
         "for how long the plant's input keeps each value: the loop's period for a command (dt: a "
         "sample), 0 for a quantity that was measured; by default what an autopilot's log says",
-        group=THE_RECORD,
     )
-    valid: Mapping[str, Pair] = option_field(
+    valid: Mapping[str, Pair] = _record(
         kinds.RANGES,
         {},
         "lowest and highest value of a channel that can be true, such as gyro.x=-20:20: others "
         "count as missing, and are interpolated; may be repeated",
-        group=_PART,
     )
-    max_gap: float | None = option_field(
+    max_gap: float | None = _record(
         kinds.DURATION,
         None,
         "the longest gap, and the longest run of missing values, that is interpolated",
-        group=_PART,
     )
-    start: float | None = option_field(
-        kinds.TIME, None, "first time to use, in the file's time", group=_PART
-    )
-    stop: float | None = option_field(kinds.TIME, None, "last time to use", group=_PART)
-    segments: Sequence[Pair] = option_field(
+    start: float | None = _record(kinds.TIME, None, "first time to use, in the file's time")
+    stop: float | None = _record(kinds.TIME, None, "last time to use")
+    segments: Sequence[Pair] = _record(
         kinds.SEGMENTS,
         (),
         "instead of start and stop; repeat it to analyse several parts together",
-        group=_PART,
         flag="--segment",
     )
-    integrators: int = option_field(
+    integrators: int = _model(
         kinds.COUNT,
         1,
         "n in K e^(-delay s) / (s^n (lag s + 1)): 1 from a moment to a rate, 2 to an "
         "angle; 1 by default",
-        group=_MODEL,
     )
-    lag: bool = option_field(
-        kinds.SWITCH, True, "fit a model without the lag", group=_MODEL, flag="--no-lag"
-    )
-    delay: bool = option_field(
-        kinds.SWITCH, True, "fit a model without the delay", group=_MODEL, flag="--no-delay"
-    )
-    poles: int | None = option_field(
+    lag: bool = _model(kinds.SWITCH, True, "fit a model without the lag", flag="--no-lag")
+    delay: bool = _model(kinds.SWITCH, True, "fit a model without the delay", flag="--no-delay")
+    poles: int | None = _model(
         kinds.COUNT,
         None,
         "fit a transfer function with this many poles beside the integrators, "
         "instead of gain and lag",
-        group=_MODEL,
     )
-    zeros: int = option_field(
-        kinds.COUNT, 0, "number of zeros, with --poles; 0 by default", group=_MODEL
-    )
-    keep_gyro_filters: bool = option_field(
+    zeros: int = _model(kinds.COUNT, 0, "number of zeros, with --poles; 0 by default")
+    keep_gyro_filters: bool = _model(
         kinds.SWITCH,
         False,
         "leave the gyro's filters in the model; by default those in front of an autopilot's logged "
         "rate are divided out, where the log has their parameters",
-        group=_MODEL,
     )
-    band: Pair | None = option_field(
+    band: Pair | None = _estimate(
         kinds.BAND,
         None,
         "fit between these frequencies, in Hz (6.28 rad/s); by default what the record resolves",
-        group=_ESTIMATE,
     )
-    band_rad: Pair | None = option_field(
-        kinds.BAND, None, "the same in rad/s (0.159 Hz)", group=_ESTIMATE
-    )
-    estimator: str = option_field(
+    band_rad: Pair | None = _estimate(kinds.BAND, None, "the same in rad/s (0.159 Hz)")
+    estimator: str = _estimate(
         kinds.ESTIMATOR,
         "local",
         "of the frequency response: local "
         "polynomials, composite windows, or windows of one length; local by default",
-        group=_ESTIMATE,
     )
-    window: float | None = option_field(
+    window: float | None = _estimate(
         kinds.DURATION,
         None,
         "length of welch's window, which it selects; a fifth of the record by default",
-        group=_ESTIMATE,
     )
-    cost: str = option_field(
+    cost: str = _estimate(
         kinds.COST,
         "ml",
         "maximum likelihood, or CIFER's coherence-weighted cost, Eq. (14); ml by default",
-        group=_ESTIMATE,
     )
-    explain: bool = option_field(
+    explain: bool = _estimate(
         kinds.SWITCH,
         False,
         "where the misfit exceeds 1.5 random errors, fit again with one more pole, zero, pair, "
         "or damping, and say which of them explains it",
-        group=_ESTIMATE,
         flag="--explain",
     )
-    verify: str | None = option_field(
-        kinds.FILE,
-        None,
-        "simulate the model on this record, which has the same channels",
-        group=_CHECK,
+    verify: str | None = _check(
+        kinds.FILE, None, "simulate the model on this record, which has the same channels"
     )
-    verify_start: float | None = option_field(
-        kinds.TIME, None, "first time of that record to use", group=_CHECK
-    )
-    verify_stop: float | None = option_field(
-        kinds.TIME, None, "last time of that record to use", group=_CHECK
-    )
+    verify_start: float | None = _check(kinds.TIME, None, "first time of that record to use")
+    verify_stop: float | None = _check(kinds.TIME, None, "last time of that record to use")
 
-    def _check_together(self) -> None:
-        one_of_two = (self.input is None) != (self.output is None)
-        if one_of_two:
-            raise SettingsError(
-                "`input` and `output` belong together: give both, or none to have them proposed"
-            )
+    def clashes(self) -> Iterator[str]:
+        if (self.input is None) != (self.output is None):
+            yield "`input` and `output` belong together: give both, or none to have them proposed"
         if self.input is not None and self.axis is not None:
-            raise SettingsError(
-                "`axis` is for a proposal: leave it out, or leave `input` and `output` out"
-            )
+            yield "`axis` is for a proposal: leave it out, or leave `input` and `output` out"
         if self.input is not None and self.chirp is not None:
-            raise SettingsError(
-                "`chirp` is for a proposal: leave it out, or leave `input` and `output` out"
-            )
+            yield "`chirp` is for a proposal: leave it out, or leave `input` and `output` out"
         if self.input is not None and self.flight is not None:
-            raise SettingsError(
+            yield (
                 "`flight` is for a proposal: name the channels of that flight (log2.axisSum[0]), "
                 "or leave `input` and `output` out"
             )
         if self.segments and (self.start is not None or self.stop is not None):
-            raise SettingsError(
-                "`segments` says where to start and stop: leave `start` and `stop` out"
-            )
+            yield "`segments` says where to start and stop: leave `start` and `stop` out"
         if self.band is not None and self.band_rad is not None:
-            raise SettingsError("`band` (Hz) and `band_rad` (rad/s) are both given: keep one")
+            yield "`band` (Hz) and `band_rad` (rad/s) are both given: keep one"
         if self.dt is not None and (self.time is not None or self.time_unit is not None):
-            raise SettingsError(
-                "`dt` is for a table without time: leave `time` and `time_unit` out"
-            )
-        self._check_unused()
-
-    def _check_unused(self) -> None:
-        """Raise SettingsError for what would change nothing beside the others."""
+            yield "`dt` is for a table without time: leave `time` and `time_unit` out"
+        # What would change nothing beside the others.
         if self.zeros and self.poles is None:
-            raise SettingsError("`zeros` is for a transfer function: say its `poles`, too")
+            yield "`zeros` is for a transfer function: say its `poles`, too"
         if self.poles is not None and self.zeros > self.poles + self.integrators:
-            raise SettingsError(
+            yield (
                 f"`zeros` is {self.zeros}, above {self.poles} `poles` and {self.integrators} "
                 "`integrators`: take as many zeros as these at most"
             )
         if self.poles is not None and not self.lag:
-            raise SettingsError(
-                "`lag` is for a model of gain, lag and delay: leave it out, or leave `poles` out"
-            )
+            yield "`lag` is for a model of gain, lag and delay: leave it out, or leave `poles` out"
         if self.window is not None and self.estimator == "composite":
-            raise SettingsError(
-                "`window` is for windows of one length: leave it out, or choose `estimator` welch"
-            )
+            yield "`window` is for windows of one length: leave it out, or choose `estimator` welch"
         if self.verify is None and (self.verify_start, self.verify_stop) != (None, None):
-            raise SettingsError(
-                "`verify_start` and `verify_stop` are for a second record: name it by `verify`"
-            )
+            yield "`verify_start` and `verify_stop` are for a second record: name it by `verify`"
+
+
+_vehicle = ft.partial(option_field, "the vehicle")
+_flight = ft.partial(option_field, "the simulated flight")
+_controller = ft.partial(option_field, "the controller")
+_plants = ft.partial(option_field, "the plants")
+_law, _kept = ft.partial(option_field, "the law"), ft.partial(option_field, "what is kept")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class TuneSettings(Settings):
+    """How a controller is tuned on an identified axis: what the record does not tell.
+
+    The keyword arguments are the keys of the TOML file; `jaxquad tune --help` lists them as
+    options.
+
+    **Raises:** `SettingsError` (a ValueError) for values that cannot be.
+    """
+
+    inertia: float = _vehicle(
+        kinds.INERTIA, _MISSING, "nominal inertia of the axis, in kg m^2; required"
+    )
+    limit: float = _vehicle(
+        kinds.POSITIVE, _MISSING, "largest command, to either side, in its unit; required"
+    )
+    spread: Pair = _vehicle(
+        kinds.BAND,
+        (0.5, 3.0),
+        "range of the true inertia, as factors of the nominal one; 0.5 3 by default",
+    )
+    inertia_error: float = _vehicle(
+        kinds.NOT_NEGATIVE,
+        0.1,
+        "relative standard error of the inertia that the controller's gains "
+        "are scheduled with; 0.1 by default",
+    )
+    noise: float = _vehicle(
+        kinds.DEVIATION, 0.02, "standard deviation of the measured angle; 0.02 by default"
+    )
+    step: float = _flight(kinds.DEGREES, 4.0, "step of the reference; 4 by default")
+    disturbance: float | None = _flight(
+        kinds.TORQUE, None, "torque pulse; by default a tenth of the torque at the limit"
+    )
+    duration: float = _flight(kinds.DURATION, 4.0, "of one flight; 4 by default")
+    dt: float | None = _controller(
+        kinds.DURATION, None, "sampling interval of the controller; by default that of the record"
+    )
+    sensitivity: float = _controller(
+        kinds.POSITIVE, 3.6, "upper limit of the peak of |S|; 3.6 by default"
+    )
+    wo: float | None = _controller(
+        kinds.POSITIVE,
+        None,
+        "hold the observer's bandwidth at this value in rad/s, for instance where the "
+        "identified band ends; by default it is tuned",
+    )
+    name: str = _controller(
+        kinds.TEXT, "attitude", "prefix of the functions in the C header; attitude by default"
+    )
+    members: int = _plants(kinds.SIZE, 64, "number of plants to tune on; 64 by default")
+    fresh: int = _plants(kinds.SIZE, 256, "number of new plants to certify on; 256 by default")
+    seed: int = _plants(kinds.COUNT, 0, "of the random draws; 0 by default")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class AutopilotSettings(Settings):
+    """How the gains of the autopilot that flew a log are tuned.
+
+    The keyword arguments are the keys of the TOML file; `jaxquad autopilot --help` lists them as
+    options. Input, output and reference are those that the log proposes.
+
+    **Raises:** `SettingsError` (a ValueError) for values that cannot be.
+    """
+
+    axis: str = _record(
+        kinds.ONE_OR_ALL_AXES,
+        "all",
+        "the axis to tune; all by default, with one file of parameters",
+    )
+    chirp: int | None = _which_chirp()
+    flight: int | None = _which_flight()
+    start: float | None = _record(kinds.TIME, None, "first time to use, in the file's time")
+    stop: float | None = _record(kinds.TIME, None, "last time to use")
+    band: Pair | None = _record(
+        kinds.BAND,
+        None,
+        "fit between these frequencies, in Hz; by default what the record resolves",
+    )
+    throttle: float | None = _record(
+        kinds.POSITIVE,
+        None,
+        "of 1, at which Betaflight's dynamic filters and TPA are taken; by default the log's "
+        "median, 0.3 where it does not hold the throttle",
+    )
+    law: Literal["pid", "adrc"] | None = _law(
+        kinds.LAW,
+        None,
+        "the law to tune: adrc is that of Betaflight's pull request 15400; by default what flew",
+    )
+    hover: float | None = _law(
+        kinds.POSITIVE,
+        None,
+        "adrc_hover_throttle, of 1; by default that of the ADRC that flew, else the lowest level "
+        "of throttle that was flown",
+    )
+    sensitivity: float = _kept(
+        kinds.POSITIVE, 1.8, "upper limit of the peak of |S|; 1.8 by default"
+    )
+    resonance: float = _kept(
+        kinds.POSITIVE,
+        1.4,
+        "upper limit of the peak of the response from set-point to rate; 1.4 by default",
+    )
+    noise: float = _kept(
+        kinds.POSITIVE,
+        1.5,
+        "the most that the command's noise may grow, as a factor; 1.5 by default",
+    )
+    change: float = _kept(
+        kinds.POSITIVE,
+        3.0,
+        "factor within which each gain and cutoff, or wc, wo and b0, stays of what flew; 3 by "
+        "default",
+    )
+    keep_filters: bool = _kept(
+        kinds.SWITCH, False, "leave the filters as they flew, and tune gains alone"
+    )
+    members: int = _plants(kinds.SIZE, 32, "number of plants to tune on; 32 by default")
+    fresh: int = _plants(kinds.SIZE, 256, "number of new plants to certify on; 256 by default")
+    seed: int = _plants(kinds.COUNT, 0, "of the random draws; 0 by default")
+
+    def clashes(self) -> Iterator[str]:
+        if self.throttle is not None and self.throttle > 1:
+            yield f"`throttle` is {self.throttle:g}: give a share, above 0 to 1"
+        if self.hover is not None and not 0.05 <= self.hover <= 1:
+            yield f"`hover` is {self.hover:g}: give a share, from 0.05 to 1"
+        if self.hover is not None and self.law == "pid":
+            yield "`hover` is of the ADRC: leave it out, or give `law` adrc"
+        if self.sensitivity <= 1:
+            yield f"`sensitivity` is {self.sensitivity:g}: no loop has a peak of |S| of 1 or below"
+        if self.resonance <= 1:
+            yield f"`resonance` is {self.resonance:g}: a loop with an integral has a peak above 1"
+        if self.change <= 1:
+            yield f"`change` is {self.change:g}: give a factor above 1"
+
+
+class Override(NamedTuple):
+    """Settings of the logs whose paths match one of the patterns."""
+
+    logs: tuple[str, ...]
+    changes: Mapping[str, object]
+
+
+_ONE_LOG = ("verify", "verify_start", "verify_stop")
+_LOG_KEYS = tuple(key for key in IdentifySettings.options() if key not in _ONE_LOG)
+_batch = ft.partial(option_field, "")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class BatchSettings(Settings):
+    """Which logs of a folder are identified, how each of them, and by how many processes.
+
+    In TOML the keys of `identify` stand beside the others, and each override is a table
+    `[[override]]` with `logs` and the keys that it changes.
+
+    **Raises:** `SettingsError` (a ValueError) for values that cannot be.
+
+    !!! example
+
+        ```python
+        settings = jq.workflows.BatchSettings(
+            logs="**/*.ulg",
+            identify={"band": (0.7, 12), "integrators": 1},
+            overrides=[jq.workflows.Override(("flight_07*",), {"stop": 80})],
+        )
+        ```
+    """
+
+    logs: str | Sequence[str] = _batch(
+        kinds.PATTERNS,
+        ("**/*",),
+        "file patterns below the folder; by default every file but hidden ones",
+    )
+    timeout: float | None = _batch(
+        kinds.DURATION,
+        None,
+        "limit for one log, which has failed if it takes longer; 1800 by default, "
+        "none with a scheduler",
+    )
+    workers: int | None = _batch(
+        kinds.SIZE, None, "processes of this machine; by default one for each core"
+    )
+    scheduler: str | None = _batch(
+        kinds.ADDRESS,
+        None,
+        "of a Dask cluster that sees the same files, such as tcp://10.0.0.1:8786",
+    )
+    identify: IdentifySettings | Mapping[str, object] = dataclasses.field(default_factory=dict)
+    overrides: Sequence[Override] = ()
+
+    @classmethod
+    def from_mapping(cls: type[S], content: Mapping[str, object], where: str = "") -> S:
+        try:
+            check_keys(content, [*cls.options(), *_LOG_KEYS, "override"])
+            tables = content.get("override", [])
+            if not isinstance(tables, list) or not all(isinstance(t, dict) for t in tables):
+                raise SettingsError("`override` is no list of tables: write [[override]]")
+            settings: dict[str, Value] = {k: content[k] for k in content if k in cls.options()}
+            settings["identify"] = {key: content[key] for key in content if key in _LOG_KEYS}
+            settings["overrides"] = [_override(k, table) for k, table in enumerate(tables, 1)]
+            return cls(**settings)
+        except SettingsError as error:
+            raise within_file(where, error) from error
+
+    def __post_init__(self):
+        super().__post_init__()
+        object.__setattr__(self, "identify", _checked(self._common))
+        object.__setattr__(self, "overrides", tuple(Override(*x) for x in self.overrides))
+
+    def clashes(self) -> Iterator[str]:
+        if self.timeout is not None and self.scheduler is not None:
+            yield "`timeout` is for processes of this machine: leave it out with `scheduler`"
+
+    @property
+    def _common(self) -> Mapping[str, object]:
+        common = self.identify
+        return common.changes() if isinstance(common, IdentifySettings) else common
+
+    def changed(self: S, changes: Mapping[str, object]) -> S:
+        return dataclasses.replace(self, **changes)  # pyright: ignore[reportArgumentType]
+
+    def of(self, log: str) -> IdentifySettings:
+        """The settings of one log, by its path below the folder.
+
+        Later overrides change earlier ones. A key that says the same in another way takes the
+        place of the other: `segments` that of `start` and `stop`, `band` that of `band_rad`.
+
+        **Raises:** `SettingsError` for settings that exclude each other.
+        """
+        settings = self._common
+        for patterns, changes in self.overrides:
+            if any(fnmatchcase(log, pattern) for pattern in patterns):
+                settings = updated(settings, changes)
+        return IdentifySettings.from_mapping(settings, f"settings of {log}")
+
+
+def _override(k: int, table: Mapping[str, object]) -> Override:
+    try:
+        check_keys(table, [*_LOG_KEYS, "logs"])
+        if "logs" not in table:
+            raise SettingsError('`logs` is missing: add logs = "flight_07*"')
+        patterns = convert("logs", kinds.PATTERNS, table["logs"])
+        return Override(patterns, _checked({k: v for k, v in table.items() if k != "logs"}))
+    except SettingsError as error:
+        raise SettingsError(f"override {k}: {error}") from error
+
+
+def _checked(content: Mapping[str, object]) -> dict[str, object]:
+    """The values converted; whether they go together is known once overrides are applied."""
+    check_keys(content, _LOG_KEYS)
+    options = IdentifySettings.options()
+    values = {key: convert(key, options[key].kind, value) for key, value in content.items()}
+    for key, others in REPLACED.items():
+        clash = next((other for other in others if key in values and other in values), None)
+        if clash is not None:
+            raise SettingsError(f"`{key}` and `{clash}` are both given: keep one")
+    return values

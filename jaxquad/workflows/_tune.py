@@ -31,7 +31,7 @@ from ._identification import Identification
 from ._identify import identify_fit
 from ._log import open_again
 from ._result_file import load_result, require_radians, StoredResult
-from ._tune_settings import TuneSettings
+from ._settings import TuneSettings
 
 
 _PULSE, _BACK = 0.375, 0.625  # of the flight: when the torque comes, and the step back

@@ -97,6 +97,6 @@ def test_a_message_prints_in_the_words_of_python_and_keeps_its_kind():
 
 def test_every_word_of_python_that_a_message_marks_has_one_of_the_command_line():
     texts = [text.replace("»", "«").split("«")[1::2] for _, text in messages()]
-    words = {word for text in texts for word in text}
+    words = {word for text in texts for word in text} - {"plant|X"}  # which a page leaves out
     assert len(words) > 30
     assert not [word for word in words if in_options(f"«{word}»") == Message(f"«{word}»")]

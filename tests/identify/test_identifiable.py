@@ -10,7 +10,8 @@ import pytest
 from synthetic import response_of
 
 import jaxquad as jq
-from jaxquad.identify.frequency_domain._bounds import _polished, one_sided, one_sided_limits
+from jaxquad.identify.frequency_domain._bounds import polish
+from jaxquad.identify.uncertainty._zero_bounds import one_sided, one_sided_limits
 
 
 ML = jq.identify.MaximumLikelihood()
@@ -391,7 +392,7 @@ def test_a_limit_of_another_level_is_where_the_cost_has_risen_by_as_much(seed, m
     start = jq.LaggedIntegrator(70.0, 0.03, 0.02)
     fit = jq.fit(start, frf, free=("gain", "lag"), cost=ML)
     for level, score in ((0.68, 0.4677), (0.9, 1.2816), (0.999, 3.0902)):
-        monkeypatch.setattr("jaxquad.identify.frequency_domain._bounds._RISE", score**2)
+        monkeypatch.setattr("jaxquad.identify.uncertainty._zero_bounds._RISE", score**2)
         (bound,) = jq.fit(start, frf, free=("gain", "lag"), cost=ML).verdict.bounds
         for model_error, limit in ((True, bound.limit), (False, bound.noise_limit)):
             low, high = fit.interval("lag", level=level, model_error=model_error)
@@ -402,7 +403,7 @@ def test_a_limit_that_rounding_hides_is_infinite_and_a_model_without_numbers_no_
     """A lag at zero beside a free delay may have a variance of -10, or reach 1e300 s."""
     calls = []
     watched = lambda *given: calls.append(given) or one_sided_limits(*given)
-    monkeypatch.setattr("jaxquad.identify.uncertainty._seen.one_sided_limits", watched)
+    monkeypatch.setattr("jaxquad.identify.uncertainty._zero_bounds.one_sided_limits", watched)
     frf = response_of(jq.LaggedIntegrator(80.0, 1e-9, 0.02), error=0.05, seed=0)
     jq.fit(jq.LaggedIntegrator(70.0, 0.03, 0.02), frf, free=("gain", "lag"), cost=ML)
     [(problem, solution, k, inflations)] = calls
@@ -410,4 +411,4 @@ def test_a_limit_that_rounding_hides_is_infinite_and_a_model_without_numbers_no_
     assert limits[:2] == [np.inf, np.inf] and 0 < limits[2] < 0.01
     for far in (700.0, 800.0, np.inf):
         z = np.where(np.arange(2) == k, far, solution.z)
-        assert not np.isfinite(_polished(problem, z, [k], solution)[1].cost)
+        assert not np.isfinite(polish(problem, z, [k], solution)[1].cost)

@@ -28,7 +28,7 @@ def test_a_killed_worker_of_a_cluster_loses_no_log(tmp_path):
 
 def test_a_scheduler_that_is_not_there_is_one_line(tmp_path, capsys, monkeypatch):
     pytest.importorskip("distributed", reason="needs pip install jaxquad[cluster]")
-    monkeypatch.setattr("jaxquad.workflows._batch._workers.PATIENCE", 0.2)
+    monkeypatch.setattr("jaxquad.workflows._batch_workers.PATIENCE", 0.2)
     (tmp_path / "a.csv").write_text("a")
     words = ["batch", str(tmp_path), "--out", str(tmp_path / "out")]
     assert main([*words, "--scheduler", "tcp://127.0.0.1:9"]) == 2

@@ -137,7 +137,7 @@ rate = 50
     settings = BatchSettings.from_toml(path)
     assert settings.logs == ("*.npz", "old/*.csv") and settings.timeout == 60
     assert settings.of("new.npz").output == "q" and settings.of("old/6.csv").rate is None
-    assert settings.of("old/7.csv").given() == settings.of("old/6.csv").given() | {"rate": 50}
+    assert settings.of("old/7.csv").changes() == settings.of("old/6.csv").changes() | {"rate": 50}
     assert settings.of("old/7.csv").output == "gyro"
     same = BatchSettings(
         logs=["*.npz", "old/*.csv"],
@@ -159,9 +159,9 @@ def test_an_override_replaces_what_says_the_same_in_another_way():
             Override(("ab",), {"stop": 7}),
         ],
     )
-    assert settings.of("a").given() == {"segments": ((1, 2), (3, 4)), "band_rad": (2, 9)}
-    assert settings.of("ab").given() == {"stop": 7, "band_rad": (2, 9)}
-    assert settings.of("b").given() == {"start": 5, "stop": 9, "band": (1, 2)}
+    assert settings.of("a").changes() == {"segments": ((1, 2), (3, 4)), "band_rad": (2, 9)}
+    assert settings.of("ab").changes() == {"stop": 7, "band_rad": (2, 9)}
+    assert settings.of("b").changes() == {"start": 5, "stop": 9, "band": (1, 2)}
 
 
 @pytest.mark.parametrize(

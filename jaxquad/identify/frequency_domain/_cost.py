@@ -203,7 +203,7 @@ def _in_both(low: float, high: float) -> str:
     return f"{low:.3g} to {high:.3g} rad/s ({low / turn:.3g} to {high / turn:.3g} Hz)"
 
 
-def known_points(frf: FrequencyResponse) -> Mask:
+def precise_points(frf: FrequencyResponse) -> Mask:
     """Points that have a response, each by its own random error: so small by no chance.
 
     None where feedback dominates: what is known there is the controller, and not the plant.

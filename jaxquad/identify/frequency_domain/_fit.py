@@ -1,6 +1,8 @@
+"""Fits of models to frequency responses, by a weighted cost."""
+
 import contextlib
-import dataclasses
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import equinox as eqx
 import numpy as np
@@ -10,9 +12,9 @@ from jaxquad._core import Message, one_blas_thread, require_x64
 from jaxquad.models import LaggedIntegrator, with_arrays
 from jaxquad.spectra import FrequencyResponse
 
-from ..uncertainty._assess import assess, Counted, discrepancy_at, records_at
+from ..uncertainty._assess import assess, unfitted
+from ..uncertainty._error_budget import Weighting, weighting_at
 from ..uncertainty._fit_remarks import DOUBT
-from ..uncertainty._make_fit import unfitted
 from ..uncertainty._verdict import Verdict, without_numbers
 from ._bounds import settle_at_bounds, solve_within_bounds
 from ._condition import Condition
@@ -20,12 +22,12 @@ from ._cost import (
     Band,
     Cost,
     describe_usable,
-    known_points,
     least_coherence,
     Mask,
     MaximumLikelihood,
     Points,
     points_of,
+    precise_points,
     Ratio,
     usable,
     Weights,
@@ -39,6 +41,11 @@ from ._refits import Options, Origin
 from ._result import Fit
 from ._solve import Solution
 from ._starts import Minimum, solve_from_many, spread_starts
+
+
+_SMALL = 256  # frequencies, up to which a second thread of BLAS waits longer than it works
+_PRESENT = 0.2  # random error of a response that is there
+_SETTLED = 0.1  # relative change of weights that moves no estimate by more than a fraction of it
 
 
 def guess_lagged_integrator(frf: FrequencyResponse, integrators: int) -> LaggedIntegrator:
@@ -142,9 +149,6 @@ def fit(
     return fit_with(model, frfs, options)
 
 
-_SMALL = 256  # frequencies, up to which a second thread of BLAS waits longer than it works
-
-
 def fit_with(
     model: PyTree, frfs: Sequence[FrequencyResponse], options: Options, *, rounds: int = 3
 ) -> Fit:
@@ -156,7 +160,7 @@ def fit_with(
     - `rounds`: how often to solve again with what the model leaves unexplained as a floor on the
         random error; 0 for estimates under the noise alone, whose costs compare structures.
     """
-    small = all(np.size(one.omega) <= _SMALL for one in frfs)
+    small = all(np.size(frf.omega) <= _SMALL for frf in frfs)
     with one_blas_thread() if small else contextlib.nullcontext():
         return _fit_with(model, frfs, options, rounds)
 
@@ -164,36 +168,39 @@ def fit_with(
 def _fit_with(
     model: PyTree, frfs: Sequence[FrequencyResponse], options: Options, rounds: int
 ) -> Fit:
-    model = with_arrays(model)
+    model, cost, band = with_arrays(model), options.cost, options.band
     parameters = select_parameters(model, options.free, options.tied)
-    least = [least_coherence(options.min_coherence, options.cost, one) for one in frfs]
-    used = [usable(one, options.band, limit) for one, limit in zip(frfs, least, strict=True)]
-    _check_priors_against(model, options.priors, options.cost)
-    too_few = _too_few_points(frfs, used, parameters, max(least), options.band)
+    least = [least_coherence(options.min_coherence, cost, frf) for frf in frfs]
+    usable_points = [usable(frf, band, limit) for frf, limit in zip(frfs, least, strict=True)]
+    require_priors(model, options.priors)
+    if options.priors and not isinstance(cost, MaximumLikelihood):
+        raise ValueError(
+            Message(
+                "a prior needs a cost that knows the noise, and that of Eq. (14) does not: leave "
+                "«cost=» at its default, jq.identify.MaximumLikelihood()"
+            )
+        )
+    too_few = _too_few_points(frfs, usable_points, parameters, max(least), band)
     if too_few is not None:
-        remarks = dict.fromkeys(remark for one in frfs for remark in one.remarks)
+        remarks = dict.fromkeys(remark for frf in frfs for remark in frf.remarks)
         return unfitted(model, parameters, too_few, tuple(remarks))
     problem = make_problem(model, parameters, frfs, options.conditions, options.priors)
-    asked, used = used, [m & ~none for m, none in zip(used, problem.silences, strict=True)]
-    points = points_of(frfs, used)
+    pairs = zip(usable_points, problem.silences, strict=True)
+    points = points_of(frfs, [mask & ~silent for mask, silent in pairs])
     problem, solution, minima = _solve_reweighted(problem, points, options)
-    _check_finite(solution)
     check_priors(problem, solution)
-    problem, solution, counted = _solve_with_floor(problem, points, solution, options, rounds)
-    further = _remarks_on_silence(frfs, asked, problem)
+    problem, solution, weighting = _solve_with_floor(problem, points, solution, options, rounds)
+    further = _remarks_on_silence(frfs, usable_points, problem)
     origin = Origin(fit_with, tuple(points), options)
-    return assess(problem, counted, solution, minima, further=further, origin=origin)
-
-
-_PRESENT = 0.2  # random error of a response that is there
+    return assess(problem, weighting, solution, minima, further=further, origin=origin)
 
 
 def _remarks_on_silence(
-    frfs: Sequence[FrequencyResponse], asked: Sequence[Mask], problem: Problem
+    frfs: Sequence[FrequencyResponse], usable_points: Sequence[Mask], problem: Problem
 ) -> list[str]:
     """Remark on responses that were measured, and that the model has none of."""
     remarks = []
-    for frf, mask, pairs in zip(frfs, asked, problem.silent, strict=True):
+    for frf, mask, pairs in zip(frfs, usable_points, problem.silent, strict=True):
         for o, i in pairs:
             error = np.asarray(frf.random_error)[mask[:, o, i], o, i]
             if not error.size or np.mean(error < _PRESENT) < 0.5:
@@ -209,20 +216,19 @@ def _remarks_on_silence(
 
 def _too_few_points(
     frfs: Sequence[FrequencyResponse],
-    used: Sequence[Mask],
+    usable_points: Sequence[Mask],
     parameters: Parameters,
     least: float,
     band: Band,
 ) -> Verdict | None:
-    points = sum(int(mask.sum()) for mask in used)
-    needed = parameters.count + 2
+    points, needed = sum(int(mask.sum()) for mask in usable_points), parameters.count + 2
     if points >= needed:
         return None
     reason = (
         f"{describe_usable(frfs, points, least)}{f' (band {band} rad/s)' if band else ''}, and "
         f"{parameters.count} parameters need at least {needed}"
     )
-    wider = widen_band(frfs, [known_points(frf) for frf in frfs]) if band is None else None
+    wider = widen_band(frfs, [precise_points(frf) for frf in frfs]) if band is None else None
     remedies = ("excite the axis («jq.sweep»), record longer, or use a longer window",)
     if wider:
         remedies = (wider, "fit fewer parameters (free=): a delay, say, known from another source")
@@ -230,31 +236,26 @@ def _too_few_points(
 
 
 def _solve_reweighted(
-    problem: Problem,
-    points: Sequence[Points],
-    options: Options,
+    problem: Problem, points: Sequence[Points], options: Options
 ) -> tuple[Problem, Solution, tuple[Minimum, ...]]:
     """Solve; where the weights depend on the model, solve again under those of the solution."""
-    starts, solver, max_steps = options.starts, options.solver, options.max_steps
-    cost = options.cost
-    weights = _weights(cost, points, [np.ones(each.used.shape) for each in points])
+    solver, max_steps, cost, minima = options.solver, options.max_steps, options.cost, ()
+    weights = _weights(cost, points, [np.ones(one.used.shape) for one in points])
     problem = _weighted(problem, cost, points, weights)
-    z, minima = np.asarray(problem.parameters.start)[: problem.parameters.count], ()
-    if starts == 1:
+    if options.starts == 1:
+        z = np.asarray(problem.parameters.start)[: problem.parameters.count]
         solution = solve_within_bounds(problem, z, solver, max_steps)
     else:
-        fastest = max(float(each.frf.omega[-1]) for each in points)
-        spread = spread_starts(problem.parameters, starts, fastest=fastest)
-        solution, minima = solve_from_many(problem, spread, solver, max_steps)
+        fastest = max(float(one.frf.omega[-1]) for one in points)
+        starts = spread_starts(problem.parameters, options.starts, fastest=fastest)
+        solution, minima = solve_from_many(problem, starts, solver, max_steps)
         solution = settle_at_bounds(problem, solution, solver, max_steps)
     again = _weights(cost, points, _ratios(solution))
-    if _are_close(weights, again, 1e-4):
-        return problem, solution, minima
-    problem = _weighted(problem, cost, points, again)
-    return problem, solve_within_bounds(problem, solution.z, solver, max_steps), minima
-
-
-_SETTLED = 0.1  # relative change of weights that moves no estimate by more than a fraction of it
+    if not _are_close(weights, again, 1e-4):
+        problem = _weighted(problem, cost, points, again)
+        solution = solve_within_bounds(problem, solution.z, solver, max_steps)
+    _check_finite(solution)
+    return problem, solution, minima
 
 
 def _solve_with_floor(
@@ -263,32 +264,28 @@ def _solve_with_floor(
     solution: Solution,
     options: Options,
     rounds: int,
-) -> tuple[Problem, Solution, Counted]:
+) -> tuple[Problem, Solution, Weighting]:
     """Solve again with what the model leaves unexplained as a floor on the random error.
 
     Only where it does leave something: for a right model a floor costs efficiency.
     """
-    records, cost, lifted = records_at(problem, points, solution), options.cost, False
-    found = discrepancy_at(records, points, solution)
-    for _ in range(rounds if found[0].none < DOUBT else 0):
-        raised = [_with_floor(each, found[0].amplitude) for each in points]
+    cost, lifted = options.cost, False
+    weighting = weighting_at(problem, points, solution)
+    for _ in range(rounds if weighting.mixtures[0].none < DOUBT else 0):
+        floor = weighting.mixtures[0].amplitude
+        raised = [replace(one, floor=np.full(one.used.shape, floor)) for one in points]
         weights = _weights(cost, raised, _ratios(solution))
-        if _are_close([np.asarray(each) for each in problem.weights], weights, _SETTLED):
+        if _are_close([np.asarray(old) for old in problem.weights], weights, _SETTLED):
             break
         problem, lifted = _weighted(problem, cost, raised, weights), True
         solution = solve_within_bounds(problem, solution.z, options.solver, options.max_steps)
         _check_finite(solution)
-        records = records_at(problem, points, solution)
-        found = discrepancy_at(records, points, solution)
-    if not lifted:
-        return problem, solution, Counted(points, records, None, None, found)
-    plain = _weights(cost, points, _ratios(solution))
-    mixings = _mixings(cost, points, plain)
-    return problem, solution, Counted(points, records, plain, mixings, found)
-
-
-def _with_floor(points: Points, floor: float) -> Points:
-    return dataclasses.replace(points, floor=np.full(points.used.shape, floor))
+        weighting = weighting_at(problem, points, solution)
+    if lifted:
+        plain = _weights(cost, points, _ratios(solution))
+        mixings = _mixings(cost, points, plain)
+        weighting = weighting._replace(weights=plain, mixings=mixings)
+    return problem, solution, weighting
 
 
 def _are_close(old: Sequence[Weights], new: Sequence[Weights], share: float) -> bool:
@@ -311,7 +308,7 @@ def _mixings(
 
 def _weights(cost: Cost, points: Sequence[Points], ratios: Sequence[Ratio]) -> list[Weights]:
     weigh = type(cost).weights  # a bound method of an `eqx.Module` is made like a model
-    return [weigh(cost, *each) for each in zip(points, ratios, strict=True)]
+    return [weigh(cost, *pair) for pair in zip(points, ratios, strict=True)]
 
 
 def _ratios(solution: Solution) -> list[Ratio]:
@@ -321,10 +318,10 @@ def _ratios(solution: Solution) -> list[Ratio]:
 
 def require_responses(frf: object) -> list[FrequencyResponse]:
     """One response or several, as a list. Raise ValueError for anything else, and for repeats."""
-    given = list(frf) if isinstance(frf, Sequence) else [frf]
-    frfs = [one for one in given if isinstance(one, FrequencyResponse)]
-    if not given or len(frfs) < len(given):
-        kinds = ", ".join(sorted({type(one).__name__ for one in given})) or "nothing"
+    items = list(frf) if isinstance(frf, Sequence) else [frf]
+    frfs = [one for one in items if isinstance(one, FrequencyResponse)]
+    if not items or len(frfs) < len(items):
+        kinds = ", ".join(sorted({type(one).__name__ for one in items})) or "nothing"
         raise ValueError(
             f"a fit needs a jq.spectra.FrequencyResponse or a list of them, not {kinds}: make one "
             "with jq.frequency_response(record), and call jq.fit(model, response)"
@@ -353,18 +350,6 @@ def check_options(cost: PyTree, band: PyTree, min_coherence: float | None, max_s
         )
     if max_steps < 1:
         raise ValueError(f"max_steps is {max_steps}: give at least 1")
-
-
-def _check_priors_against(model: PyTree, priors: Sequence[Prior], cost: Cost) -> None:
-    """Raise ValueError for priors under a cost without noise, and as `require_priors` does."""
-    require_priors(model, priors)
-    if priors and not isinstance(cost, MaximumLikelihood):
-        raise ValueError(
-            Message(
-                "a prior needs a cost that knows the noise, and that of Eq. (14) does not: leave "
-                "«cost=» at its default, jq.identify.MaximumLikelihood()"
-            )
-        )
 
 
 def _check_finite(solution: Solution) -> None:

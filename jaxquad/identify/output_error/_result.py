@@ -21,7 +21,8 @@ from ..uncertainty._accuracy import (
     projected_noise,
     scaled_inverse,
 )
-from ..uncertainty._assess import identifiability_of, ranks_of
+from ..uncertainty._assess import identifiability_of, make_fit, ranks_of
+from ..uncertainty._error_budget import prior_rows, rescale, units_of
 from ..uncertainty._fit_remarks import (
     is_unfinished,
     no_minimum,
@@ -30,8 +31,6 @@ from ..uncertainty._fit_remarks import (
     runaways,
 )
 from ..uncertainty._identifiability import Information
-from ..uncertainty._make_fit import Costs, Estimate, make_fit
-from ..uncertainty._seen import prior_rows, rescale, units_of
 from ..uncertainty._verdict import NO_MINIMUM, Verdict
 from ._descent import Descent, with_fixed_slopes
 from ._problem import evaluate_misfits, Evaluation, RecordTerm
@@ -90,7 +89,6 @@ def assess_output_error(descent: Descent, records: Sequence[Record]) -> Fit:
     else:
         verdict, by_data = _verdict(descent, reduced, prior, covariance, units)
     fitted = count + sum(one.nuisance.shape[2] for one in projected)
-    average = cost / sum(one.misfit.shape[1] for one in projected)
     samples = sum(one.misfit.size for one in projected)
     fitted_to_noise = taken + sum(sum(m.order) for one in descent.noise for m in one.models)
     levels = [float(np.sum(np.log(np.asarray(term.weights)))) for term in problem.terms]
@@ -100,8 +98,16 @@ def assess_output_error(descent: Descent, records: Sequence[Record]) -> Fit:
     return make_fit(
         base,
         solution,
-        Estimate(bread, covariance, covariance, units[:count], verdict, decrement),
-        Costs(cost, average, information, data_cost / max(rows - fitted, 1)),
+        bread=bread,
+        covariance=covariance,
+        by_noise=covariance,
+        units=units[:count],
+        verdict=verdict,
+        decrement=decrement,
+        cost=cost,
+        average_cost=cost / sum(one.misfit.shape[1] for one in projected),
+        information=information,
+        chi_squared=data_cost / max(rows - fitted, 1),
         points=rows,
         remarks=(
             *_remarks_on_output_error(descent, records, decrement, taken, verdict),

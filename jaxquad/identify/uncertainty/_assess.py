@@ -3,44 +3,42 @@
 import dataclasses
 import functools as ft
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, PyTree
 
+from jaxquad._core import as_messages
 from jaxquad.models import LaggedIntegrator, StateSpace, TransferFunction
 from jaxquad.spectra import FrequencyResponse
 
-from ..frequency_domain._aside import look_aside
-from ..frequency_domain._cost import Points, Weights, widen_band
+from ..frequency_domain._cost import widen_band
 from ..frequency_domain._held import remarks_on_hold
-from ..frequency_domain._mixing import Mixing
-from ..frequency_domain._parameters import Place
+from ..frequency_domain._parameters import Parameters, Place
 from ..frequency_domain._problem import on_device, Problem
 from ..frequency_domain._refits import Origin
 from ..frequency_domain._result import Fit
-from ..frequency_domain._solve import same_responses, Solution
+from ..frequency_domain._solve import is_saddle, same_responses, Solution
 from ..frequency_domain._starts import Minimum, remarks_on_minima
+from ..output_error._noise import NoiseModel
 from ..output_error._simulated import HasStateSpace, HasTransferFunction, linear_model
 from ._accuracy import (
     Block,
     blocks_of,
+    condition_number,
+    cramer_rao,
     degrees_of_freedom,
     fitted_noise,
     gauss_newton,
     information_root,
+    insensitivity,
     Matrix,
     misfit_ratio,
-    Noise,
     noise_effect,
     PriorRows,
-    ResponseTerm,
     scaled_inverse,
 )
-from ._discrepancy import (
-    find_discrepancy,
-    Mixture,
-)
+from ._discrepancy import Discrepancy
+from ._error_budget import error_budget, ErrorBudget, records_of, Units, units_of, Weighting
 from ._fit_remarks import (
     DOUBT,
     fed_back,
@@ -55,42 +53,21 @@ from ._fit_remarks import (
     remarks_on_fit,
     remarks_on_growth,
     remarks_on_priors,
+    runaways,
 )
-from ._identifiability import assess_identifiability, Information
-from ._make_fit import Costs, Estimate, make_fit
-from ._seen import (
-    bounds_among,
-    halved,
-    near_zeros,
-    prior_rows,
-    pulled_beyond,
-    records_of,
-    see,
-    Seen,
-    units_of,
-    with_changes,
-    with_tangled,
-)
-from ._verdict import Bound, Verdict
+from ._identifiability import assess_identifiability, Information, LIMIT
+from ._verdict import Bound, pooled_freedom, Verdict
+from ._zero_bounds import bounds_among, near_zeros, one_sided_covariance, pulled_beyond
 
 
-class Counted(NamedTuple):
-    """How the points of a fit count: as the noise says, and with what the model does not explain.
+_NO_MINIMUM = 1e-2  # Newton decrement over cost, above which no number counts as determined
 
-    `records` are at the solution, by changes relative to its own units. `weights` are those by the
-    noise alone, where those of the problem have a floor on the error.
-    """
-
-    points: Sequence[Points]
-    records: list[ResponseTerm]
-    weights: Sequence[Weights] | None
-    mixings: Sequence[Mixing | None] | None
-    found: tuple[Mixture, Mixture]
+Vector = Float[np.ndarray, " parameters"]
 
 
 def assess(
     problem: Problem,
-    counted: Counted,
+    weighting: Weighting,
     solution: Solution,
     minima: tuple[Minimum, ...] = (),
     *,
@@ -101,282 +78,179 @@ def assess(
 
     The fit gets the `further` remarks and its `origin`.
     """
-    frfs, count = [each.frf for each in counted.points], problem.parameters.count
-    seen, units, bounds, bread, newton = _see(problem, counted, solution)
-    here = _cost(seen.blocks, seen.prior)
-    falls_aside = look_aside(problem, solution.z, here, bread, solution.aside)
-    costs = _costs_by_noise(problem, counted, solution, seen, units)
-    cut = ft.partial(halved, seen=seen, names=problem.parameters.names, bounds=bounds)
-    by_noise, covariance = cut(seen.by_noise), cut(seen.covariance)
-    facts = _information(problem, solution, seen.blocks, (covariance, by_noise), units)
-    verdict, by_data = _judge(problem, solution, seen, facts, bounds, newton, costs.cost)
-    estimate = Estimate(seen.bread, covariance, by_noise, units[:count], verdict, newton.decrement)
-    remarks = [
-        *_remarks_on_used(problem, frfs),
-        *remarks_on_hold(frfs, [np.asarray(each)[..., 0] > 0 for each in problem.weights]),
-    ]
-    if not is_fed_back(verdict):
-        doubted = _doubted(seen, costs)
-        remarks += [
-            *remarks_on_fit(problem, solution, costs.cost, newton.decrement, doubted, verdict),
-            *remarks_on_bounds(pulled_beyond(seen, problem.parameters.names, bounds), verdict),
-            *_remarks_on_growth(problem, solution, frfs),
-            *remarks_on_minima(problem, solution.converged and falls_aside(), minima),
-            *remarks_on_priors(seen.prior.misfit, verdict, by_data, chi_squared=doubted),
-            *remarks_on_discrepancy(seen.discrepancy),
-        ]
-    return make_fit(
-        problem,
-        solution,
-        estimate,
-        costs,
-        points=sum(int(np.sum(block.weights[:, 0] > 0)) for block in seen.blocks),
-        freedom=degrees_of_freedom(seen.records, seen.bread, seen.noise, count),
-        remarks=(*remarks, *further),
-        minima=minima,
-        discrepancy=seen.discrepancy,
-        origin=origin,
-    )
-
-
-class _Newton(NamedTuple):
-    """The next step of Gauss and Newton, and half of what it takes off the cost."""
-
-    step: Float[np.ndarray, " parameters"]
-    decrement: float
-
-
-class _AtSolution(NamedTuple):
-    """What the records say, by changes relative to units, and parameters that may be zero."""
-
-    seen: Seen
-    units: Float[np.ndarray, " all"]
-    bounds: tuple[Bound, ...]
-    bread: Matrix  # by the slopes at the solution itself
-    newton: _Newton
-
-
-def _see(problem: Problem, counted: Counted, solution: Solution) -> _AtSolution:
+    names, count = problem.parameters.names, problem.parameters.count
+    frfs = [points.frf for points in weighting.points]
     start = units = units_of(solution)
-    seen = tangent = see(counted.records, counted.found, solution, units)
-    near = near_zeros(problem, solution, seen, units)
+    budget = error_budget(weighting.records, weighting.mixtures, solution, units)
+    bread, bounds = budget.bread, ()  # by the slopes at the solution itself
+    near = near_zeros(problem, solution, budget)
     still = [one.k for one in near if one.changes is not None and one.bound.value]
-    step = newton_step(seen.bread, seen.gradient, solution.at_zero, still)
-    decrement = 0.5 * float(seen.gradient @ step)
-    bounds, frfs = (), [points.frf for points in counted.points]
+    step = newton_step(bread, budget.gradient, solution.at_zero, still)
+    decrement = 0.5 * float(budget.gradient @ step)
 
-    def see_again() -> Seen:
-        records = with_changes(records_of(problem, frfs, solution, units), near, units)
-        return see(records, counted.found, solution, units)
+    def budget_up_to_limits() -> ErrorBudget:
+        """With slopes that hold up to the limits of parameters near zero."""
+        records = records_of(problem, frfs, solution, units)
+        for number, record in enumerate(records):
+            slopes = record.slopes.copy()
+            for one in near:
+                if one.changes is not None:
+                    slopes[..., one.k] = units[one.k] * one.changes[number]
+            records[number] = dataclasses.replace(record, slopes=slopes)
+        return error_budget(records, weighting.mixtures, solution, units)
 
     if near:
-        seen = see_again()
-        bounds, tangled = bounds_among(near, seen, solution, units)
-        if tangled:
-            units = with_tangled(units, near, tangled)
-            seen = see_again()
-    newton = _Newton(step * (start / units)[: step.size], decrement)
-    return _AtSolution(seen, units, bounds, tangent.bread, newton)
-
-
-def _costs_by_noise(
-    problem: Problem,
-    counted: Counted,
-    solution: Solution,
-    seen: Seen,
-    units: Float[np.ndarray, " all"],
-) -> Costs:
-    """Cost and misfit under weights by the noise alone: they compare fits of other structures."""
-    plain, prior = seen, seen.prior
-    if counted.weights is not None:
-        alone, frfs = problem.weighted(counted.weights, counted.mixings), counted.points
-        records = records_of(alone, [each.frf for each in frfs], solution, units)
-        plain = _look(records, prior, problem.parameters.count)
-    return _costs(plain.blocks, prior, plain.bread, plain.noise)
-
-
-def _doubted(seen: Seen, costs: Costs) -> float:
-    """The misfit that remarks are about.
-
-    Few points of their own noise reach a large one by chance: the discrepancy has to say so, too.
-    """
-    misfit = costs.chi_squared
-    return misfit if seen.discrepancy.none < DOUBT else min(misfit, 1.0)
-
-
-def _judge(
-    problem: Problem,
-    solution: Solution,
-    seen: Seen,
-    facts: Information,
-    bounds: tuple[Bound, ...],
-    newton: _Newton,
-    cost: float,
-) -> tuple[Verdict, Verdict]:
-    """What data and priors determine together, and what the data determine alone."""
-    names, frfs = problem.parameters.names, [each.frf for each in seen.records]
-    step, decrement = newton
-    dominated, used = _count_dominated(problem, frfs)
-    if 2 * dominated > used:
-        verdict = fed_back(names, dominated, used)
-    elif decrement > _NO_MINIMUM * max(cost, 1e-9) or is_unfinished(solution, step, seen.by_noise):
-        remedies = ("«start from other values»", "try many starts at once (starts=20)")
-        verdict = no_minimum(names, decrement, cost, *remedies, message=solution.message)
-    elif seen.discrepancy.amplitude > NO_MODEL:
-        verdict = no_model(names, seen.discrepancy.amplitude)
-    else:
-        both, by_data = identifiability_of(facts, seen.prior, bounds)
-        return _with_wider_band(both, problem, frfs), by_data
-    return verdict, verdict
-
-
-class _Look(NamedTuple):
-    """What the weights alone make of the records."""
-
-    blocks: list[Block]
-    bread: Matrix
-    noise: Noise
-
-
-def _look(records: list[ResponseTerm], prior: PriorRows, count: int) -> _Look:
-    blocks = blocks_of(records)
-    bread, _ = gauss_newton(blocks, prior, count)
-    return _Look(blocks, bread, noise_effect(records, blocks, prior, count))
-
-
-def _costs(blocks: list[Block], prior: PriorRows, bread: Matrix, noise: Noise) -> Costs:
-    cost = _cost(blocks, prior)
-    misfit = misfit_ratio(_cost(blocks), bread, noise)
-    # A misfit beyond the noise is in no covariance of the noise.
-    inflation = misfit if misfit > MISFIT**2 else 1.0
-    information = cost + 2 * inflation * fitted_noise(bread, noise)
-    return Costs(cost, cost / len(blocks), information, misfit)
-
-
-def _cost(blocks: list[Block], prior: PriorRows | None = None) -> float:
-    """The sum of squares of the data, and of the priors."""
-    data = sum(float(np.sum(block.residual**2)) for block in blocks)
-    return data if prior is None else data + float(np.sum(prior.misfit**2))
-
-
-def records_at(
-    problem: Problem, points: Sequence[Points], solution: Solution
-) -> list[ResponseTerm]:
-    """The responses at a solution, by changes relative to its own units."""
-    frfs = [each.frf for each in points]
-    return records_of(problem, frfs, solution, units_of(solution))
-
-
-def discrepancy_at(
-    records: list[ResponseTerm], points: Sequence[Points], solution: Solution
-) -> tuple[Mixture, Mixture]:
-    """What the model leaves unexplained at a solution."""
-    count, prior = solution.z.size, prior_rows(solution, units_of(solution))
-    held = set()
-    if solution.at_zero:
-        gradient = gauss_newton(blocks_of(records), prior, count)[1]
-        held = {k for k in solution.at_zero if gradient[k] > 0}
-    return find_discrepancy(records, points, prior, [k for k in range(count) if k not in held])
-
-
-def _with_wider_band(
-    verdict: Verdict, problem: Problem, frfs: Sequence[FrequencyResponse]
-) -> Verdict:
-    """With the advice to excite a wider band first, where a wider one may tell parameters apart."""
-    if verdict.identifiable or len(verdict.exact):
-        return verdict
-    wider = widen_band(frfs, [np.asarray(each)[..., 0] > 0 for each in problem.weights])
-    remedies = (wider, *verdict.remedies) if wider else verdict.remedies
-    return dataclasses.replace(verdict, remedies=remedies)
-
-
-def _count_dominated(problem: Problem, frfs: Sequence[FrequencyResponse]) -> tuple[int, int]:
-    """Points in use that show a controller, and all in use."""
-    used = [np.asarray(weights)[..., 0] > 0 for weights in problem.weights]
-    dominated = [mine & frf.of_controller for frf, mine in zip(frfs, used, strict=True)]
-    return int(sum(map(np.count_nonzero, dominated))), int(sum(map(np.count_nonzero, used)))
-
-
-def _remarks_on_used(problem: Problem, frfs: Sequence[FrequencyResponse]) -> list[str]:
-    """Those of the responses' remarks that concern the points in use, each once."""
-    used = [np.asarray(weights)[..., 0] > 0 for weights in problem.weights]
-    pairs = [(frf, mine) for frf, mine in zip(frfs, used, strict=True) if frf.remarks]
-    parts = [frf.remarks_about(mine) for frf, mine in pairs]
-    return list(dict.fromkeys(remark for part in parts for remark in part))
-
-
-def _remarks_on_growth(
-    problem: Problem, solution: Solution, frfs: Sequence[FrequencyResponse]
-) -> list[str]:
-    """Remark on a model that grows within the band of a direct estimate: no open loop does."""
-    model = solution.model
-    lags = isinstance(model, LaggedIntegrator) and not np.asarray(model.lag) < 0
-    if lags or not any(frf.method == "direct" for frf in frfs):
-        return []
-    if not isinstance(model, StateSpace | TransferFunction | HasStateSpace | HasTransferFunction):
-        return []
-    pairs = zip(frfs, problem.weights, strict=True)
-    used = [
-        np.asarray(frf.omega)[np.any(np.asarray(w)[..., 0] > 0, axis=(1, 2))] for frf, w in pairs
-    ]
-    omega = np.concatenate(used)
-    lowest, highest = float(np.min(omega)), float(np.max(omega))
-    poles = linear_model(on_device(model)).poles
-    growth = float(np.max(np.real(poles[np.abs(poles) < highest]), initial=0.0))
-    return remarks_on_growth(growth) if growth > lowest else []
-
-
-def newton_step(
-    bread: Float[np.ndarray, "parameters parameters"],
-    gradient: Float[np.ndarray, " parameters"],
-    at_zero: Sequence[int],
-    still: Sequence[int] = (),
-) -> Float[np.ndarray, " parameters"]:
-    """The next Gauss-Newton step, downhill; parameters at zero do not become negative.
-
-    Others stand `still`: those so near zero that slopes there say nothing about a step.
-    """
-    held = [*(k for k in at_zero if gradient[k] > 0), *still]
-    if not held:
-        return scaled_inverse(bread) @ gradient
-    free, step = np.setdiff1d(np.arange(gradient.size), held), np.zeros(gradient.size)
-    step[free] = scaled_inverse(bread[np.ix_(free, free)]) @ gradient[free]
-    return step
-
-
-def _information(
-    problem: Problem,
-    solution: Solution,
-    blocks: list[Block],
-    covariances: tuple[Matrix, Matrix],
-    units: Float[np.ndarray, " all"],
-) -> Information:
-    """What the data say; the covariances are those with model error and by the noise alone."""
+        budget = budget_up_to_limits()
+        bounds, mixed = bounds_among(near, budget, solution, units)
+        if not np.array_equal(mixed, units):
+            units = mixed
+            budget = budget_up_to_limits()
+    step = step * (start / units)[: step.size]
+    cost, average, information, misfit = _costs_by_noise(
+        problem, weighting, solution, budget, units
+    )
+    cut = ft.partial(one_sided_covariance, budget=budget, names=names, bounds=bounds)
+    by_noise, covariance = cut(budget.by_noise), cut(budget.covariance)
     places = problem.parameters.places
-    return Information(
-        root=information_root(blocks),
-        covariance=covariances[0],
-        by_noise=covariances[1],
+    facts = Information(
+        root=information_root(budget.blocks),
+        covariance=covariance,
+        by_noise=by_noise,
         names=tuple(place.name for place in places),
         values=np.asarray(solution.values),
         units=units,
         order=ranks_of(places),
         same=ft.partial(same_responses, problem, solution),
     )
+    used = [np.asarray(weights)[..., 0] > 0 for weights in problem.weights]
+    controller = [mine & frf.of_controller for frf, mine in zip(frfs, used, strict=True)]
+    dominated, points = (int(sum(map(np.count_nonzero, masks))) for masks in (controller, used))
+    unfinished = decrement > _NO_MINIMUM * max(cost, 1e-9)
+    if 2 * dominated > points:
+        verdict = by_data = fed_back(names, dominated, points)
+    elif unfinished or is_unfinished(solution, step, budget.by_noise):
+        remedies = ("«start from other values»", "try many starts at once (starts=20)")
+        verdict = by_data = no_minimum(names, decrement, cost, *remedies, message=solution.message)
+    elif budget.discrepancy.amplitude > NO_MODEL:
+        verdict = by_data = no_model(names, budget.discrepancy.amplitude)
+    else:
+        verdict, by_data = identifiability_of(facts, budget.prior, bounds)
+        indefinite = not verdict.identifiable and not len(verdict.exact)
+        if indefinite and (wider := widen_band(frfs, used)):  # may tell parameters apart
+            verdict = dataclasses.replace(verdict, remedies=(wider, *verdict.remedies))
+    # Those of the responses' remarks that concern the points in use, each once.
+    parts = [frf.remarks_about(mine) for frf, mine in zip(frfs, used, strict=True) if frf.remarks]
+    remarks = list(dict.fromkeys(remark for part in parts for remark in part))
+    remarks += remarks_on_hold(frfs, used)
+    if not is_fed_back(verdict):
+        here = total_cost(budget.blocks, budget.prior)
+        saddle = solution.converged and is_saddle(problem, solution, here, bread)
+        # Few points of independent noise reach a large misfit by chance: the discrepancy has to
+        # say so, too.
+        doubted = misfit if budget.discrepancy.none < DOUBT else min(misfit, 1.0)
+        remarks += [
+            *remarks_on_fit(problem, solution, cost, decrement, doubted, verdict),
+            *remarks_on_bounds(pulled_beyond(budget, names, bounds), verdict),
+            *_remarks_on_growth(solution.model, frfs, used),
+            *remarks_on_minima(problem, saddle, minima),
+            *remarks_on_priors(budget.prior.misfit, verdict, by_data, chi_squared=doubted),
+            *remarks_on_discrepancy(budget.discrepancy),
+        ]
+    return make_fit(
+        problem,
+        solution,
+        bread=budget.bread,
+        covariance=covariance,
+        by_noise=by_noise,
+        units=units[:count],
+        verdict=verdict,
+        decrement=decrement,
+        cost=cost,
+        average_cost=average,
+        information=information,
+        chi_squared=misfit,
+        points=sum(int(np.sum(block.weights[:, 0] > 0)) for block in budget.blocks),
+        freedom=degrees_of_freedom(budget.records, budget.bread, budget.noise, count),
+        remarks=(*remarks, *further),
+        minima=minima,
+        discrepancy=budget.discrepancy,
+        origin=origin,
+    )
+
+
+def newton_step(
+    bread: Matrix, gradient: Vector, at_zero: Sequence[int], still: Sequence[int] = ()
+) -> Vector:
+    """The next Gauss-Newton step, downhill; parameters at zero do not become negative.
+
+    Others stand `still`: those so near zero that slopes there say nothing about a step.
+    """
+    fixed = [*(k for k in at_zero if gradient[k] > 0), *still]
+    if not fixed:
+        return scaled_inverse(bread) @ gradient
+    free, step = np.setdiff1d(np.arange(gradient.size), fixed), np.zeros(gradient.size)
+    step[free] = scaled_inverse(bread[np.ix_(free, free)]) @ gradient[free]
+    return step
+
+
+def total_cost(blocks: list[Block], prior: PriorRows | None = None) -> float:
+    """The sum of squares of the data, and of the priors."""
+    data = sum(float(np.sum(block.residual**2)) for block in blocks)
+    return data if prior is None else data + float(np.sum(prior.misfit**2))
+
+
+def _costs_by_noise(
+    problem: Problem, weighting: Weighting, solution: Solution, budget: ErrorBudget, units: Units
+) -> tuple[float, float, float, float]:
+    """Cost, average, information and misfit under weights by the noise alone.
+
+    They compare fits of other structures.
+    """
+    blocks, prior, bread, noise = budget.blocks, budget.prior, budget.bread, budget.noise
+    if weighting.weights is not None:
+        count = problem.parameters.count
+        alone = problem.weighted(weighting.weights, weighting.mixings)
+        frfs = [points.frf for points in weighting.points]
+        records = records_of(alone, frfs, solution, units)
+        blocks = blocks_of(records)
+        bread, _ = gauss_newton(blocks, prior, count)
+        noise = noise_effect(records, blocks, prior, count)
+    cost = total_cost(blocks, prior)
+    misfit = misfit_ratio(total_cost(blocks), bread, noise)
+    # A misfit beyond the noise is in no covariance of the noise.
+    inflation = misfit if misfit > MISFIT**2 else 1.0
+    information = cost + 2 * inflation * fitted_noise(bread, noise)
+    return cost, cost / len(blocks), information, misfit
+
+
+def _remarks_on_growth(
+    model: PyTree, frfs: Sequence[FrequencyResponse], used: Sequence[np.ndarray]
+) -> list[str]:
+    """Remark on a model that grows within the band of a direct estimate: no open loop does."""
+    lags = isinstance(model, LaggedIntegrator) and not np.asarray(model.lag) < 0
+    if lags or not any(frf.method == "direct" for frf in frfs):
+        return []
+    if not isinstance(model, StateSpace | TransferFunction | HasStateSpace | HasTransferFunction):
+        return []
+    pairs = zip(frfs, used, strict=True)
+    omega = np.concatenate([np.asarray(f.omega)[np.any(m, axis=(1, 2))] for f, m in pairs])
+    lowest, highest = float(np.min(omega)), float(np.max(omega))
+    poles = linear_model(on_device(model)).poles
+    growth = float(np.max(np.real(poles[np.abs(poles) < highest]), initial=0.0))
+    return remarks_on_growth(growth) if growth > lowest else []
 
 
 def identifiability_of(
     facts: Information, prior: PriorRows, bounds: tuple[Bound, ...] = ()
 ) -> tuple[Verdict, Verdict]:
     """What data and priors determine together, and what the data determine alone."""
+    by_data = assess_identifiability(facts, bounds)
     if not len(prior.misfit):
-        verdict = assess_identifiability(facts, bounds)
-        return verdict, verdict
+        return by_data, by_data
     # Rows come in pairs of magnitude and phase; a prior's row counts once.
     priors = np.repeat(prior.slopes, 2, axis=0) / np.sqrt(2)
-    return assess_identifiability(
-        facts._replace(root=np.concatenate([facts.root, priors])), bounds
-    ), assess_identifiability(facts, bounds)
+    together = facts._replace(root=np.concatenate([facts.root, priors]))
+    return assess_identifiability(together, bounds), by_data
 
 
 def ranks_of(places: Sequence[Place]) -> tuple[int, ...]:
@@ -385,4 +259,116 @@ def ranks_of(places: Sequence[Place]) -> tuple[int, ...]:
     return tuple(ordered.index(place) for place in places)
 
 
-_NO_MINIMUM = 1e-2  # Newton decrement over cost, above which no number counts as determined
+def make_fit(
+    problem: Problem,
+    solution: Solution,
+    *,
+    bread: Matrix,
+    covariance: Matrix,
+    by_noise: Matrix,
+    units: Vector,
+    verdict: Verdict,
+    decrement: float,
+    cost: float,
+    average_cost: float,
+    information: float,
+    chi_squared: float,
+    points: int,
+    remarks: tuple[str, ...],
+    minima: tuple[Minimum, ...] = (),
+    freedom: Vector | None = None,
+    discrepancy: Discrepancy | None = None,
+    noise_models: tuple[tuple[NoiseModel, ...], ...] = (),
+    origin: Origin | None = None,
+) -> Fit:
+    """A result in physical units; both covariances are those of changes relative to `units`.
+
+    `freedom` is that of the noise estimate, infinite without.
+    """
+    names, values = problem.parameters.names, np.asarray(solution.values)[: units.size]
+    freedom = np.full(units.size, np.inf) if freedom is None else freedom
+    pooled = pooled_freedom(freedom, np.ones(units.size))
+    combinations = (one._replace(degrees_of_freedom=pooled) for one in verdict.combinations)
+    verdict = dataclasses.replace(verdict, combinations=tuple(combinations))
+    if runaways(problem, solution, verdict) and not is_fed_back(verdict):
+        verdict = dataclasses.replace(verdict, remedies=())  # the remarks say what to do
+    unbounded = np.zeros(len(names), dtype=bool)
+    if verdict.undetermined:
+        # A pseudo-inverse shows no variance along a null direction: there it is unbounded.
+        rows = [[row.get(name, 0.0) for name in names] for row in verdict.null_directions]
+        hidden = [row for row in np.array(rows) if row @ covariance @ row < (0.5 * LIMIT) ** 2]
+        null = np.reshape([*hidden, *verdict.exact], (-1, len(names)))
+        lost = np.array([name in verdict.undetermined for name in names])
+        unbounded = lost & np.any(np.abs(null) > 1e-6, axis=0)
+
+    def in_units(relative: Matrix) -> Matrix:
+        physical = relative * np.outer(units, units)
+        if unbounded.any():
+            physical[unbounded, :] = physical[:, unbounded] = np.nan
+        return physical
+
+    physical = in_units(covariance)
+    with np.errstate(divide="ignore"):
+        percent = np.where(values == 0, np.nan, 100 * np.abs(units / values))
+    return Fit(
+        model=on_device(solution.model),
+        names=names,
+        values=values,
+        standard_errors=np.where(unbounded, np.inf, np.sqrt(np.diagonal(physical))),
+        covariance=physical,
+        noise_covariance=in_units(by_noise),
+        cramer_rao=np.where(unbounded, np.inf, cramer_rao(bread) * percent),
+        insensitivity=insensitivity(bread) * percent,
+        cost=cost,
+        average_cost=average_cost,
+        information=information,
+        chi_squared=chi_squared,
+        newton_decrement=decrement,
+        condition=condition_number(bread),
+        points=points,
+        steps=solution.steps,
+        verdict=verdict,
+        remarks=as_messages(remarks),
+        parameters=problem.parameters,
+        units=units,
+        relative_covariance=covariance,
+        relative_noise_covariance=by_noise,
+        minima=minima,
+        degrees_of_freedom=freedom,
+        discrepancy=discrepancy,
+        noise_models=noise_models,
+        origin=origin,
+    )
+
+
+def unfitted(
+    model: PyTree, parameters: Parameters, verdict: Verdict, remarks: tuple[str, ...] = ()
+) -> Fit:
+    """What a fit returns where there is nothing to fit: the starting values, all marked."""
+    count = parameters.count
+    infinite, unknown = np.full(count, np.inf), np.full((count, count), np.nan)
+    return Fit(
+        model=model,
+        names=parameters.names,
+        values=np.asarray(parameters.values(parameters.start[:count])),
+        standard_errors=infinite,
+        covariance=unknown,
+        noise_covariance=unknown,
+        cramer_rao=infinite,
+        insensitivity=infinite,
+        degrees_of_freedom=infinite,
+        cost=np.nan,
+        average_cost=np.nan,
+        information=np.nan,
+        chi_squared=np.nan,
+        newton_decrement=np.nan,
+        condition=np.inf,
+        points=0,
+        steps=0,
+        verdict=verdict,
+        remarks=as_messages(remarks),
+        parameters=parameters,
+        units=np.asarray(parameters.slopes(parameters.start[:count])),
+        relative_covariance=unknown,
+        relative_noise_covariance=unknown,
+    )

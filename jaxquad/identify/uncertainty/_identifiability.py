@@ -20,7 +20,7 @@ _MOVE = 0.4  # finite relative change along a null direction, to test products a
 _FLOOR = 1e-8  # of the largest singular value: below it lies rounding
 
 Vector = Float[np.ndarray, " parameters"]
-Directions = Float[np.ndarray, "directions parameters"]
+Directions = Float[np.ndarray, "_ parameters"]
 
 
 def echelon(rows: Float[np.ndarray, "rows columns"]) -> Float[np.ndarray, "rows columns"]:

@@ -1,0 +1,234 @@
+"""Parameters that may be zero: the limits that they stay below, and errors up to there.
+
+At a bound the optimum is a one-sided problem: the cost rises from it with a slope, and the limit is
+where the profile likelihood has risen by 2.71 / 2.
+Source: Self and Liang (1987), Asymptotic properties of maximum likelihood estimators and likelihood
+ratio tests under nonstandard conditions.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from ..frequency_domain._bounds import linearise, Linearised, polish
+from ..frequency_domain._problem import Problem
+from ..frequency_domain._solve import Solution, solution_at
+from ._accuracy import Matrix, scaled_inverse
+from ._error_budget import ErrorBudget
+from ._identifiability import LIMIT
+from ._verdict import Bound
+
+
+_RISE = 2.71  # of the cost, at the end of a one-sided 95 % interval
+_EVALUATIONS = 12  # of the profile
+_CLOSE = 0.02  # of the rise
+_FAR = 50.0  # standard deviations, beyond which the hazard's digits cancel
+# A tenth of the magnitude and 6 deg of phase are less than a design's margins leave open, so what a
+# parameter does to the loop is well enough determined, whatever its share of it.
+_SLIGHT = 0.1
+_FEW = 0.1  # of the limit: below it the slopes at a value say little about the way to the limit
+_ONE_SIDED = 1.645  # standard errors that reach from the middle of a one-sided 95 % interval
+
+Units = Float[np.ndarray, " all"]
+
+
+class NearZero(NamedTuple):
+    """A parameter that may be zero, how far from it the data allow, and what it does up to there.
+
+    `changes` are those of the misfits by its value, as the way to the limit has them on average,
+    where the slopes at the value itself say little about the rest of the way; else None. `slight`
+    is whether all of that way moves the responses by little.
+    """
+
+    k: int
+    bound: Bound
+    changes: list[Float[np.ndarray, "frequencies outputs inputs 2"]] | None
+    slight: bool
+
+
+def near_zeros(problem: Problem, solution: Solution, budget: ErrorBudget) -> list[NearZero]:
+    """Parameters at zero, or so near it that the data allow it, with one-sided 95 % limits."""
+    parameters, parts = problem.parameters, (budget.covariance, budget.by_noise)
+    possible = np.sqrt(np.diagonal(budget.covariance)) * _ONE_SIDED > 1
+    possible |= np.sqrt(np.diagonal(budget.by_noise)) > LIMIT
+    possible &= np.array(parameters.logarithmic[: parameters.count])
+    possible[list(solution.at_zero)] = True
+    near, curvature = [], scaled_inverse(budget.bread)
+    for k in np.flatnonzero(possible & (np.diagonal(budget.bread) > 0)).tolist():
+        others = [j for j in solution.at_zero if j != k]
+        inflations = [float(part[k, k] / curvature[k, k]) for part in parts]
+        if others:  # these stay at zero
+            some = np.append(np.setdiff1d(np.arange(len(curvature)), [k, *others]), k)
+            pairs = [_sandwich(budget.bread, budget.bread @ c @ budget.bread, some) for c in parts]
+            inflations = [float(c[-1, -1] / inverse[-1, -1]) for c, inverse in pairs]
+        (limit, by_noise), beyond = one_sided_limits(problem, solution, k, inflations)
+        value = float(np.asarray(solution.values)[k])
+        bound = Bound(parameters.names[k], value, limit, by_noise, beyond)
+        if not np.isfinite(limit):
+            near.append(NearZero(k, bound, None, slight=False))
+            continue
+        z = np.array(solution.z)
+        z[k] = np.log(abs(limit / float(np.asarray(parameters.scale)[k])))
+        there, here = solution_at(problem, z).sensitivity.misfits, solution.sensitivity.misfits
+        steps = [np.asarray(new) - np.asarray(old) for new, old in zip(there, here, strict=True)]
+        changes = [step / (limit - value) for step in steps]
+        used = (record.weights > 0 for record in budget.records)
+        sizes = [np.abs(c[mine]) for c, mine in zip(changes, used, strict=True)]
+        largest = max(float(np.max(size, initial=0.0)) for size in sizes)
+        few, slight = abs(value) < _FEW * abs(limit), largest * abs(limit) < _SLIGHT
+        near.append(NearZero(k, bound, changes if few else None, slight))
+    return near
+
+
+def one_sided_limits(
+    problem: Problem, solution: Solution, k: int, inflations: Sequence[float]
+) -> tuple[list[float], float]:
+    """Where a parameter that may be zero leaves its one-sided 95 % interval, in its own unit.
+
+    **Arguments:**
+
+    - `problem`, `solution`: with the parameter at zero, or at so small a value that it might be.
+    - `k`: which parameter.
+    - `inflations`: its variance over what the curvature of the cost says, one for each limit.
+
+    **Returns:** the limits, with the parameter's sign, infinite where the cost does not rise so
+    far; and how far beyond zero the cost would be lowest, without a sign.
+    """
+    local, unit = linearise(problem, solution), float(np.asarray(solution.slopes)[k])
+    # Slope and curvature of the profile, over the value at which these are evaluated.
+    jacobian = local.jacobian
+    slope = max(float(jacobian[:, k] @ local.residual), 0.0)
+    curvature = 1 / max(float(scaled_inverse(jacobian.T @ jacobian)[k, k]), 1e-300)
+    limits = []
+    for inflation in inflations:
+        wanted = _RISE * inflation
+        if not wanted > 0:  # of a variance that rounding left negative
+            limits.append(unit * np.inf)
+            continue
+        guess = (np.sqrt(slope**2 + curvature * wanted) - slope) / curvature
+        limits.append(unit * _growth(problem, solution, local, k, wanted, 1 + guess))
+    return limits, abs(unit) * slope / curvature
+
+
+def _growth(
+    problem: Problem, solution: Solution, local: Linearised, k: int, wanted: float, times: float
+) -> float:
+    """By which factor parameter `k` grows until the cost has risen by what is wanted."""
+    low, high = 1.0, np.inf
+    for _ in range(_EVALUATIONS):
+        z = np.asarray(solution.z).copy()
+        z[k] += np.log(times)
+        cost = polish(problem, z, [k], solution)[1].cost
+        rise = cost - local.cost if np.isfinite(cost) else np.inf
+        if abs(rise - wanted) <= _CLOSE * wanted:
+            return float(times)
+        low, high = (times, high) if rise < wanted else (low, times)
+        times *= np.clip(np.sqrt(wanted / max(rise, 1e-300)), 0.2, 5.0)
+        if not low < times < high:
+            times = np.sqrt(low * min(high, 100 * low))
+    return float(times if np.isfinite(high) else np.inf)
+
+
+def bounds_among(
+    near: Sequence[NearZero], budget: ErrorBudget, solution: Solution, units: Units
+) -> tuple[tuple[Bound, ...], Units]:
+    """Those that a limit determines; and units in which those mixed up with others count.
+
+    That is where another one would change by too much if this one had a value up to its limit: it
+    then counts as much as that other one.
+    """
+    bounds, mixed = [], {}
+    slight = [one.k for one in near if one.slight]
+    for one in near:
+        along = np.abs(budget.covariance[:, one.k] / budget.covariance[one.k, one.k])
+        moved = along * abs(one.bound.limit / units[one.k])
+        moved[[one.k, *(solution.at_zero if one.k in solution.at_zero else ())]] = 0.0
+        moved[slight if one.slight else []] = 0.0
+        if np.all(moved <= LIMIT):
+            bounds.append(one.bound)
+        elif one.k in solution.at_zero or one.changes is not None:
+            mixed[one.k] = moved
+    others = [j for j in range(len(budget.bread)) if j not in mixed]
+    units = units.copy()
+    for one in near:
+        if one.k in mixed and np.isfinite(one.bound.limit):
+            share = float(np.max(mixed[one.k][others], initial=0.0))
+            units[one.k] = one.bound.limit / (share if share > LIMIT else 1.0)
+    return tuple(bounds), units
+
+
+def one_sided_covariance(
+    covariance: Matrix, budget: ErrorBudget, names: tuple[str, ...], bounds: Sequence[Bound]
+) -> Matrix:
+    """The covariance with what the bounds of parameters at zero cut off taken away."""
+    covariance, steps = _unbounded(covariance, budget, names, bounds)
+    for k, step in steps.items():
+        covariance = one_sided(covariance, k, step)
+    return covariance
+
+
+def pulled_beyond(
+    budget: ErrorBudget, names: tuple[str, ...], bounds: Sequence[Bound]
+) -> Mapping[str, float]:
+    """How far beyond zero the data want parameters at zero, in random errors."""
+    covariance, steps = _unbounded(budget.by_noise, budget, names, bounds)
+    errors = {k: float(np.sqrt(max(covariance[k, k], 1e-300))) for k in steps}
+    return {names[k]: -step / errors[k] for k, step in steps.items()}
+
+
+def _unbounded(
+    covariance: Matrix, budget: ErrorBudget, names: tuple[str, ...], bounds: Sequence[Bound]
+) -> tuple[Matrix, dict[int, float]]:
+    """The covariance without bounds, and where parameters at zero would go without them.
+
+    One by one, while the others stay there: two lags at zero do the same to a response, so that
+    without their bounds one could grow without limit as the other becomes negative.
+    """
+    zeros, bread = [names.index(bound.name) for bound in bounds if not bound.value], budget.bread
+    if len(zeros) < 2:
+        step = -scaled_inverse(bread) @ budget.gradient
+        return covariance, {k: float(step[k]) for k in zeros}
+    meat = bread @ covariance @ bread
+    free = np.setdiff1d(np.arange(len(bread)), zeros)
+    total, steps = np.zeros_like(covariance), dict[int, float]()
+    total[np.ix_(free, free)] = _sandwich(bread, meat, free)[0]
+    for k in zeros:
+        some = np.append(free, k)
+        mine, inverse = _sandwich(bread, meat, some)
+        along = np.zeros(len(bread))
+        along[some] = mine[:, -1] / max(float(mine[-1, -1]), 1e-300)
+        total += np.outer(along, along) * mine[-1, -1]
+        steps[k] = -float(inverse[-1] @ budget.gradient[some])
+    return total, steps
+
+
+def _sandwich(
+    bread: Matrix, meat: Matrix, some: Int[np.ndarray, " some"]
+) -> tuple[Float[np.ndarray, "some some"], Float[np.ndarray, "some some"]]:
+    """The covariance of some parameters while the others are fixed, and the inverse bread."""
+    inverse = scaled_inverse(bread[np.ix_(some, some)])
+    return inverse @ meat[np.ix_(some, some)] @ inverse, inverse
+
+
+def one_sided(covariance: Matrix, k: int, optimum: float) -> Matrix:
+    """The covariance where parameter `k` is at zero, from that of an unconstrained fit.
+
+    What is left of its normal distribution above zero has this second moment about zero, and what
+    the other parameters make of it. `optimum` is where it would be without the bound.
+    """
+    from scipy.special import log_ndtr
+
+    variance = covariance[k, k]
+    if not variance > 0:  # of a matrix that rounding left singular
+        return covariance
+    below = max(-optimum / np.sqrt(variance), 0.0)
+    # Second moment of a standard normal distribution beyond `below`, about that point.
+    if below > _FAR:
+        remaining = 2 / below**2 - 10 / below**4 + 74 / below**6
+    else:
+        hazard = np.exp(-0.5 * below**2 - log_ndtr(-below)) / np.sqrt(2 * np.pi)
+        remaining = max(1 - below * (hazard - below), 0.0)
+    along = covariance[:, k] / variance
+    return covariance + np.outer(along, along) * (variance * remaining - variance)
