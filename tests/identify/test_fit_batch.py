@@ -50,7 +50,7 @@ def one_by_one(response, weights):
         omega=(OMEGA,),
         measured=(response,),
         weights=(weights,),
-        known=jnp.zeros((0, 2)),
+        prior=jnp.zeros((0, 2)),
         aliases=(None,),
         silent=((),),
         mixings=(None,),
