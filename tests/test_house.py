@@ -59,3 +59,31 @@ def test_no_file_but_its_own_asks_whether_a_firmware_is_the_one():
         for node in ast.walk(ast.parse(path.read_text())):
             words = [x.value for x in ast.walk(node) if isinstance(x, ast.Constant)]
             assert not (isinstance(node, ast.Compare) and firmwares & {*words}), (path, node.lineno)
+
+
+VAGUE = {
+    "found", "known", "given", "each", "own", "whole",
+    "beside", "made", "told", "asked", "apart", "held",
+}  # fmt: skip
+
+
+def bindings(tree: ast.AST) -> Iterator[tuple[int, str]]:
+    """The line and name of all that a file binds: variables, fields, arguments, functions."""
+    for node in ast.walk(tree):
+        match node:
+            case ast.Name(id=name, ctx=ast.Store()) | ast.Attribute(attr=name, ctx=ast.Store()):
+                yield node.lineno, name
+            case ast.arg(arg=name) | ast.FunctionDef(name=name) | ast.ClassDef(name=name):
+                yield node.lineno, name
+            case ast.alias(asname=str(name)):
+                yield node.lineno, name
+
+
+def test_a_name_says_what_a_value_is():
+    vague = [
+        f"{path.relative_to(ROOT)}:{line}: {name}"
+        for path in FILES
+        for line, name in (*bindings(ast.parse(path.read_text())), (0, path.stem))
+        if name.strip("_") in VAGUE
+    ]
+    assert not vague, "\n".join(["name the value by the field's noun:", *vague])
