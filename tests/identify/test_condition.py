@@ -11,7 +11,7 @@ from synthetic import response_of
 
 import jaxquad as jq
 from jaxquad._compile import _programs
-from jaxquad.identify.frequency_domain._condition import require_conditions
+from jaxquad.identify.frequency_domain._parameters import require_conditions
 
 
 RIG = jq.models.AttitudeAxis(L=0.197, K_t=0.1188, J_x=0.0552, lag=0.02)

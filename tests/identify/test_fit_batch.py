@@ -11,7 +11,7 @@ import jaxquad as jq
 from jaxquad._compile import evaluate_once
 from jaxquad.identify import select_parameters
 from jaxquad.identify.batch._fit_batch import solve_batch
-from jaxquad.identify.frequency_domain._condition import UNCHANGED
+from jaxquad.identify.frequency_domain._parameters import UNCHANGED
 from jaxquad.identify.frequency_domain._problem import Problem, residuals
 
 

@@ -13,10 +13,9 @@ from jaxquad._core import Message, Normal, normal_equations, on_host, pytree_nod
 from jaxquad.models import evaluate_response
 from jaxquad.spectra import FrequencyResponse
 
-from ._condition import Condition, require_conditions
-from ._held import Aliases, evaluate_sampled, hold_of, plan_aliases
 from ._mixing import mix_parts, Mixing, unmixed
-from ._parameters import find_place, Numbers, Parameters
+from ._parameters import Condition, find_place, Numbers, Parameters, require_conditions
+from ._sampled import Aliases, evaluate_sampled, hold_of, plan_aliases
 
 
 class Prior(eqx.Module):
