@@ -33,9 +33,15 @@ from ._cost import (
     widen_band,
 )
 from ._mixing import Mixing, mixings_of
-from ._model_checks import require_model, require_model_response
 from ._parameters import Condition, Free, Parameters, select_parameters, Tie
-from ._problem import make_problem, Prior, Problem, require_priors
+from ._problem import (
+    make_problem,
+    Prior,
+    Problem,
+    require_model,
+    require_model_response,
+    require_priors,
+)
 from ._refits import Options, Origin
 from ._result import Fit
 from ._solve import Solution

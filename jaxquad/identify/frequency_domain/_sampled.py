@@ -135,8 +135,8 @@ def remarks_on_hold(
                 "it is not known how long the input keeps each value: if it is held for a sample "
                 f"({1e3 * frf.dt:.3g} ms), the gain is {100 * lost[k]:.2g} % too low at "
                 f"{omega:.3g} rad/s ({omega / (2 * np.pi):.3g} Hz), {over[k]:.2g} times the random "
-                "error, and the delay half a sample too long; give «hold=» in s, the loop's period for a "
-                "command, 0 for a quantity that was measured« (jq.Record, jq.read)»"
+                "error, and the delay half a sample too long; give «hold=» in s, the loop's period "
+                "for a command, 0 for a quantity that was measured« (jq.Record, jq.read)»"
             ]
     return []
 
