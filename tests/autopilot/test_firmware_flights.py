@@ -12,7 +12,7 @@ from jaxquad.autopilot import AxesProposal
 from jaxquad.autopilot._law_check import check_law
 from jaxquad.cli import main
 from jaxquad.workflows import _autopilot as workflow, autopilot, AutopilotSettings
-from jaxquad.workflows._autopilot import _channels_of, _read_flight
+from jaxquad.workflows._autopilot import _read_axis
 
 
 BETAFLIGHT, ARDUPILOT = "betaflight_firmware", "ardupilot_firmware"
@@ -31,8 +31,8 @@ LEFT = {"P": 0.01, "I": 0.03, "D": 0.01, "output": 0.01}  # beyond what rounding
 def law_of(path, axis, **changed):
     """The law of a log replayed, with other gains where `changed` has some."""
     settings = AutopilotSettings(axis=axis)
-    asked, proposal = _channels_of(path, settings)
-    flown, flight = _read_flight(path, asked, proposal, settings)
+    axis = _read_axis(path, settings)
+    flown, flight = axis.flown, axis.flight
     assert flight is not None
     loop = flown.loop
     if changed:
@@ -70,8 +70,8 @@ def test_another_law_is_named_by_its_term(data, changed, wrong):
 def test_a_set_point_that_acts_a_loop_later_is_found_and_said(data):
     path = data / ARDUPILOT / "rate_chirp_pitch.BIN"
     settings = AutopilotSettings(axis="pitch")
-    asked, proposal = _channels_of(path, settings)
-    flown, flight = _read_flight(path, asked, proposal, settings)
+    axis = _read_axis(path, settings)
+    flown, flight = axis.flown, axis.flight
     assert flight is not None
     check = check_law(flown.loop, flown.axis, dataclasses.replace(flight, late=0.0))
     assert check.flew and check.shifted and check.late == pytest.approx(1 / 400)
