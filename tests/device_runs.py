@@ -15,6 +15,7 @@ from jaxquad.control import LADRC, PD
 from jaxquad.loops import Loop
 from jaxquad.models import DecoupledAxes
 from jaxquad.simulation import (
+    devices_for,
     evaluate,
     over_devices,
     Pulse,
@@ -26,7 +27,7 @@ from jaxquad.simulation import (
     Window,
 )
 from jaxquad.simulation._evaluate import _run
-from jaxquad.simulation._over_devices import devices_for, where_put
+from jaxquad.simulation._over_devices import where_put
 
 
 MEMBERS, SAMPLES = 67, 120  # no multiple of two
