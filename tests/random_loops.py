@@ -69,7 +69,9 @@ def compare(seed):
     parts, signal = (draw(2), draw(2, members)), draw(samples)
 
     def fast(carry, parts):
-        return run_ensemble(step, carry, parts, signal, own=((False, True), False), chunk=chunk)
+        return run_ensemble(
+            step, carry, parts, signal, of_members=((False, True), False), chunk=chunk
+        )
 
     def plain(carry, parts):
         return jax.lax.scan(lambda carry, now: step(carry, parts, now), carry, signal)

@@ -6,7 +6,6 @@ is the same, by plain scans. See docs/compilers.md.
 
 from ._compile_cache import (
     enable_compile_cache as enable_compile_cache,
-    own_folder as own_folder,
     share_programs as share_programs,
 )
 from ._door import (

@@ -42,14 +42,19 @@ def enable_compile_cache() -> Path | None:
     """
     if os.environ.get(_VARIABLE) == "off":
         return None
-    given = _given()
-    if given is not None:
-        return given.parent if _is_own(given) else given
-    shared = _shared_folder()
+    jax_folder = _jax_folder()
+    if jax_folder is not None:
+        return jax_folder.parent if _is_own(jax_folder) else jax_folder
+    folder = os.environ.get(_VARIABLE)
+    default = Path(platformdirs.user_cache_dir("jaxquad")) / f"programs-{_processor()}"
+    shared = Path(folder).absolute() if folder else default
     try:
         shared.mkdir(parents=True, exist_ok=True)
         _prune(shared)
-        own = _linked(shared)
+        mine = Path(tempfile.mkdtemp(prefix=_OWN, dir=shared))
+        for path in shared.glob(_ENTRIES):
+            with contextlib.suppress(FileNotFoundError):  # Another process has just removed it.
+                os.link(path, mine / path.name)
     except OSError as error:
         warnings.warn(
             f"compiled programs are not kept: {error}. Name another folder by {_VARIABLE}, or "
@@ -57,11 +62,17 @@ def enable_compile_cache() -> Path | None:
             stacklevel=2,
         )
         return None
-    _use(own)
+    jax.config.update("jax_compilation_cache_dir", str(mine))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", _LEAST)
+    # Else the name of this process's folder is part of what programs are found by.
+    jax.config.update("jax_persistent_cache_enable_xla_caches", "none")
+    compilation_cache.reset_cache()  # An earlier compilation has fixed that there is none.
+    atexit.register(shutil.rmtree, mine, ignore_errors=True)
+    atexit.register(share_programs)
     return shared
 
 
-def _given() -> Path | None:
+def _jax_folder() -> Path | None:
     # `jax.config.values` copies all settings, and every run of a program asks.
     folder = jax.config.jax_compilation_cache_dir  # pyright: ignore[reportAttributeAccessIssue]
     return Path(folder) if folder else None
@@ -69,19 +80,12 @@ def _given() -> Path | None:
 
 def own_folder() -> Path | None:
     """This process's folder of programs; None without `enable_compile_cache`."""
-    folder = _given()
+    folder = _jax_folder()
     return folder if folder is not None and _is_own(folder) else None
 
 
 def _is_own(folder: Path) -> bool:
     return folder.name.startswith(_OWN)
-
-
-def _shared_folder() -> Path:
-    folder = os.environ.get(_VARIABLE)
-    if folder:
-        return Path(folder).absolute()
-    return Path(platformdirs.user_cache_dir("jaxquad")) / f"programs-{_processor()}"
 
 
 def _processor() -> str:
@@ -108,34 +112,14 @@ def _prune(shared: Path) -> None:
             shutil.rmtree(folder, ignore_errors=True)
 
 
-def _linked(shared: Path) -> Path:
-    own = Path(tempfile.mkdtemp(prefix=_OWN, dir=shared))
-    for path in shared.glob(_ENTRIES):
-        try:
-            os.link(path, own / path.name)
-        except FileNotFoundError:  # Another process has just removed it.
-            continue
-    return own
-
-
-def _use(own: Path) -> None:
-    jax.config.update("jax_compilation_cache_dir", str(own))
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", _LEAST)
-    # Else the name of this process's folder is part of what programs are found by.
-    jax.config.update("jax_persistent_cache_enable_xla_caches", "none")
-    compilation_cache.reset_cache()  # An earlier compilation has fixed that there is none.
-    atexit.register(shutil.rmtree, own, ignore_errors=True)
-    atexit.register(share_programs)
-
-
 def share_programs() -> None:
     """Give other processes what this one has compiled; at its end this happens by itself.
 
     It does nothing without `enable_compile_cache`.
     """
-    own = own_folder()
-    if own is None:
+    mine = own_folder()
+    if mine is None:
         return
-    for path in own.glob(_ENTRIES):
+    for path in mine.glob(_ENTRIES):
         with contextlib.suppress(OSError):  # It is there already, or the disk is full.
-            os.link(path, own.parent / path.name)
+            os.link(path, mine.parent / path.name)

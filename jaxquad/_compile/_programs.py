@@ -71,12 +71,12 @@ class Jit:
         """The same for arguments that the caller has taken apart."""
         if not _is_outermost(leaves):
             return self._plain(*args)
-        kind = lambda: (self._function, str(structure), *map(_kind, _apart(leaves)[0]))
+        kind = lambda: (self._function, str(structure), *map(_kind, _arrays_and_others(leaves)[0]))
         run = lambda: self._run(args, leaves, structure)
         return compilers().or_plain(self._function.__name__, kind, run)
 
     def _run(self, args: PyTree, leaves: list, structure: PyTree) -> PyTree:
-        arrays, others = _apart(leaves)
+        arrays, others = _arrays_and_others(leaves)
         try:
             with _Silence():  # errors of what runs are raised here
                 return jax.block_until_ready(self._programs.of(structure, others)(arrays))
@@ -88,7 +88,7 @@ class Jit:
     def lower(self, *args: PyTree) -> jax.stages.Lowered:
         """What a call with such arguments, outside of other programs, compiles."""
         leaves, structure = jax.tree.flatten(args)
-        arrays, others = _apart(leaves)
+        arrays, others = _arrays_and_others(leaves)
         return self._programs.of(structure, others).plain.lower(arrays)
 
     def is_outermost(self, *args: PyTree) -> bool:
@@ -98,17 +98,11 @@ class Jit:
     def is_new(self, *args: PyTree) -> bool:
         """Whether nobody has asked before for arguments that have the same program."""
         leaves, structure = jax.tree.flatten(args)
-        arrays, others = _apart(leaves)
+        arrays, others = _arrays_and_others(leaves)
         kind = structure, others, _kinds(arrays)
         is_new = kind not in self._met
         self._met.add(kind)
         return is_new
-
-    def begin(self, *args: PyTree) -> None:
-        """Trace and lower what the first call with such arguments will compile."""
-        leaves, structure = jax.tree.flatten(args)
-        arrays, others = _apart(leaves)
-        self._programs.of(structure, others).begin(arrays)
 
 
 class KeptPrograms:
@@ -119,7 +113,7 @@ class KeptPrograms:
 
     def __call__(self, *args: PyTree) -> PyTree:
         leaves, structure = jax.tree.flatten(args)
-        arrays, others = _apart(leaves)
+        arrays, others = _arrays_and_others(leaves)
         return self.of(structure, others)(arrays)
 
     def of_arrays(
@@ -134,7 +128,7 @@ class KeptPrograms:
         def run(arrays: Sequence[Numbers]) -> PyTree:
             if not program:
                 leaves, structure = jax.tree.flatten(fill(arrays))
-                in_order, others = _apart(leaves)
+                in_order, others = _arrays_and_others(leaves)
                 if list(map(id, in_order)) != list(map(id, arrays)):
                     raise ValueError(
                         "the arrays are not those of the arguments' leaves, in their order"
@@ -145,7 +139,7 @@ class KeptPrograms:
         return run
 
 
-def _apart(leaves: Sequence[Any]) -> tuple[list[Any], Others]:
+def _arrays_and_others(leaves: Sequence[Any]) -> tuple[list[Any], Others]:
     arrays = [x for x in leaves if isinstance(x, _ARRAYS)]
     if len(arrays) == len(leaves):
         return arrays, ()
@@ -169,7 +163,6 @@ class _Form:
 
 
 _Call = Callable[[Sequence[Numbers]], PyTree]
-_Lowered = tuple[jax.stages.Lowered, _Form]
 
 
 class _Program:
@@ -181,7 +174,7 @@ class _Program:
         def run(arrays: Sequence[Any]) -> tuple[list[Any], _Form]:
             args = jax.tree.unflatten(structure, _together(arrays, others))
             leaves, form = jax.tree.flatten(function(*args))
-            results, rest = _apart(leaves)
+            results, rest = _arrays_and_others(leaves)
             return results, _Form(form, rest)
 
         run.__name__ = function.__name__
@@ -189,7 +182,6 @@ class _Program:
         self._settings = structure, others
         self.plain = jax.jit(run, compiler_options=options() or None)
         self._compiled: dict[tuple, _Call] = {}
-        self._lowered: dict[tuple, _Lowered] = {}
         self._lock = threading.Lock()
 
     def __call__(self, arrays: Sequence[Numbers]) -> PyTree:
@@ -199,21 +191,10 @@ class _Program:
         kinds = _kinds(arrays)
         with self._lock:
             if kinds not in self._compiled:
-                self._compiled[kinds] = self._find(arrays, kinds, folder)
+                self._compiled[kinds] = self._find(arrays, folder)
         return self._compiled[kinds](arrays)
 
-    def begin(self, arrays: Sequence[Numbers]) -> None:
-        """Trace and lower the program, unless it is there."""
-        folder, name = _folder(), self._name(arrays)
-        if folder is None or name is None:
-            self.plain.lower(arrays)
-            return
-        kinds = _kinds(arrays)
-        with self._lock:
-            if not ((folder / name).is_file() or kinds in self._compiled):
-                self._lowered[kinds] = self._lower(name, arrays)
-
-    def _find(self, arrays: Sequence[Numbers], kinds: tuple, folder: Path) -> _Call:
+    def _find(self, arrays: Sequence[Numbers], folder: Path) -> _Call:
         """From the disk or the compiler; by `jax.jit` where it has no name."""
         name = self._name(arrays)
         if name is None:
@@ -222,7 +203,7 @@ class _Program:
         program = _read(path, len(arrays)) if path.is_file() else None
         if program is not None:
             return program
-        lowered, form = self._lowered.pop(kinds, None) or self._lower(name, arrays)
+        lowered, form = self._lower(name, arrays)
         _remove_of_jax(name)  # what JAX takes from its own files cannot be written again
         run = lowered.compile()
         _remove_of_jax(name)
@@ -233,7 +214,7 @@ class _Program:
         results, form = self.plain(arrays)
         return form.filled(results)
 
-    def _lower(self, name: str, arrays: Sequence[Numbers]) -> _Lowered:
+    def _lower(self, name: str, arrays: Sequence[Numbers]) -> tuple[jax.stages.Lowered, _Form]:
         forms: list[_Form] = []
 
         def run(arrays: Sequence[Any]) -> list[Any]:

@@ -41,10 +41,6 @@ class Queue(NamedTuple):
         rows = jax.lax.dynamic_update_index_in_dim(self.rows, self.newest, place, 0)
         return Queue(rows, self.newest), oldest
 
-    def in_order(self) -> tuple[Array, ...]:
-        """The inputs, the oldest first."""
-        return (*(() if self.rows is None else self.rows), self.newest)
-
 
 def scan_members(
     step: Step,
@@ -75,10 +71,17 @@ def scan_members(
         advance = lambda carry, *now: step(carry, parts, *now)
         return scan_in_blocks(advance, carry, signals, queue, few)
 
+    def with_rows(both: tuple[tuple[Array, ...], PyTree], now: PyTree) -> tuple[PyTree, PyTree]:
+        """Hands the queue on row by row: a GPU's kernel has no place that is known only later."""
+        (oldest, *rows), carry = both
+        carry, (newest, out) = step(carry, parts, now, oldest)
+        return ((*rows, newest), carry), out
+
     if members is not None and compilers().why_no_device_kernels() is None:
-        advance, begun = lambda carry, *now: step(carry, parts, *now), carry
+        advance, begun = lambda carry, now: step(carry, parts, now), carry
         if queue is not None:
-            advance, begun = _with_rows(advance), (queue.in_order(), carry)
+            rows = () if queue.rows is None else tuple(queue.rows)
+            advance, begun = with_rows, ((*rows, queue.newest), carry)  # the oldest first
         result = compilers().scan_on_device(advance, begun, signals, members, scan_in_blocks)
         if result is not None:
             return result if queue is None else (result[0][1], result[1])
@@ -88,17 +91,6 @@ def scan_members(
 def are_few(members: int) -> bool:
     """Whether a loop of so many takes longer to compile than to run, and is no single loop."""
     return SINGLE < members <= _SOME
-
-
-def _with_rows(step: Step) -> Step:
-    """A step that hands its queue on row by row: a kernel has no place that is known only later."""
-
-    def queued(both: tuple[tuple[Array, ...], PyTree], now: PyTree) -> tuple[PyTree, PyTree]:
-        (oldest, *rows), carry = both
-        carry, (newest, out) = step(carry, now, oldest)
-        return ((*rows, newest), carry), out
-
-    return queued
 
 
 def scan_in_blocks(
@@ -111,17 +103,39 @@ def scan_in_blocks(
     (carry, (newest, y)). The reverse of `few` members is kernels that two cores compile at once.
     """
     count = len(jax.tree.leaves(xs)[0])
-    size = _block_size(count)
+    size = count
+    if count > _SHORT:  # near the square root of `count`, and a divisor if there is one
+        root = math.isqrt(count)
+        near = sorted(range(root // 2, 2 * root + 1), key=lambda size: abs(size - root))
+        size = next((size for size in near if count % size == 0), root)
     length = -(-count // size) * size
+
+    def until_count(carry: PyTree, xs: tuple[Array, PyTree], *oldest: Array) -> PyTree:
+        """Leaves the carry as it is after `count`: a last block of another length would be
+        compiled as a second loop."""
+        index, now = xs
+        after, out = step(carry, now, *oldest)
+        return jax.tree.map(lambda new, old: jnp.where(index < count, new, old), after, carry), out
+
+    longer = lambda x: jnp.concatenate([x, jnp.repeat(x[-1:], length - count, axis=0)])
+    sample = step
     if length > count:
-        step, xs = _until(count, step), (jnp.arange(length), jax.tree.map(_lengthened(length), xs))
+        sample, xs = until_count, (jnp.arange(length), jax.tree.map(longer, xs))
     # Within a scan nothing can be merged with the forward pass, so no barriers are needed.
-    step = jax.checkpoint(step, prevent_cse=False, policy=_POLICY)
+    sample = jax.checkpoint(sample, prevent_cse=False, policy=_POLICY)
+
+    def with_queue(both: tuple[Queue, PyTree], xs: tuple[Array, PyTree]) -> tuple[PyTree, PyTree]:
+        """Changes it outside of what reverse mode computes again: that would have to keep it."""
+        (queue, carry), (index, now) = both, xs
+        queue, oldest = queue.exchange(index)
+        carry, (newest, out) = sample(carry, now, oldest)
+        return (queue._replace(newest=newest), carry), out
+
     if queue is not None:
-        step, carry, xs = _with_queue(step), (queue, carry), (jnp.arange(length), xs)
+        carry, xs = (queue, carry), (jnp.arange(length), xs)
 
     def jaxquad_block(carry: PyTree, xs: PyTree) -> tuple[PyTree, PyTree]:
-        return jax.lax.scan(step, carry, xs)
+        return jax.lax.scan(sample if queue is None else with_queue, carry, xs)
 
     # A function of this name becomes kernels of its own where it is computed again and reversed:
     # two cores compile these two at once, and the time of both grows faster than their operations.
@@ -136,46 +150,6 @@ def scan_in_blocks(
     return (carry if queue is None else carry[1]), out
 
 
-def _with_queue(step: Step) -> Step:
-    """The queue changes outside of what reverse mode computes again: that would have to keep it."""
-
-    def queued(both: tuple[Queue, PyTree], xs: tuple[Array, PyTree]) -> tuple[PyTree, PyTree]:
-        (queue, carry), (index, now) = both, xs
-        queue, oldest = queue.exchange(index)
-        carry, (newest, out) = step(carry, now, oldest)
-        return (queue._replace(newest=newest), carry), out
-
-    return queued
-
-
-def _until(count: int, step: Step) -> Step:
-    """The step, which leaves the carry as it is after `count` samples.
-
-    A last block of another length would be compiled as a second loop.
-    """
-
-    def masked(carry: PyTree, xs: tuple[Array, PyTree], *oldest: Array) -> tuple[PyTree, PyTree]:
-        index, now = xs
-        after, out = step(carry, now, *oldest)
-        return jax.tree.map(lambda new, old: jnp.where(index < count, new, old), after, carry), out
-
-    return masked
-
-
-def _lengthened(length: int) -> Callable[[Array], Array]:
-    """With the last sample repeated."""
-    return lambda x: jnp.concatenate([x, jnp.repeat(x[-1:], length - x.shape[0], axis=0)])
-
-
-def _block_size(count: int) -> int:
-    """Near the square root of `count`, and a divisor if there is one."""
-    if count <= _SHORT:
-        return count
-    root = math.isqrt(count)
-    near = sorted(range(root // 2, 2 * root + 1), key=lambda size: abs(size - root))
-    return next((size for size in near if count % size == 0), root)
-
-
 _CHUNK = 128  # members: some hundred arrays of them fit a core's second cache
 _VECTOR = 16  # members that are computed at once
 _WIDEST = 4095  # numbers of an array in a kernel
@@ -187,7 +161,7 @@ def run_ensemble(
     parts: PyTree,
     signals: PyTree,
     *,
-    own: PyTree,
+    of_members: PyTree,
     chunk: int | None = None,
 ) -> tuple[PyTree, PyTree]:
     """`jax.lax.scan` of an ensemble of loops: the last carry, and what each sample left.
@@ -204,53 +178,63 @@ def run_ensemble(
     - `carry`: before the first sample, with the members on the last axis.
     - `parts`: what does not change with time.
     - `signals`: [samples, ...], of which `now` is one sample.
-    - `own`: True for the arrays of (parts, signals) that have the members on their last axis; a
-        tree like these, or the top of one.
+    - `of_members`: True for the arrays of (parts, signals) that have the members on their last
+        axis; a tree like these, or the top of one.
     - `chunk`: members at a time; None is 128 on a CPU, or as many as a kernel holds.
 
     **Raises:** ValueError for a result that does not have the members on its last axis.
     """
 
-    def scan(given: PyTree) -> tuple[PyTree, PyTree]:
-        carry, (parts, signals) = given
+    def scan(args: PyTree) -> tuple[PyTree, PyTree]:
+        carry, (parts, signals) = args
         members = jax.tree.leaves(carry)[0].shape[-1]
         return scan_members(step, carry, parts, signals, members=members)
 
     chunk = chunk or most_at_once(carry, jax.tree.leaves(carry)[0].shape[-1])
-    return in_chunks(scan, (carry, (parts, signals)), (True, own), chunk)
+    return in_chunks(scan, (carry, (parts, signals)), (True, of_members), chunk)
 
 
 def in_chunks(
-    function: Callable[[PyTree], PyTree], given: PyTree, own: PyTree, chunk: int | None = None
+    function: Callable[[PyTree], PyTree], args: PyTree, of_members: PyTree, chunk: int | None = None
 ) -> PyTree:
-    """`function(given)` for `chunk` members after the others, where there are more than these.
+    """`function(args)` for `chunk` members after the others, where there are more than these.
 
-    None: 128 on a CPU, all of them elsewhere. `own` tells which arrays of `given` have the members
-    on the last axis; all results must have them there. Raises ValueError for one that has not.
+    None: 128 on a CPU, all of them elsewhere. `of_members` tells which arrays of `args` have the
+    members on the last axis; all results must have them there, or a ValueError is raised.
     """
-    theirs, common = eqx.partition(given, own)
+    theirs, common = eqx.partition(args, of_members)
     members = jax.tree.leaves(theirs)[0].shape[-1]
-    size = _chunk_size(members, chunk or most_at_once())
+    number = -(-members // (chunk or most_at_once()))
+    size = -(-members // (number * _VECTOR)) * _VECTOR  # equal chunks, whole vectors long
     if members <= size:
-        return function(given)
+        return function(args)
     firsts = np.minimum(np.arange(0, members, size), members - size)  # the last two may overlap
-    few = jax.tree.map(lambda x: _split(x, len(firsts), size), theirs)
+
+    def in_rows(x: Array) -> Array:
+        """[chunks, ..., size]."""
+        rows = x[..., : size * (len(firsts) - 1)].reshape(*x.shape[:-1], len(firsts) - 1, size)
+        return jnp.moveaxis(jnp.concatenate([rows, x[..., None, -size:]], axis=-2), -2, 0)
+
     # Within a scan nothing can be merged with the forward pass, so no barriers are needed.
     run = jax.checkpoint(lambda x: function(eqx.combine(x, common)), prevent_cse=False)
 
-    def put(room: PyTree, now: tuple[Array, PyTree]) -> tuple[PyTree, None]:
+    def room(x: jax.ShapeDtypeStruct) -> Array:
+        """For the results of all members: joined at the end, they would be written twice."""
+        if len(x.shape) < 1 or x.shape[-1] != size:
+            raise ValueError(
+                f"a result has the shape {x.shape}, but the {size} members of a chunk belong on "
+                "its last axis: return what each member gives, and nothing that they share"
+            )
+        return jnp.zeros((*x.shape[:-1], members), x.dtype)
+
+    def put(joined: PyTree, now: tuple[Array, PyTree]) -> tuple[PyTree, None]:
         first, few = now
-        return jax.tree.map(lambda whole, x: _placed(whole, x, first), room, run(few)), None
+        place = lambda old, x: jax.lax.dynamic_update_slice_in_dim(old, x, first, old.ndim - 1)
+        return jax.tree.map(place, joined, run(few)), None
 
+    few = jax.tree.map(in_rows, theirs)
     shapes = jax.eval_shape(run, jax.tree.map(lambda x: x[0], few))
-    room = jax.tree.map(lambda x: _room(x, size, members), shapes)
-    return jax.lax.scan(put, room, (jnp.asarray(firsts), few))[0]
-
-
-def _chunk_size(members: int, most: int) -> int:
-    """Of equal chunks, whole vectors of members long; all members where they fit one chunk."""
-    number = -(-members // most)
-    return members if number == 1 else -(-members // (number * _VECTOR)) * _VECTOR
+    return jax.lax.scan(put, jax.tree.map(room, shapes), (jnp.asarray(firsts), few))[0]
 
 
 def most_at_once(carry: PyTree = None, members: int = 1) -> int:
@@ -260,24 +244,3 @@ def most_at_once(carry: PyTree = None, members: int = 1) -> int:
     theirs = [x.size for x in jax.tree.leaves(carry) if x.shape[-1:] == (members,)]
     fitting = _WIDEST * members // max(theirs, default=members) // _VECTOR * _VECTOR
     return min(_CHUNK, fitting) or _CHUNK
-
-
-def _split(x: Array, number: int, size: int) -> Array:
-    """[number, ..., size], of which the last are the last of all."""
-    first = x[..., : (number - 1) * size].reshape(*x.shape[:-1], number - 1, size)
-    whole = jnp.concatenate([first, x[..., None, -size:]], axis=-2)
-    return jnp.moveaxis(whole, -2, 0)
-
-
-def _room(x: jax.ShapeDtypeStruct, size: int, members: int) -> Array:
-    """For the results of all members: joined at the end, they would be written twice."""
-    if len(x.shape) < 1 or x.shape[-1] != size:
-        raise ValueError(
-            f"a result has the shape {x.shape}, but the {size} members of a chunk belong on "
-            "its last axis: return what each member gives, and nothing that they share"
-        )
-    return jnp.zeros((*x.shape[:-1], members), x.dtype)
-
-
-def _placed(whole: Array, part: Array, first: Int[Array, ""]) -> Array:
-    return jax.lax.dynamic_update_slice_in_dim(whole, part, first, whole.ndim - 1)

@@ -95,12 +95,12 @@ def whole_samples(name: str, seconds: Number, sample_rate: Number, *, fewest: in
     count = seconds * sample_rate
     if not np.isfinite(count):
         raise ValueError(f"{name} is {seconds} s at {sample_rate} Hz: it has to be finite.")
-    whole = round(count)
-    if whole < fewest or abs(count - whole) > 1e-6:
+    rounded = round(count)
+    if rounded < fewest or abs(count - rounded) > 1e-6:
         below = max(fewest, int(np.floor(count)))
         raise ValueError(
             f"{name} of {seconds:.9g} s is {count:.6g} samples at {sample_rate:.6g} Hz, not "
             f"a whole number of at least {fewest}: the nearest are {below / sample_rate:.9g} s and "
             f"{(below + 1) / sample_rate:.9g} s."
         )
-    return whole
+    return rounded

@@ -70,11 +70,13 @@ def ensemble_shape(*trees: PyTree, rank: int | None = None) -> tuple[int, ...]:
 
     - `ValueError`: the arrays are for ensembles of different shapes. It names them.
     """
-    found = [(tree, *leaf) for tree in trees for leaf in _leaves(tree, rank)]
+    leaves = [(tree, *leaf) for tree in trees for leaf in _leaves(tree, rank)]
     shapes = [
-        (_name(tree, path), leaf.shape[own:])
-        for tree, path, leaf, own in found
-        if own is not None and isinstance(leaf, _ARRAYS) and len(leaf.shape) > own
+        (_name(tree, path), leaf.shape[rank_of_field:])
+        for tree, path, leaf, rank_of_field in leaves
+        if rank_of_field is not None
+        and isinstance(leaf, _ARRAYS)
+        and len(leaf.shape) > rank_of_field
     ]
     most = max((len(shape) for _, shape in shapes), default=0)
     try:
@@ -100,13 +102,13 @@ def mark_members(tree: PyTree, ensemble: tuple[int, ...], rank: int | None = Non
     `ensemble`, and `False` for all others, such as those of length 1 on it.
     """
 
-    def has(leaf: object, own: int | None) -> bool:
-        if own is None or not ensemble or not isinstance(leaf, _ARRAYS):
+    def has(leaf: object, field_rank: int | None) -> bool:
+        if field_rank is None or not ensemble or not isinstance(leaf, _ARRAYS):
             return False
-        shape = leaf.shape[own:]
+        shape = leaf.shape[field_rank:]
         return len(shape) == len(ensemble) and shape[-1] == ensemble[-1]
 
-    marks = [has(leaf, own) for _, leaf, own in _leaves(tree, rank)]
+    marks = [has(leaf, field_rank) for _, leaf, field_rank in _leaves(tree, rank)]
     return jax.tree.unflatten(jax.tree.structure(tree), marks)
 
 

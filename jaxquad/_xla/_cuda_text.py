@@ -23,7 +23,7 @@ def _between(sign: str) -> Expression:
 
 
 def _function(name: str) -> Expression:
-    return lambda kind, params, *given: f"{name}({', '.join(given)})"
+    return lambda kind, params, *args: f"{name}({', '.join(args)})"
 
 
 def _absolute(kind: str, params: dict, x: str) -> str:
@@ -88,9 +88,9 @@ _WRITTEN: dict[str, Expression] = {
 
 def _of_one_number(name: str) -> Primitive:
     """An operation of lanes alone, which only CUDA C has a text for."""
-    made = Primitive(name)
-    made.def_abstract_eval(lambda x: x)
-    return made
+    primitive = Primitive(name)
+    primitive.def_abstract_eval(lambda x: x)
+    return primitive
 
 
 # In place of what a function does that names its argument so.
@@ -98,7 +98,7 @@ FUNCTIONS = {"sincos": (_of_one_number("sine_of"), _of_one_number("cosine_of"))}
 EXPRESSIONS: dict[str, Expression] = (
     {name: _between(sign) for name, sign in _SIGNS.items()}
     | {name: _function(name) for name in _SAME_IN_C}
-    | {each.name: _function(each.name) for known in FUNCTIONS.values() for each in known}
+    | {x.name: _function(x.name) for pair in FUNCTIONS.values() for x in pair}
     | _WRITTEN
 )
 
@@ -280,10 +280,10 @@ class _Writer:
         return self.lines, [_name(v, names) for v in body.outvars]
 
     def _statement(self, equation: JaxprEqn, names: dict[Var, str], source: Source) -> None:
-        name, given = _shortened(equation, source)
+        name, args = _shortened(equation, source)
         [out] = equation.outvars
         kind = type_of(out.aval.dtype)  # pyright: ignore[reportAttributeAccessIssue]
-        text = EXPRESSIONS[name](kind, equation.params, *(_name(v, names) for v in given))
+        text = EXPRESSIONS[name](kind, equation.params, *(_name(v, names) for v in args))
         names[out] = f"{self.prefix}{len(self.lines)}"
         self.lines.append(f"const {kind} {names[out]} = {text};")
 
@@ -294,19 +294,19 @@ def _in_order(results: Sequence[Any], source: Source) -> list[JaxprEqn]:
     A compiler keeps the order of a long text to some degree: numbers that are computed late are
     held in registers for a shorter time.
     """
-    found: dict[int, JaxprEqn] = {}
+    ordered: dict[int, JaxprEqn] = {}
     for v in results:
         open_ = [source[v]] if isinstance(v, Var) and v in source else []
         while open_:
-            given = _shortened(open_[-1], source)[1]
-            needs = [source[x] for x in given if isinstance(x, Var) and x in source]
-            missing = [x for x in needs if id(x) not in found]
+            operands = _shortened(open_[-1], source)[1]
+            needs = [source[x] for x in operands if isinstance(x, Var) and x in source]
+            missing = [x for x in needs if id(x) not in ordered]
             if missing:
                 open_.append(missing[0])
             else:
                 equation = open_.pop()
-                found[id(equation)] = equation
-    return list(found.values())
+                ordered[id(equation)] = equation
+    return list(ordered.values())
 
 
 def _shortened(equation: JaxprEqn, source: Source) -> tuple[str, list]:
@@ -316,24 +316,24 @@ def _shortened(equation: JaxprEqn, source: Source) -> tuple[str, list]:
     """
     name = equation.primitive.name
     rule = _RULES.get(name)
-    found = None if rule is None else rule(equation.invars, source)
-    return (name, equation.invars) if found is None else found
+    rule_result = None if rule is None else rule(equation.invars, source)
+    return (name, equation.invars) if rule_result is None else rule_result
 
 
-def _slope_of_clamp(given: list, source: Source) -> tuple[str, list] | None:
+def _slope_of_clamp(operands: list, source: Source) -> tuple[str, list] | None:
     """`then` where low < x < high, else 0."""
-    which, zero, *then = given
+    which, zero, *then = operands
     one, other = _given_to("and", which, source) or (None, None)
     above, below = _given_to("gt", one, source), _given_to("lt", other, source)
     if not (_is_zero(zero) and above and below and above[0] is below[0] and len(then) == 1):
         return None
-    given = [above[1], above[0], below[1], *then]
-    return ("within", given) if len({v.aval.dtype for v in given}) == 1 else None
+    operands = [above[1], above[0], below[1], *then]
+    return ("within", operands) if len({v.aval.dtype for v in operands}) == 1 else None
 
 
-def _slope_of_extreme(given: list, source: Source) -> tuple[str, list] | None:
+def _slope_of_extreme(operands: list, source: Source) -> tuple[str, list] | None:
     """1, 1/2 where both are as large, or 0: JAX writes it as a quotient of two choices."""
-    choices = [_given_to("select_n", v, source) for v in given]
+    choices = [_given_to("select_n", v, source) for v in operands]
     numbers = [v for choice in choices for v in choice[1:]]
     if len(numbers) != 4 or not all(isinstance(v, Literal) for v in numbers):
         return None

@@ -46,15 +46,15 @@ def scan_in_kernel(
     carried, doubles = _bytes_of(first, members)
     fixed, fixed_doubles = _bytes_of(consts, members)
     # The carry and its cotangents, what is fixed and the cotangents of that.
-    held = held_bytes(2 * carried + 2 * fixed, doubles + 2 * fixed_doubles, BLOCK)
-    segments = segments_of(len(now[0]) if now else 0, carried, members, BLOCK, held)
+    shared = held_bytes(2 * carried + 2 * fixed, doubles + 2 * fixed_doubles, BLOCK)
+    segments = segments_of(len(now[0]) if now else 0, carried, members, BLOCK, shared)
     loop = Loop(jaxpr, len(consts), len(first), members, segments)
     reason = _why_not(loop)
     if reason is not None:
         note(f"a kernel of a GPU does not hold {reason}")
         return None
-    found = _loop.bind(*consts, *first, *now, loop=loop, scan=scan, keep=False)
-    return jax.tree.unflatten(result, found)
+    results = _loop.bind(*consts, *first, *now, loop=loop, scan=scan, keep=False)
+    return jax.tree.unflatten(result, results)
 
 
 def _bytes_of(arrays: Sequence[Array], members: int) -> tuple[int, int]:
@@ -71,8 +71,8 @@ def _trace(step: Step, carry: PyTree, signals: PyTree) -> tuple[ClosedJaxpr, lis
 
     def opened(*args: Array) -> list[Array]:
         fresh = iter(args)
-        whole = [next(fresh) if isinstance(x, jax.Array) else x for x in closed.consts]
-        return jaxpr_as_fun(ClosedJaxpr(closed.jaxpr, whole))(*fresh)
+        values = [next(fresh) if isinstance(x, jax.Array) else x for x in closed.consts]
+        return jaxpr_as_fun(ClosedJaxpr(closed.jaxpr, values))(*fresh)
 
     shaped = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in (*consts, *closed.in_avals)]
     return jax.make_jaxpr(opened)(*shaped), consts, jax.tree.structure(result)
@@ -88,12 +88,12 @@ def _why_not(loop: Loop) -> str | None:
         return "a loop without signals"
     if any((a.shape, a.dtype) != (b.shape, b.dtype) for a, b in zip(carry, after, strict=True)):
         return "a carry that changes its shape"
-    held = sum(size(loop, x) for x in carry)
-    if held > _MOST_HELD:
-        return f"a carry of {held} numbers for each member"
-    if len(loop.given) + len(loop.out) > _MOST_ARRAYS:
+    carried = sum(size(loop, x) for x in carry)
+    if carried > _MOST_HELD:
+        return f"a carry of {carried} numbers for each member"
+    if len(loop.inputs) + len(loop.out) > _MOST_ARRAYS:
         return f"a step of more than {_MOST_ARRAYS} arrays"
-    for x in (*loop.given, *loop.out):
+    for x in (*loop.inputs, *loop.out):
         if x.dtype not in NUMBERS:
             return f"values of {x.dtype}"
     return _fits(ft.partial(step_in_lanes, loop))
@@ -135,23 +135,23 @@ def _of_wanted(
 
     def function(*some: Array) -> Flat:
         fresh = iter(some)
-        whole = [next(fresh) if w else x for w, x in zip(which, args, strict=True)]
-        return [x for x in _run_plain(loop, scan, *whole) if is_float(x.dtype)]
+        values = [next(fresh) if w else x for w, x in zip(which, args, strict=True)]
+        return [x for x in _run_plain(loop, scan, *values) if is_float(x.dtype)]
 
     return function, [x for w, x in zip(which, args, strict=True) if w]
 
 
 def _plain_tangents(*args: Array, loop: Loop, scan: Scan, which: tuple[bool, ...]) -> Flat:
     """Of (arguments, kept, tangents)."""
-    given, _, tangents = split(args, len(which), len(kept_avals(loop)))
-    function, some = _of_wanted(loop, scan, given, which)
+    primals, _, tangents = split(args, len(which), len(kept_avals(loop)))
+    function, some = _of_wanted(loop, scan, primals, which)
     return jax.jvp(function, some, tangents)[1]
 
 
 def _plain_cotangents(*args: Array, loop: Loop, scan: Scan, which: tuple[bool, ...]) -> Flat:
     """Of (arguments, kept, cotangents)."""
-    given, _, cotangents = split(args, len(which), len(kept_avals(loop)))
-    function, some = _of_wanted(loop, scan, given, which)
+    primals, _, cotangents = split(args, len(which), len(kept_avals(loop)))
+    function, some = _of_wanted(loop, scan, primals, which)
     return list(jax.vjp(function, *some)[1](cotangents))
 
 
@@ -165,10 +165,10 @@ def _primitive(name: str, kernel: Callable[..., Flat], plain: Callable[..., Flat
             warn_once(f"NVRTC made no kernel of a loop ({reason})")
             return plain(*args, **params)
 
-    made = Primitive(name)
-    made.multiple_results = True
-    made.def_impl(lambda *args, **params: jax.jit(ft.partial(run, **params))(*args))
-    mlir.register_lowering(made, mlir.lower_fun(run, multiple_results=True))
+    primitive = Primitive(name)
+    primitive.multiple_results = True
+    primitive.def_impl(lambda *args, **params: jax.jit(ft.partial(run, **params))(*args))
+    mlir.register_lowering(primitive, mlir.lower_fun(run, multiple_results=True))
 
     def derivative(primals: Sequence, tangents: Sequence, **params: Any) -> tuple[Flat, Flat]:
         moved = tuple(ad.instantiate_zeros(x) for x in tangents)
@@ -178,9 +178,9 @@ def _primitive(name: str, kernel: Callable[..., Flat], plain: Callable[..., Flat
         out = jax.vmap(ft.partial(plain, **params), in_axes=tuple(axes))(*args)
         return out, [0] * len(out)
 
-    ad.primitive_jvps[made] = derivative
-    batching.primitive_batchers[made] = batch
-    return made
+    ad.primitive_jvps[primitive] = derivative
+    batching.primitive_batchers[primitive] = batch
+    return primitive
 
 
 def _forward(*args: Array, loop: Loop, scan: Scan, keep: bool) -> Flat:
@@ -237,9 +237,11 @@ def _loop_derivative(
     moved = [x for x in tangents if not isinstance(x, ad.Zero)]
     if any(which):
         moved = _tangent.bind(*primals, *kept, *moved, loop=loop, scan=scan, which=which)
-    found = iter(moved)
+    moved_in_order = iter(moved)
     still = lambda x: ad.Zero(jax.typeof(x).to_tangent_aval())
-    out_tangents = [next(found, still(x)) if is_float(x.dtype) else still(x) for x in results]
+    out_tangents = [
+        next(moved_in_order, still(x)) if is_float(x.dtype) else still(x) for x in results
+    ]
     kept = kept if keep else []
     # What is made of the kept carries is differentiated by the arguments, which lead to them.
     return [*results, *kept], [*out_tangents, *map(still, kept)]
@@ -248,20 +250,20 @@ def _loop_derivative(
 def _transpose(
     cotangents: Sequence, *args: Any, loop: Loop, scan: Scan, which: tuple[bool, ...]
 ) -> list:
-    known, _ = split(args, len(which) + len(kept_avals(loop)))
+    primals, _ = split(args, len(which) + len(kept_avals(loop)))
     if all(isinstance(x, ad.Zero) for x in cotangents):
         return [None] * len(args)
-    given = [not isinstance(x, ad.Zero) for x in cotangents]
+    are_given = [not isinstance(x, ad.Zero) for x in cotangents]
     filled = [ad.instantiate_zeros(x) for x in cotangents]
     reason = _fits(ft.partial(reverse_in_lanes, loop, which))
-    if reason is None and not holds_cotangents(loop, given):
+    if reason is None and not holds_cotangents(loop, are_given):
         reason = "a cotangent of what all members share"
     if reason is None:
-        found = _cotangent.bind(*known, *filled, loop=loop, scan=scan, which=which)
+        transposed = _cotangent.bind(*primals, *filled, loop=loop, scan=scan, which=which)
     else:
         note(f"the reverse kernel of a GPU does not hold {reason}")
-        found = _plain_cotangents(*known, *filled, loop=loop, scan=scan, which=which)
-    return [*(None for _ in known), *found]
+        transposed = _plain_cotangents(*primals, *filled, loop=loop, scan=scan, which=which)
+    return [*(None for _ in primals), *transposed]
 
 
 ad.primitive_jvps[_loop] = _loop_derivative

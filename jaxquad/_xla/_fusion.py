@@ -58,13 +58,13 @@ def evaluate_once(function: Callable[..., PyTree], *, least: int = _LARGE) -> Ca
         leaves, structure = jax.tree.flatten(args)
         flat = lambda *xs: function(*jax.tree.unflatten(structure, xs))
         closed, shape = jax.make_jaxpr(flat, return_shape=True)(*leaves)
-        values = _evaluate(closed.jaxpr, closed.consts, leaves, _Known(least, {}))
+        values = _evaluate(closed.jaxpr, closed.consts, leaves, _Computed(least, {}))
         return jax.tree.unflatten(jax.tree.structure(shape), values)
 
     return run
 
 
-class _Known(NamedTuple):
+class _Computed(NamedTuple):
     """What has been computed, of arrays of so many elements at least."""
 
     least: int
@@ -72,44 +72,46 @@ class _Known(NamedTuple):
 
 
 def _evaluate(
-    jaxpr: Jaxpr, consts: Sequence[Value], args: Sequence[Value], known: _Known
+    jaxpr: Jaxpr, consts: Sequence[Value], args: Sequence[Value], computed: _Computed
 ) -> list[Value]:
     values = dict(zip(jaxpr.constvars, consts, strict=True))
     values.update(zip(jaxpr.invars, args, strict=True))
     read = lambda var: var.val if isinstance(var, Literal) else values[var]
     for equation in jaxpr.eqns:
-        found = _apply(equation, [read(var) for var in equation.invars], known)
-        values.update(zip(equation.outvars, found, strict=True))
+        results = _apply(equation, [read(var) for var in equation.invars], computed)
+        values.update(zip(equation.outvars, results, strict=True))
     return [read(var) for var in jaxpr.outvars]
 
 
-def _apply(equation: JaxprEqn, args: list[Value], known: _Known) -> list[Value]:
+def _apply(equation: JaxprEqn, args: list[Value], computed: _Computed) -> list[Value]:
     name, params = equation.primitive.name, equation.params
     if name in _INLINED:
         inner = params[_INLINED[name]]
         if _stays_a_call(equation):
-            return _remembered(("call", id(inner)), args, known, lambda: _bind(equation, args))
-        return _evaluate(inner.jaxpr, inner.consts, args, known)
+            return _remembered(("call", id(inner)), args, computed, lambda: _bind(equation, args))
+        return _evaluate(inner.jaxpr, inner.consts, args, computed)
     if equation.primitive.multiple_results:
         return _bind(equation, args)
-    return _remembered((name, str(params)), args, known, lambda: [_single(equation, args, known)])
+    return _remembered(
+        (name, str(params)), args, computed, lambda: [_single(equation, args, computed)]
+    )
 
 
 def _stays_a_call(equation: JaxprEqn) -> bool:
     """Whether `no_fuse` keeps apart what takes longer than a call."""
     sizes = [var.aval.size for var in equation.outvars]  # pyright: ignore[reportAttributeAccessIssue]
-    apart = (equation.ctx.xla_metadata or {}).get("inlineable") == "false"
-    return apart and max(sizes) >= _LARGE
+    is_marked = (equation.ctx.xla_metadata or {}).get("inlineable") == "false"
+    return is_marked and max(sizes) >= _LARGE
 
 
 def _remembered(
-    what: tuple, args: Sequence[Value], known: _Known, compute: Callable[[], list[Value]]
+    what: tuple, args: Sequence[Value], computed: _Computed, compute: Callable[[], list[Value]]
 ) -> list[Value]:
     """The slopes by each parameter were traced apart: what they share has to be found again."""
     key = (*what, *(_identity(arg) for arg in args))
-    if key not in known.values:
-        known.values[key] = args, compute()  # holding the arguments keeps their ids their own
-    return known.values[key][1]
+    if key not in computed.values:
+        computed.values[key] = args, compute()  # holding the arguments keeps their ids their own
+    return computed.values[key][1]
 
 
 def _identity(arg: Value) -> Value:
@@ -118,14 +120,14 @@ def _identity(arg: Value) -> Value:
     return (str(arg.dtype), repr(arg.item())) if is_number else id(arg)
 
 
-def _single(equation: JaxprEqn, args: list[Value], known: _Known) -> Value:
+def _single(equation: JaxprEqn, args: list[Value], computed: _Computed) -> Value:
     name, params = equation.primitive.name, equation.params
-    if equation.outvars[0].aval.size < known.least:  # pyright: ignore[reportAttributeAccessIssue]
+    if equation.outvars[0].aval.size < computed.least:  # pyright: ignore[reportAttributeAccessIssue]
         return _bind(equation, args)[0]
     if name == "div" and jnp.iscomplexobj(args[1]):
-        return args[0] * _reciprocal_of(args[1], known)
+        return args[0] * _reciprocal_of(args[1], computed)
     if name == "integer_pow" and params["y"] < 0 and jnp.iscomplexobj(args[0]):
-        return jax.lax.integer_pow(_reciprocal_of(args[0], known), -params["y"])
+        return jax.lax.integer_pow(_reciprocal_of(args[0], computed), -params["y"])
     if name in _COSTLY:
         return no_fuse(lambda *xs: _bind(equation, xs)[0], *args)
     return _bind(equation, args)[0]
@@ -135,12 +137,12 @@ def _bind(equation: JaxprEqn, args: Sequence[Value]) -> list[Value]:
     bound = equation.primitive.get_bind_params(equation.params)
     functions, params = bound if isinstance(bound, tuple) else ((), bound)  # before jax 0.10, both
     with equation.ctx.manager:  # without it `no_fuse` would be lost
-        found = equation.primitive.bind(*functions, *args, **params)
-    return list(found) if equation.primitive.multiple_results else [found]
+        results = equation.primitive.bind(*functions, *args, **params)
+    return list(results) if equation.primitive.multiple_results else [results]
 
 
-def _reciprocal_of(value: Any, known: _Known) -> Value:
-    return _remembered(("reciprocal",), [value], known, lambda: [no_fuse(_reciprocal, value)])[0]
+def _reciprocal_of(value: Any, computed: _Computed) -> Value:
+    return _remembered(("reciprocal",), [value], computed, lambda: [no_fuse(_reciprocal, value)])[0]
 
 
 def _reciprocal(value: Value) -> Value:

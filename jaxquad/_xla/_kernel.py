@@ -158,12 +158,12 @@ ad.deflinear2(leave, _transposed(enter))
 
 def _tag(ctx: mlir.LoweringRuleContext, x: ir.Value) -> list[ir.Value]:
     """Turn the call that `x` comes from, by now differentiated and batched, into a kernel."""
-    whole = ctx.module_context
+    program = ctx.module_context
     try:
         call = _owner(x)
-        if _is_plain_call(call) and _is_for_one_cpu(whole):
-            for found in (call, *_forward_passes(call, whole)):
-                _make_kernel(found, whole)
+        if _is_plain_call(call) and _is_for_one_cpu(program):
+            for kernel in (call, *_forward_passes(call, program)):
+                _make_kernel(kernel, program)
     except Exception as error:  # The compiler's interfaces have changed: do without the kernel.
         warn_once(f"JAX {jax.__version__} cannot mark a kernel ({type(error).__name__}: {error})")
     return [x]
@@ -173,36 +173,36 @@ def _owner(x: ir.Value) -> Op | ir.Block:
     return getattr(x.owner, "operation", x.owner)
 
 
-def _forward_passes(call: Op, whole: mlir.ModuleContext) -> Iterator[Op]:
+def _forward_passes(call: Op, program: mlir.ModuleContext) -> Iterator[Op]:
     """The calls whose results a call takes, without their marks where nothing else was asked of.
 
     What is in a function takes them as its arguments; its forward pass is in one written before.
     """
     owners = [_owner(operand) for operand in call.operands]
     yield from filter(_is_plain_call, owners)
-    alone = isinstance(whole.axis_context, mlir.ShardingContext)  # then all functions are for one
+    alone = isinstance(program.axis_context, mlir.ShardingContext)  # then all functions are for one
     if alone and any(isinstance(owner, ir.Block) for owner in owners):
-        before = [op for f in whole.module.body.operations for op in operations_in(f)]
+        before = [op for f in program.module.body.operations for op in operations_in(f)]
         yield from filter(_is_plain_call, before)
 
 
-def _make_kernel(call: Op, whole: mlir.ModuleContext) -> None:
+def _make_kernel(call: Op, program: mlir.ModuleContext) -> None:
     if not _is_plain_call(call):
         return
-    reason = why_not(call, whole.module)
+    reason = why_not(call, program.module)
     if reason is not None:
         note(f"a kernel does not hold {reason}")
         call.attributes[ATTRIBUTE] = _attributes(_SEEN)
         return
-    name = in_parts(text(call, "callee"), whole.module, whole.symbol_table)
+    name = in_parts(text(call, "callee"), program.module, program.symbol_table)
     call.attributes["callee"] = ir.FlatSymbolRefAttr.get(name)
-    parts = calls_within(name, "jaxquad_block", whole.module)
+    parts = calls_within(name, "jaxquad_block", program.module)
     if len(parts) > 1:  # a block computed again, and reversed
         call.attributes[ATTRIBUTE] = _attributes(_SEEN)
     else:
         parts = [call]
     for part in parts:
-        hold_in_kernel(part, whole.module, whole.symbol_table, _attributes(_TAGS))
+        hold_in_kernel(part, program.module, program.symbol_table, _attributes(_TAGS))
 
 
 def _attributes(texts: dict[str, str]) -> ir.Attribute:
@@ -217,14 +217,14 @@ def _is_plain_call(op: Op | ir.Block) -> TypeGuard[ir.Operation]:
     return text(op, "callee").startswith("jaxquad_kernel") and len(op.operands) > 0
 
 
-def _is_for_one_cpu(whole: mlir.ModuleContext) -> bool:
+def _is_for_one_cpu(program: mlir.ModuleContext) -> bool:
     """Whether XLA has nothing to split among devices: a kernel cannot be split."""
-    where = whole.axis_context
+    where = program.axis_context
     if isinstance(where, mlir.SPMDAxisContext):
         alone = where.manual_axes == frozenset(where.mesh.axis_names)
     else:
         alone = isinstance(where, mlir.ShardingContext) and where.num_devices == 1
-    return alone and tuple(whole.platforms) == ("cpu",)
+    return alone and tuple(program.platforms) == ("cpu",)
 
 
 mlir.register_lowering(enter, lambda ctx, x: [x])

@@ -20,10 +20,10 @@ Lines = list[str]
 
 def pack(loop: Loop, x: Array, aval: Shaped, *, timed: bool = False) -> Array:
     """Members last, and the numbers of each member in one row."""
-    own = is_wide(loop, aval)
-    if own:
+    wide = is_wide(loop, aval)
+    if wide:
         x = jnp.moveaxis(x, timed + aval.shape.index(loop.members), -1)
-    last = (loop.members,) if own else ()
+    last = (loop.members,) if wide else ()
     x = x.reshape(*x.shape[:timed], size(loop, aval), *last)
     return x.astype(memory_type(x.dtype))
 
@@ -140,12 +140,12 @@ class Tile(NamedTuple):
 
 def tiles_of(loop: Loop, prefix: str, times: int, *, shared: bool = False) -> list[Tile]:
     kinds = [np.dtype(x.dtype) for x in loop.avals[1] for _ in range(size(loop, x))]
-    places = {kind: [k for k, each in enumerate(kinds) if each == kind] for kind in kinds}
-    made = [Tile(f"{prefix}_{kind}", kind, tuple(k), times, shared) for kind, k in places.items()]
-    return sorted(made, key=lambda tile: -memory_type(tile.kind).itemsize)
+    places = {kind: [k for k, one in enumerate(kinds) if one == kind] for kind in kinds}
+    tiles = [Tile(f"{prefix}_{kind}", kind, tuple(k), times, shared) for kind, k in places.items()]
+    return sorted(tiles, key=lambda tile: -memory_type(tile.kind).itemsize)
 
 
-class Held:
+class InBlock:
     """Numbers in double precision that a thread holds in its block's memory, if it is to do so.
 
     They are read and written there each time (`volatile`).
@@ -172,10 +172,10 @@ class Held:
         return lines, names
 
 
-def declared(held: Held, tiles: Sequence[Tile]) -> Lines:
+def declared(in_block: InBlock, tiles: Sequence[Tile]) -> Lines:
     """Where what a block shares lies, the largest numbers first, so that all are aligned."""
-    lines, first = ["extern __shared__ long long shelf[];"], held.size
-    if held.size:
+    lines, first = ["extern __shared__ long long shelf[];"], in_block.size
+    if in_block.size:
         lines.append("volatile double *const held = (double *)shelf + threadIdx.x;")
     for tile in tiles:
         kind = type_of(memory_type(tile.kind))
@@ -191,9 +191,9 @@ def kept_avals(loop: Loop) -> list[Shaped]:
 
 def load_tiles(tiles: Sequence[Tile], time: str) -> tuple[Lines, Lines]:
     """The lines that read a carry, and what its numbers are called."""
-    found = [tile.load(time) for tile in tiles]
-    names = {place: name for _, part in found for place, name in part.items()}
-    return [x for lines, _ in found for x in lines], [names[k] for k in sorted(names)]
+    loads = [tile.load(time) for tile in tiles]
+    names = {place: name for _, part in loads for place, name in part.items()}
+    return [x for lines, _ in loads for x in lines], [names[k] for k in sorted(names)]
 
 
 def fetch_before(tiles: Sequence[Tile]) -> Lines:
@@ -206,8 +206,8 @@ def store_tiles(tiles: Sequence[Tile], names: Sequence[str], time: str) -> Lines
 
 def load_all(rows: Iterable[Rows], time: str | None = None) -> tuple[Lines, Lines]:
     """The lines that read arrays, and what their numbers are called."""
-    found = [row.load(time) for row in rows]
-    return [x for lines, _ in found for x in lines], [x for _, names in found for x in names]
+    loads = [row.load(time) for row in rows]
+    return [x for lines, _ in loads for x in lines], [x for _, names in loads for x in names]
 
 
 def store_all(rows: Sequence[Rows], names: Sequence[str], time: str | None = None) -> Lines:
@@ -220,8 +220,8 @@ def variables(
 ) -> tuple[Lines, Lines]:
     """Lines that make variables with these values, and what they are called."""
     kinds = [type_of(x.dtype) for x in avals for _ in range(size(loop, x))]
-    made = [f"{prefix}{k}" for k in range(len(values))]
-    return [f"{c} {x} = {y};" for c, x, y in zip(kinds, made, values, strict=True)], made
+    names = [f"{prefix}{k}" for k in range(len(values))]
+    return [f"{c} {x} = {y};" for c, x, y in zip(kinds, names, values, strict=True)], names
 
 
 def assigned(names: Sequence[str], values: Sequence[str]) -> Lines:
@@ -237,15 +237,15 @@ def nested(head: str, lines: Iterable[str]) -> Lines:
 def run(
     loop: Loop,
     lines: Lines,
-    given: tuple[Sequence[Rows | Tile], Flat],
-    made: tuple[Sequence[Rows | Tile], Sequence[Shaped]],
+    inputs: tuple[Sequence[Rows | Tile], Flat],
+    outputs: tuple[Sequence[Rows | Tile], Sequence[Shaped]],
     shared: int = 0,
 ) -> Flat:
     """What a kernel of these lines makes of arguments and writes to results.
 
     Each block has some bytes of its own.
     """
-    parameters = [x.parameter("const ") for x in given[0]] + [x.parameter("") for x in made[0]]
+    parameters = [x.parameter("const ") for x in inputs[0]] + [x.parameter("") for x in outputs[0]]
     bounds = f"__launch_bounds__({BLOCK}, {BLOCKS})"
     head = f'extern "C" __global__ void {bounds} kernel({", ".join(parameters)})'
     begin = [
@@ -255,4 +255,4 @@ def run(
         "const long long member = is_member ? place : members - 1;",
     ]
     text = "\n".join([PRELUDE, *nested(head, [*begin, *lines]), ""])
-    return launch(text, "kernel", given[1], made[1], loop.members, BLOCK, shared)
+    return launch(text, "kernel", inputs[1], outputs[1], loop.members, BLOCK, shared)

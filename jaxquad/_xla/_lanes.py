@@ -50,18 +50,18 @@ class Lanes:
         """The shape of the cells of an array."""
         if shape.count(self.members) > 1:
             raise NotInLanes(f"an array {shape} with two axes as long as the ensemble")
-        found = tuple(1 if n == self.members else n for n in shape)
-        if math.prod(found) > MOST_CELLS or 0 in found:
+        cells = tuple(1 if n == self.members else n for n in shape)
+        if math.prod(cells) > MOST_CELLS or 0 in cells:
             raise NotInLanes(f"an array {shape}")
-        return found
+        return cells
 
     def evaluate(self, jaxpr: Jaxpr, consts: Sequence[Any], args: Sequence[Cells]) -> list[Cells]:
         values = {v: self._constant(c) for v, c in zip(jaxpr.constvars, consts, strict=True)}
         values.update(zip(jaxpr.invars, args, strict=True))
         read = lambda v: self._literal(v) if isinstance(v, Literal) else values[v]
         for equation in jaxpr.eqns:
-            found = self._apply(equation, [read(v) for v in equation.invars])
-            values.update(zip(equation.outvars, found, strict=True))
+            results = self._apply(equation, [read(v) for v in equation.invars])
+            values.update(zip(equation.outvars, results, strict=True))
         return [read(v) for v in jaxpr.outvars]
 
     def _literal(self, literal: Literal) -> Cells:
@@ -83,7 +83,7 @@ class Lanes:
             called = params[CALLS[name]]
             in_its_place = _known_function(called)
             if in_its_place:
-                return [self._each(operation, *args) for operation in in_its_place]
+                return [self._of_lanes(operation, *args) for operation in in_its_place]
             return self.call(called, args)
         if name in _KEPT:
             return args
@@ -96,8 +96,8 @@ class Lanes:
             return [self._arithmetic(equation, args, shape)]
         if name not in RULES:
             raise NotInLanes(f"{name} of {', '.join(str(v.aval) for v in equation.invars)}")
-        found = RULES[name](self, equation, *args)
-        return found if isinstance(found, list) else [found]
+        results = RULES[name](self, equation, *args)
+        return results if isinstance(results, list) else [results]
 
     def call(self, jaxpr: ClosedJaxpr | Jaxpr, args: Sequence[Cells]) -> list[Cells]:
         closed = isinstance(jaxpr, ClosedJaxpr)
@@ -109,15 +109,15 @@ class Lanes:
         return cells_of([self._operation(equation, row) for row in rows], shape)
 
     def _operation(self, equation: JaxprEqn, row: Sequence[Lane]) -> Lane:
-        known = folded(equation, row)
-        if known is not None:
-            return known
+        constant = folded(equation, row)
+        if constant is not None:
+            return constant
         self.count += 1
         if self.count > _MOST_OPERATIONS:
             raise NotInLanes(f"more than {_MOST_OPERATIONS} operations in a sample")
         return equation.primitive.bind(*row, **equation.params)
 
-    def _each(self, operation: Primitive, x: Cells) -> Cells:
+    def _of_lanes(self, operation: Primitive, x: Cells) -> Cells:
         self.count += x.size
         return cells_of([operation.bind(lane) for lane in x.reshape(-1)], x.shape)
 
@@ -182,8 +182,8 @@ _PAIRS: dict[str, tuple[Callable, Callable]] = {
 
 def pair(name: str, a: Lane, b: Lane) -> Lane:
     """What a reduction does with two numbers."""
-    known = isinstance(a, np.generic) and isinstance(b, np.generic)
-    return _PAIRS[name][0 if known else 1](a, b)
+    are_constants = isinstance(a, np.generic) and isinstance(b, np.generic)
+    return _PAIRS[name][0 if are_constants else 1](a, b)
 
 
 _KNOWN: dict[str, Callable[..., Any]] = {
@@ -379,10 +379,10 @@ def _accumulate(lanes: Lanes, equation: JaxprEqn, x: Cells) -> Cells:
     axis, out = equation.params["axis"], np.empty_like(x)
     _keep_apart(lanes, equation, (axis,))
     turned = (lambda a: np.flip(a, axis)) if equation.params["reverse"] else (lambda a: a)
-    rows, found = (np.moveaxis(turned(a), axis, 0) for a in (x, out))
+    rows, totals = (np.moveaxis(turned(a), axis, 0) for a in (x, out))
     for k, row in enumerate(rows):
         total = row if k == 0 else _pairwise(lanes, "reduce_sum", total, row)  # noqa: F821
-        found[k] = total
+        totals[k] = total
     return out
 
 
@@ -405,8 +405,8 @@ def _dot(lanes: Lanes, equation: JaxprEqn, a: Cells, b: Cells) -> Cells:
     product = lambda x, y: lanes.fold(
         "reduce_sum", [lanes.pair("reduce_prod", p, q) for p, q in zip(x, y, strict=True)]
     )
-    found = [product(x, y).astype(kind) for m, n in zip(a, b, strict=True) for x in m for y in n]
-    return cells_of(found, (*batch, *free_a, *free_b))
+    products = [product(x, y).astype(kind) for m, n in zip(a, b, strict=True) for x in m for y in n]
+    return cells_of(products, (*batch, *free_a, *free_b))
 
 
 def _matrices(x: Cells, batch: Sequence[int], shared: Sequence[int]) -> tuple[Cells, Shape]:
@@ -421,12 +421,12 @@ def _cond(lanes: Lanes, equation: JaxprEqn, index: Cells, *args: Cells) -> list[
     choice = index.item()
     if isinstance(choice, np.generic):
         return branches[min(max(int(choice), 0), len(branches) - 1)]
-    found = branches[0]
+    chosen = branches[0]
     for k, branch in enumerate(branches[1:], 1):
         takes = choice if choice.dtype == bool else jax.lax.ge(choice, choice.dtype.type(k))
         pick = ft.partial(_choose, takes)
-        found = [pick(new, old) for new, old in zip(branch, found, strict=True)]
-    return found
+        chosen = [pick(new, old) for new, old in zip(branch, chosen, strict=True)]
+    return chosen
 
 
 def _choose(takes: Lane, new: Cells, old: Cells) -> Cells:

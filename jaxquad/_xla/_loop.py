@@ -51,33 +51,33 @@ class Segments(NamedTuple):
     count: int
     length: int  # samples, of all but the last
     are_shared: bool  # whether a segment's carries lie in shared memory
-    held: int = 0  # bytes of a thread there, for numbers of eight bytes that it holds
+    shared: int = 0  # bytes of a thread there, for numbers of eight bytes that it holds
 
     @property
     def number(self) -> int:
         return -(-self.count // self.length)
 
 
-def segments_of(count: int, carry: int, members: int, block: int, held: int = 0) -> Segments:
+def segments_of(count: int, carry: int, members: int, block: int, shared: int = 0) -> Segments:
     """For `members` whose carry has so many bytes, in blocks of so many threads.
 
     `held` are the bytes of each that `held_bytes` found.
     """
     room = _memory()[0]
-    most = (_shared_by_block() - held * block) // max(carry * block, 1)
+    most = (_shared_by_block() - shared * block) // max(carry * block, 1)
     length = max(_LEAST, math.ceil(count * carry * members / (_SHARE * room))) if room else count
     if length <= min(most, count):
-        return Segments(count, length, True, held)
-    return Segments(count, math.isqrt(max(count - 1, 0)) + 1, False, held)
+        return Segments(count, length, True, shared)
+    return Segments(count, math.isqrt(max(count - 1, 0)) + 1, False, shared)
 
 
-def held_bytes(held: int, of_eight: int, block: int) -> int:
+def held_bytes(in_registers: int, of_eight: int, block: int) -> int:
     """Bytes of a thread that go to shared memory, of those that it holds from sample to sample.
 
     `of_eight` are those of numbers with eight bytes. None where registers have room for all, and
     where that memory has none.
     """
-    registers = held // 4
+    registers = in_registers // 4
     return of_eight if registers > _HELD and of_eight * block <= _shared_by_block() else 0
 
 
@@ -91,8 +91,8 @@ def _memory() -> tuple[int, int]:
         device = jax.local_devices(backend="gpu")[0]
     except RuntimeError:  # a program for another machine
         return 0, 0
-    known = device.memory_stats() or {}
-    free = known.get("bytes_limit", 0) - known.get("bytes_in_use", 0)
+    stats = device.memory_stats() or {}
+    free = stats.get("bytes_limit", 0) - stats.get("bytes_in_use", 0)
     return free, _KILOBYTE * _SHARED.get(str(device.compute_capability), 64)
 
 
@@ -116,7 +116,7 @@ class Loop(NamedTuple):
         return self.segments.count
 
     @property
-    def given(self) -> list[Shaped]:
+    def inputs(self) -> list[Shaped]:
         """Shapes and types of the step's arguments."""
         return _shaped(self.step.in_avals)
 
@@ -128,7 +128,7 @@ class Loop(NamedTuple):
     @property
     def avals(self) -> tuple[list[Shaped], list[Shaped], list[Shaped]]:
         """Those of consts, carry and one sample of the signals."""
-        consts, carry, now = split(self.given, self.consts, self.carry)
+        consts, carry, now = split(self.inputs, self.consts, self.carry)
         return consts, carry, now
 
     @property
@@ -165,10 +165,10 @@ def size(loop: Loop, aval: Shaped) -> int:
 def in_lanes(loop: Loop, jaxpr: ClosedJaxpr, *, leave_sums: bool = False) -> ClosedJaxpr:
     """A jaxpr of arrays as one of their lanes. Raises `NotInLanes` for what they do not hold."""
     lanes = Lanes(loop.members, leave_sums=leave_sums)
-    given, shapes = [], []
+    shapes_of_lanes, shapes = [], []
     for aval in _shaped(jaxpr.in_avals):
         shapes.append(lanes.small(aval.shape))
-        given += [jax.ShapeDtypeStruct((), aval.dtype)] * size(loop, aval)
+        shapes_of_lanes += [jax.ShapeDtypeStruct((), aval.dtype)] * size(loop, aval)
 
     def flat(*args: Lane) -> list[Lane]:
         parts = split(args, *map(math.prod, shapes))
@@ -176,11 +176,11 @@ def in_lanes(loop: Loop, jaxpr: ClosedJaxpr, *, leave_sums: bool = False) -> Clo
         out = lanes.evaluate(jaxpr.jaxpr, jaxpr.consts, cells)
         return [lane for x in out for lane in _listed(x)]
 
-    made = jax.make_jaxpr(flat)(*given)
-    unknown = {x.primitive.name for x in made.jaxpr.eqns} - EXPRESSIONS.keys()
+    lanes_jaxpr = jax.make_jaxpr(flat)(*shapes_of_lanes)
+    unknown = {x.primitive.name for x in lanes_jaxpr.jaxpr.eqns} - EXPRESSIONS.keys()
     if unknown:
         raise NotInLanes(f"{', '.join(sorted(unknown))} of a member's numbers")
-    return made
+    return lanes_jaxpr
 
 
 def _listed(x: Cells) -> list[Lane]:
@@ -200,24 +200,24 @@ def reverse_in_lanes(loop: Loop, which: tuple[bool, ...]) -> ClosedJaxpr:
     wanted = reverse_wanted(loop, which)
 
     def back(*args: Array) -> list[Array]:
-        given, cotangents = split(args, len(loop.given))
+        inputs, cotangents = split(args, len(loop.inputs))
 
         def moved(*some: Array) -> list[Array]:
             fresh = iter(some)
-            whole = [next(fresh) if w else x for w, x in zip(wanted, given, strict=True)]
-            return [x for x in step(*whole) if is_float(x.dtype)]
+            values = [next(fresh) if w else x for w, x in zip(wanted, inputs, strict=True)]
+            return [x for x in step(*values) if is_float(x.dtype)]
 
-        _, pull = jax.vjp(moved, *(x for w, x in zip(wanted, given, strict=True) if w))
+        _, pull = jax.vjp(moved, *(x for w, x in zip(wanted, inputs, strict=True) if w))
         return list(pull(cotangents))
 
-    jaxpr = jax.make_jaxpr(back)(*loop.given, *out)
+    jaxpr = jax.make_jaxpr(back)(*loop.inputs, *out)
     return in_lanes(loop, jaxpr, leave_sums=True)
 
 
 def reverse_wanted(loop: Loop, which: tuple[bool, ...]) -> tuple[bool, ...]:
     """What one sample is differentiated by: the carry too, whose first is one of many."""
     first, last = loop.consts, loop.consts + loop.carry
-    avals = loop.given
+    avals = loop.inputs
     return tuple(is_float(x.dtype) if first <= k < last else which[k] for k, x in enumerate(avals))
 
 
@@ -244,30 +244,30 @@ def without_invariants(
 ) -> tuple[ClosedJaxpr, list[Array]]:
     """A step of (consts, carry, now) as one of other consts, which are computed from these."""
     body = step.jaxpr
-    own, rest = body.invars[: len(consts)], body.invars[len(consts) :]
-    parts = _Parts(body, own)
-    each = _used(parts.each, parts.outs)
-    read = dict.fromkeys(v for v in (*_read(each), *parts.outs) if isinstance(v, Var))
-    needed = [v for v in read if v in parts.once or v in own]
-    grown = max(_size(needed, members) - _size(own, members), len(needed) - len(own))
+    constants, rest = body.invars[: len(consts)], body.invars[len(consts) :]
+    parts = _Parts(body, constants)
+    per_sample = _used(parts.in_sample, parts.outs)
+    read = dict.fromkeys(v for v in (*_read(per_sample), *parts.outs) if isinstance(v, Var))
+    needed = [v for v in read if v in parts.before or v in constants]
+    grown = max(_size(needed, members) - _size(constants, members), len(needed) - len(constants))
     if grown > _MORE:
         return step, list(consts)
-    first = body.replace(invars=own, outvars=needed, eqns=_used(parts.steady, needed))
-    within = body.replace(invars=[*needed, *rest], outvars=parts.outs, eqns=each)
-    made = jaxpr_as_fun(ClosedJaxpr(first, step.consts))(*consts)
-    return ClosedJaxpr(within, step.consts), made
+    first = body.replace(invars=constants, outvars=needed, eqns=_used(parts.steady, needed))
+    within = body.replace(invars=[*needed, *rest], outvars=parts.outs, eqns=per_sample)
+    computed = jaxpr_as_fun(ClosedJaxpr(first, step.consts))(*consts)
+    return ClosedJaxpr(within, step.consts), computed
 
 
 class _Parts:
     """A step's equations, sorted, with one of each that are the same."""
 
-    def __init__(self, body: Jaxpr, own: Sequence[Var]):
+    def __init__(self, body: Jaxpr, constants: Sequence[Var]):
         self.steady: list[JaxprEqn] = []  # what is the same in every sample
-        self.each: list[JaxprEqn] = []  # what a sample has to compute
-        self.once: set[Var] = set()  # results that need not be computed in a sample
-        self._still, self._from_own = {*own, *body.constvars}, {*own}
+        self.in_sample: list[JaxprEqn] = []  # what a sample has to compute
+        self.before: set[Var] = set()  # results that need not be computed in a sample
+        self._still, self._from_own = {*constants, *body.constvars}, {*constants}
         self._same: dict[Var, Var] = {}
-        self._seen: dict[Any, Sequence[Var]] = {}
+        self._first_of: dict[Any, Sequence[Var]] = {}
         for equation in body.eqns:
             self._sort(equation.replace(invars=[self._first(v) for v in equation.invars]))
         self.outs = [self._first(v) for v in body.outvars]
@@ -276,30 +276,30 @@ class _Parts:
         return self._same.get(v, v) if isinstance(v, Var) else v
 
     def _sort(self, equation: JaxprEqn) -> None:
-        given = [v for v in equation.invars if isinstance(v, Var)]
-        if not self._still.issuperset(given):
-            self.each.append(equation)
+        read = [v for v in equation.invars if isinstance(v, Var)]
+        if not self._still.issuperset(read):
+            self.in_sample.append(equation)
             return
-        seen = self._seen.setdefault(_content(equation), equation.outvars)
-        if seen is not equation.outvars:
-            self._same.update(zip(equation.outvars, seen, strict=True))
+        first = self._first_of.setdefault(_content(equation), equation.outvars)
+        if first is not equation.outvars:
+            self._same.update(zip(equation.outvars, first, strict=True))
             return
         self._still.update(equation.outvars)
         self.steady.append(equation)
-        if not self._from_own.isdisjoint(given):
+        if not self._from_own.isdisjoint(read):
             self._from_own.update(equation.outvars)
             if _computes(equation):
-                self.once.update(equation.outvars)
+                self.before.update(equation.outvars)
                 return
-        self.each.append(equation)  # what only moves numbers costs nothing there
+        self.in_sample.append(equation)  # what only moves numbers costs nothing there
 
 
 def _content(equation: JaxprEqn) -> Any:
     """Equal for operations of equal results; a function may have a derivative of its own."""
     if equation.primitive.name in CALLS:
         return id(equation)
-    given = [v if isinstance(v, Var) else (str(v.val), v.aval) for v in equation.invars]
-    return equation.primitive, str(equation.params), *given
+    operands = [v if isinstance(v, Var) else (str(v.val), v.aval) for v in equation.invars]
+    return equation.primitive, str(equation.params), *operands
 
 
 def _computes(equation: JaxprEqn) -> bool:
@@ -314,12 +314,12 @@ def _read(equations: Iterable[JaxprEqn]) -> list[Any]:
 
 def _used(equations: Sequence[JaxprEqn], results: Iterable[Any]) -> list[JaxprEqn]:
     """Those on which some results depend."""
-    found, open_ = [], {v for v in results if isinstance(v, Var)}
+    used, open_ = [], {v for v in results if isinstance(v, Var)}
     for equation in reversed(equations):
         if not open_.isdisjoint(equation.outvars):
-            found.append(equation)
+            used.append(equation)
             open_.update(v for v in equation.invars if isinstance(v, Var))
-    return found[::-1]
+    return used[::-1]
 
 
 def _size(variables: Iterable[Var], members: int) -> int:

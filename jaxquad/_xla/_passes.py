@@ -12,7 +12,7 @@ from ._kernel_memory import (
     assigned,
     declared,
     fetch_before,
-    Held,
+    InBlock,
     kept_avals,
     Lines,
     load_all,
@@ -64,9 +64,12 @@ class _Forward:
 
     def run(self, args: Sequence[Array]) -> Flat:
         loop = self.loop
-        given, made = [*self.fixed, *self.begun, *self.now], [*self.last, *self.left, *self.kept]
-        found = run(loop, self.lines(), (given, self._packed(args)), (made, self._outs()))
-        last, left, kept = split(found, len(self.carry), len(self.stored))
+        inputs, outputs = (
+            [*self.fixed, *self.begun, *self.now],
+            [*self.last, *self.left, *self.kept],
+        )
+        arrays = run(loop, self.lines(), (inputs, self._packed(args)), (outputs, self._outs()))
+        last, left, kept = split(arrays, len(self.carry), len(self.stored))
         out = [unpack(loop, *pair) for pair in zip(last, self.carry, strict=True)]
         out += [unpack(loop, *pair, timed=True) for pair in zip(left, self.stored, strict=True)]
         return [*out, *kept]
@@ -95,8 +98,8 @@ class _Forward:
         after, left = split(out, len(state))
         sample = [*now, *step, *store_all(self.left, left, "t"), *assigned(state, after)]
         if self.keep:
-            each = nested("for (int t = first; t < end; ++t)", sample)
-            segment = [*bounds(loop), *store_tiles(self.kept, state, "segment"), *each]
+            samples = nested("for (int t = first; t < end; ++t)", sample)
+            segment = [*bounds(loop), *store_tiles(self.kept, state, "segment"), *samples]
             samples = nested(
                 f"for (int segment = 0; segment < {loop.segments.number}; ++segment)", segment
             )
@@ -105,13 +108,13 @@ class _Forward:
         return [*loads, *begun, *begins, *samples, *store_all(self.last, state)]
 
 
-def holds_cotangents(loop: Loop, given: Sequence[bool]) -> bool:
-    """Whether those of the float results that are `given` differ between members.
+def holds_cotangents(loop: Loop, are_given: Sequence[bool]) -> bool:
+    """Whether those of the float results that `are_given` differ between members.
 
     What all members share would be felt by each: the kernel has no place for it.
     """
     floats = [x for x in loop.out if is_float(x.dtype)]
-    pairs = zip(floats, given, strict=True)
+    pairs = zip(floats, are_given, strict=True)
     return all(is_wide(loop, aval) for aval, is_given in pairs if is_given)
 
 
@@ -150,15 +153,20 @@ class _Reverse:
         self.shelf = self.again if shared else []
 
     def run(self, args: Sequence[Array]) -> Flat:
-        given = [*self.fixed, *self.now, *self.kept, *self.felt, *self.left]
-        made = [*self.to_fixed, *self.to_carry, *self.to_now, *(() if self.shelf else self.again)]
-        pairs = (given, self._packed(args)), (made, self._outs())
-        held = Held(bool(self.loop.segments.held))
-        lines = self.lines(held)
-        own = held.size + sum(tile.size for tile in self.shelf)
-        found = run(self.loop, lines, *pairs, shared=own)
+        inputs = [*self.fixed, *self.now, *self.kept, *self.felt, *self.left]
+        outputs = [
+            *self.to_fixed,
+            *self.to_carry,
+            *self.to_now,
+            *(() if self.shelf else self.again),
+        ]
+        pairs = (inputs, self._packed(args)), (outputs, self._outs())
+        in_block = InBlock(bool(self.loop.segments.shared))
+        lines = self.lines(in_block)
+        shared = in_block.size + sum(tile.size for tile in self.shelf)
+        arrays = run(self.loop, lines, *pairs, shared=shared)
         consts, carry, signals, _ = split(
-            found, len(self.wanted_consts), len(self.moving), len(self.wanted_signals)
+            arrays, len(self.wanted_consts), len(self.moving), len(self.wanted_signals)
         )
         out = [self._gathered(*pair) for pair in zip(consts, self.wanted_consts, strict=True)]
         floats = iter(zip(carry, self.moving, strict=True))
@@ -200,14 +208,14 @@ class _Reverse:
             outs.append(jax.ShapeDtypeStruct((loop.count, size(loop, x), last), x.dtype))
         return outs if self.shelf else outs + [x.out(loop) for x in self.again]
 
-    def lines(self, held: Held) -> Lines:
+    def lines(self, in_block: InBlock) -> Lines:
         loop = self.loop
         loads, fixed = load_all(self.fixed)
-        fixed_begin, fixed = held.variables(loop, "still", self.consts, fixed)
+        fixed_begin, fixed = in_block.variables(loop, "still", self.consts, fixed)
         felt, last = load_all(self.felt)
-        begins, moved = held.variables(loop, "moved", self.moving, last)
+        begins, moved = in_block.variables(loop, "moved", self.moving, last)
         zeros = ["0"] * sum(size(loop, x) for x in self.wanted_consts)
-        sums_begin, sums = held.variables(loop, "sum", self.wanted_consts, zeros)
+        sums_begin, sums = in_block.variables(loop, "sum", self.wanted_consts, zeros)
         kept, first = load_tiles(self.kept, "segment")
         kept += nested("if (segment > 0)", fetch_before(self.kept)) if self.shelf else []
         state_begins, state = variables(loop, "state", self.carry, first)
@@ -219,7 +227,7 @@ class _Reverse:
         ]  # fmt: skip
         head = f"for (int segment = {loop.segments.number - 1}; segment >= 0; --segment)"
         ends = [*store_all(self.to_carry, moved), *store_all(self.to_fixed, sums)]
-        shelf = declared(held, self.shelf) if held.size or self.shelf else []
+        shelf = declared(in_block, self.shelf) if in_block.size or self.shelf else []
         begins = [*loads, *fixed_begin, *felt, *begins, *sums_begin]
         return [*shelf, *begins, *nested(head, segment), *ends]
 
@@ -236,8 +244,8 @@ class _Reverse:
         again += [] if self.shelf else nested("if (t > first)", fetch_before(self.again))
         now, signals = load_all(self.now, time="t")
         left, stored = self._stored_cotangents()
-        given = [*fixed, *state, *signals, *moved, *stored]
-        step, out = statements(reverse_in_lanes(self.loop, self.which), given, "v")
+        inputs = [*fixed, *state, *signals, *moved, *stored]
+        step, out = statements(reverse_in_lanes(self.loop, self.which), inputs, "v")
         to_fixed, before, to_now = split(out, len(sums), len(moved))
         added = [f"{total} += {part};" for total, part in zip(sums, to_fixed, strict=True)]
         return [*again, *now, *left, *step, *added, *assigned(moved, before), *self._to_now(to_now)]
@@ -246,9 +254,9 @@ class _Reverse:
         rows, lines, names = iter(self.left), [], []
         for x in self.loop.results[1]:
             if is_float(x.dtype) and is_wide(self.loop, x):
-                found = load_all([next(rows)], time="t")
-                lines += found[0]
-                names += found[1]
+                loads, numbers = load_all([next(rows)], time="t")
+                lines += loads
+                names += numbers
             elif is_float(x.dtype):  # `holds_cotangents`: these are zero
                 names += [f"({type_of(x.dtype)})0"] * size(self.loop, x)
         return lines, names

@@ -21,27 +21,27 @@ def hold_in_kernel(
     XLA would divide that among threads, which a kernel does not have.
     """
     kinds = [x.type for x in call.results]
-    given = [x.type for x in call.operands]
+    inputs = [x.type for x in call.operands]
     single = ir.RankedTensorType.get((), ir.F32Type.get())
-    made = []
+    functions = []
     try:
-        kernel, name = _new_function("kernel", given, [*kinds, single], call, module, symbols)
-        made.append(kernel)
+        kernel, name = _new_function("kernel", inputs, [*kinds, single], call, module, symbols)
+        functions.append(kernel)
         with call.location, ir.InsertionPoint(kernel.add_entry_block()):
             arguments = list(kernel.arguments)
-            found = func.CallOp(
+            called = func.CallOp(
                 kinds, ir.FlatSymbolRefAttr(call.attributes["callee"]), arguments
             ).results
-            func.ReturnOp([*found, _sum_of_firsts(arguments)])
-        whole, outer = _new_function("in_kernel", given, kinds, call, module, symbols)
-        made.append(whole)
-        with call.location, ir.InsertionPoint(whole.add_entry_block()):
-            hidden = stablehlo.OptimizationBarrierOp(list(whole.arguments)).results
+            func.ReturnOp([*called, _sum_of_firsts(arguments)])
+        wrapper, outer = _new_function("in_kernel", inputs, kinds, call, module, symbols)
+        functions.append(wrapper)
+        with call.location, ir.InsertionPoint(wrapper.add_entry_block()):
+            hidden = stablehlo.OptimizationBarrierOp(list(wrapper.arguments)).results
             inner = func.CallOp([*kinds, single], ir.FlatSymbolRefAttr.get(name), list(hidden))
             inner.operation.attributes[ATTRIBUTE] = attributes
             func.ReturnOp(list(inner.results)[:-1])
     except Exception:
-        for function in reversed(made):  # Half a function would spoil the whole program.
+        for function in reversed(functions):  # Half a function would spoil the whole program.
             symbols.erase(function)
         raise
     call.attributes["callee"] = ir.FlatSymbolRefAttr.get(outer)
@@ -49,14 +49,14 @@ def hold_in_kernel(
 
 def _new_function(
     name: str,
-    given: list[ir.Type],
+    inputs: list[ir.Type],
     kinds: list[ir.Type],
     call: Op,
     module: ir.Module,
     symbols: ir.SymbolTable,
 ) -> tuple[func.FuncOp, str]:
     with call.location, ir.InsertionPoint(module.body):
-        function = func.FuncOp(name, ir.FunctionType.get(given, kinds), visibility="private")
+        function = func.FuncOp(name, ir.FunctionType.get(inputs, kinds), visibility="private")
     return function, ir.StringAttr(symbols.insert(function)).value
 
 
@@ -145,22 +145,22 @@ def text(op: Op, attribute: str) -> str:
 _Counts = tuple[int, int]  # all operations, and those on many numbers
 
 
-def _count(name: str, functions: Mapping[str, Op], known: dict[str, _Counts]) -> tuple[int, int]:
+def _count(name: str, functions: Mapping[str, Op], counted: dict[str, _Counts]) -> tuple[int, int]:
     """Operations of a function and of all that it calls, once for every call: XLA inlines them."""
-    if name in known:
-        return known[name]
+    if name in counted:
+        return counted[name]
     count = wide = 0
     for op in operations_in(functions[name]):
         if op.name == "func.call":
-            more, wider = _count(text(op, "callee"), functions, known)
+            more, wider = _count(text(op, "callee"), functions, counted)
             count, wide = count + more, wide + wider
         elif not _fits(op):
             raise _DoesNotFit(f"{op.name} of {', '.join(str(x.type) for x in op.operands)}")
         else:
             count += 1
             wide += kind_of(op) != "while" and any(size_of(x.type) >= _WIDE for x in op.results)
-    known[name] = count, wide
-    return known[name]
+    counted[name] = count, wide
+    return counted[name]
 
 
 def calls_within(name: str, what: str, module: ir.Module) -> list[Op]:
@@ -169,16 +169,16 @@ def calls_within(name: str, what: str, module: ir.Module) -> list[Op]:
     Without those that are given nothing, which are done before the program runs.
     """
     functions = {text(f, "sym_name"): f.operation for f in module.body.operations}
-    found, open_ = [], [name]
+    calls_found, open_ = [], [name]
     for name in open_:
         calls = [op for op in operations_in(functions[name]) if op.name == "func.call"]
         for op in calls:
             callee = text(op, "callee")
             if callee.startswith(what) and len(op.operands):
-                found.append(op)
+                calls_found.append(op)
             elif callee not in open_:
                 open_.append(callee)
-    return found
+    return calls_found
 
 
 def operations_in(parent: Op) -> Iterator[Op]:
@@ -341,8 +341,8 @@ class Division:
                     for i, operand in enumerate(self.ops[k].operands):
                         op.operands[i] = values[operand]
                     values[self.ops[k].results[0]] = op.results[0]
-                found = [values[self.ops[k].results[0]] for k in members]
-                func.ReturnOp([*found, stablehlo.ConstantOp(_zero()).result])
+                results = [values[self.ops[k].results[0]] for k in members]
+                func.ReturnOp([*results, stablehlo.ConstantOp(_zero()).result])
             with ir.InsertionPoint(self.end):
                 call = func.CallOp(kinds, ir.FlatSymbolRefAttr.get(name), inputs)
         call.operation.attributes[ATTRIBUTE] = ir.DictAttr.get(
@@ -378,12 +378,12 @@ def operations(block: ir.Block) -> list[Op]:
 
 def _operands(op: Op) -> list[ir.Value]:
     """Also those that an operation's regions take from around them."""
-    found = list(op.operands)
+    values = list(op.operands)
     for region in op.regions:
         for block in region:
             for inner in operations(block):
-                found.extend(_operands(inner))
-    return found
+                values.extend(_operands(inner))
+    return values
 
 
 _SHORT = 32  # numbers that are computed again as fast as they are read
@@ -393,18 +393,18 @@ _FEW = 10  # operations of a function, such as `jnp.clip`, that can be within a 
 
 def in_parts(name: str, module: ir.Module, symbols: ir.SymbolTable) -> str:
     """The name of a copy of a function, its loops included, that is made of parts."""
-    made: list[Op] = []
+    functions: list[Op] = []
     try:
-        return _Copies(module, symbols, made).copy(name)
+        return _Copies(module, symbols, functions).copy(name)
     except Exception:
-        for function in reversed(made):  # Half a function would spoil the whole program.
+        for function in reversed(functions):  # Half a function would spoil the whole program.
             symbols.erase(function)
         raise
 
 
 class _Copies:
-    def __init__(self, module: ir.Module, symbols: ir.SymbolTable, made: list[Op]):
-        self.module, self.symbols, self.made = module, symbols, made
+    def __init__(self, module: ir.Module, symbols: ir.SymbolTable, functions: list[Op]):
+        self.module, self.symbols, self.inserted = module, symbols, functions
         self.functions = {text(f, "sym_name"): f.operation for f in module.body.operations}
         self.named: dict[str, str] = {}
         self.small: dict[str, bool] = {}
@@ -419,7 +419,7 @@ class _Copies:
 
     def insert(self, function: Op) -> str:
         name = ir.StringAttr(self.symbols.insert(function)).value
-        self.made.append(function)
+        self.inserted.append(function)
         return name
 
     def _divide(self, op: Op) -> None:
@@ -437,8 +437,8 @@ class _Copies:
     def is_small(self, name: str) -> bool:
         """Whether a function is a few elementwise operations."""
         if name not in self.small:
-            found = self.functions.get(name)  # None: a copy
-            ops = [] if found is None else operations(found.regions[0].blocks[0])
+            function = self.functions.get(name)  # None: a copy
+            ops = [] if function is None else operations(function.regions[0].blocks[0])
             self.small[name] = 0 < len(ops) <= _FEW and all(map(self._is_light, ops[:-1]))
         return self.small[name]
 

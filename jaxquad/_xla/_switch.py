@@ -70,7 +70,7 @@ def compiler_options() -> dict[str, int]:
 
     On a CPU, 512-bit vectors; warns, once, if this XLA does not know the option.
     """
-    return dict(_known()) if jax.default_backend() == "cpu" else {}
+    return dict(_vector_options()) if jax.default_backend() == "cpu" else {}
 
 
 _WIDEST = {"xla_cpu_prefer_vector_width": 512}  # bits; LLVM takes half of what a CPU can, unasked
@@ -112,7 +112,7 @@ def _takes(option: str) -> bool:
 
 
 @ft.cache
-def _known() -> tuple[tuple[str, int], ...]:
+def _vector_options() -> tuple[tuple[str, int], ...]:
     refusal = _refusal(_WIDEST)
     if refusal is None:
         return tuple(_WIDEST.items())

@@ -105,22 +105,22 @@ def try_kernels() -> None:
         return jax.lax.scan(step, x, inputs)
 
     def total(x: Array, inputs: Array) -> Array:
-        last, seen = as_one_kernel(loop, x, inputs)
-        return jnp.sum(last**2) + jnp.mean(seen)
+        last, stored = as_one_kernel(loop, x, inputs)
+        return jnp.sum(last**2) + jnp.mean(stored)
 
     start, inputs = jnp.linspace(-1.0, 1.0, 300).reshape(3, 100), jnp.linspace(0.0, 9.0, 500)
     large = jnp.linspace(-1.0, 1.0, 99_999).reshape(3, -1)
     for function, args in (
-        (lambda *given: as_one_kernel(loop, *given), (start, inputs)),
+        (lambda x, u: as_one_kernel(loop, x, u), (start, inputs)),
         (total, (start[:, 0], inputs)),
         (jax.grad(total, argnums=(0, 1)), (start, inputs)),
         (total, (large, inputs[:5])),
         (jax.grad(total), (large, inputs[:5])),
     ):
-        found = jax.jit(function)(*args)
+        result = jax.jit(function)(*args)
         with plain_loops(True):
             expected = jax.jit(function)(*args)
-        for one, other in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+        for one, other in zip(jax.tree.leaves(result), jax.tree.leaves(expected), strict=True):
             np.testing.assert_allclose(one, other, rtol=1e-3, atol=1e-5)
     lowered = jax.jit(jax.grad(total)).lower(start, inputs).as_text()
     assert lowered.count("xla_cpu_small_call") == 2, "loops are not marked as kernels"
@@ -166,8 +166,8 @@ def _both_results() -> list[list[np.ndarray]]:
     x = jnp.linspace(0.2, 0.8, 2 * _MEMBERS, dtype=jnp.float32).reshape(2, _MEMBERS)
     gain, push = jnp.array([0.9, 0.4], jnp.float32), jnp.linspace(0.0, 0.5, _SAMPLES)
     args = x, gain, push.astype(jnp.float32)[:, None]
-    found = (_measure(scan)(*args) for scan in (_by_kernel, _plain_scan))
-    return [[np.asarray(x) for x in jax.tree.leaves(result)] for result in found]
+    results = (_measure(scan)(*args) for scan in (_by_kernel, _plain_scan))
+    return [[np.asarray(x) for x in jax.tree.leaves(result)] for result in results]
 
 
 def _plain_scan(step: Step, carry: PyTree, signals: PyTree) -> tuple[PyTree, PyTree]:
@@ -177,10 +177,10 @@ def _plain_scan(step: Step, carry: PyTree, signals: PyTree) -> tuple[PyTree, PyT
 def _by_kernel(step: Step, carry: PyTree, signals: PyTree) -> tuple[PyTree, PyTree]:
     from ._device_loop import scan_in_kernel
 
-    found = scan_in_kernel(step, carry, signals, _MEMBERS, _plain_scan)
-    if found is None:
+    result = scan_in_kernel(step, carry, signals, _MEMBERS, _plain_scan)
+    if result is None:
         raise ValueError("the step of the trial does not fit a kernel")
-    return found
+    return result
 
 
 def _measure(scan: Scan):
@@ -192,7 +192,7 @@ def _measure(scan: Scan):
             late = jnp.concatenate([x[:1], late[:-1]])
             return (jnp.where(after > 1.2, 1.2, after), late), jnp.sqrt(jnp.abs(after[0]) + 0.1)
 
-        (last, _), seen = scan(step, (x, jnp.broadcast_to(x[:1], (_DELAY, _MEMBERS))), push)
-        return jnp.sum(last * last) + jnp.sum(seen), seen
+        (last, _), stored = scan(step, (x, jnp.broadcast_to(x[:1], (_DELAY, _MEMBERS))), push)
+        return jnp.sum(last * last) + jnp.sum(stored), stored
 
     return jax.jit(jax.value_and_grad(total, argnums=(0, 1, 2), has_aux=True))

@@ -11,13 +11,13 @@ from jaxtyping import ArrayLike, Float
 Numbers = Float[np.ndarray, "..."]  # [] or [axes]
 
 
-def as_numbers(given: ArrayLike | Sequence[float]) -> Numbers:
+def as_numbers(value: ArrayLike | Sequence[float]) -> Numbers:
     """In double precision, outside JAX: members are drawn before anything is compiled."""
-    return np.asarray(given, dtype=float)
+    return np.asarray(value, dtype=float)
 
 
-def as_numbers_or_none(given: ArrayLike | Sequence[float] | None) -> Numbers | None:
-    return None if given is None else as_numbers(given)
+def as_numbers_or_none(value: ArrayLike | Sequence[float] | None) -> Numbers | None:
+    return None if value is None else as_numbers(value)
 
 
 def row(value: Numbers) -> Float[np.ndarray, "axes 1"]:
@@ -176,15 +176,15 @@ class Choice(Distribution):
         return "one of " + ", ".join(f"{x:.4g}" for x in self.values)
 
 
-def as_distribution(given: Distribution | ArrayLike | Sequence[float]) -> Distribution:
+def as_distribution(value: Distribution | ArrayLike | Sequence[float]) -> Distribution:
     """A distribution as it is; a number, or one for each axis, as `Fixed`."""
-    return given if isinstance(given, Distribution) else Fixed(given)
+    return value if isinstance(value, Distribution) else Fixed(value)
 
 
 def distribution_or_none(
-    given: Distribution | ArrayLike | Sequence[float] | None,
+    value: Distribution | ArrayLike | Sequence[float] | None,
 ) -> Distribution | None:
-    return None if given is None else as_distribution(given)
+    return None if value is None else as_distribution(value)
 
 
 REACH = 4.0  # standard deviations at which normal distributions end

@@ -51,23 +51,24 @@ def draw_unit_points(sampling: str, key: Key[Array, ""], rows: int, members: int
     return (cells + inside) / members
 
 
-def make_grid(given: Sequence[Distribution], members: int) -> Shares:
+def make_grid(distributions: Sequence[Distribution], members: int) -> Shares:
     """Every combination of equally many levels of each; the last one changes fastest.
 
     Raise ValueError where `members` is no such number.
     """
-    if not given:
+    if not distributions:
         return np.zeros((0, members))
-    count = round(members ** (1 / len(given)))
-    if count ** len(given) != members:
-        below = int(members ** (1 / len(given)))
-        near = " or ".join(str(k ** len(given)) for k in (below, below + 1))
+    count = round(members ** (1 / len(distributions)))
+    if count ** len(distributions) != members:
+        below = int(members ** (1 / len(distributions)))
+        near = " or ".join(str(k ** len(distributions)) for k in (below, below + 1))
         raise ValueError(
-            f"a grid over {len(given)} quantities has equally many levels of each, so {members} "
-            f'members do not fill one: draw {near}, or use sampling="latin" for any number'
+            f"a grid over {len(distributions)} quantities has equally many levels of each, so "
+            f"{members} members do not fill one: draw {near}, or use "
+            'sampling="latin" for any number'
         )
-    levels = np.meshgrid(*(one.grid_levels(count) for one in given), indexing="ij")
-    return np.stack([each.ravel() for each in levels])
+    levels = np.meshgrid(*(one.grid_levels(count) for one in distributions), indexing="ij")
+    return np.stack([level.ravel() for level in levels])
 
 
 def _sobol(random: np.random.Generator, rows: int, members: int) -> Shares:
@@ -87,29 +88,29 @@ def draw_members(
     ensemble: "Ensemble", loop: Loop, n: int, key: Key[Array, ""], sampling: str
 ) -> Members:
     """`n` members of an `Ensemble` around a `Loop`."""
-    nominal, given = ensemble.resolve(loop)
+    nominal, distributions = ensemble.resolve(loop)
     axes = count_axes(nominal)
-    rows = _count_rows(given, ensemble.independent, axes)
+    rows = _count_rows(distributions, ensemble.independent, axes)
     deviates = 0 if ensemble.plants is None else ensemble.plants.deviates
-    points = _points(given, rows, deviates, n, key, sampling)
-    drawn = _values(given, rows, points, axes)
+    points = _points(distributions, rows, deviates, n, key, sampling)
+    drawn = _values(distributions, rows, points, axes)
     wide: Wide = lambda x: np.broadcast_to(x if x.ndim > 1 else x[:, None], (axes, n))
     plant, delay = nominal, np.atleast_1d(np.asarray(loop.delay))
     longest = loop.longest_delay or float(np.max(delay))
     if ensemble.plants is not None:
         scores = normal_scores(points[sum(rows.values()) :])
         plant, delay, longest = ensemble.plants.draw(scores, loop.dt)
-    if "delay" in given:
-        delay, longest = drawn["delay"], _latest(given["delay"])
+    if "delay" in distributions:
+        delay, longest = drawn["delay"], _latest(distributions["delay"])
     believed = multiply(plant_inertia(nominal), drawn["inertia"])
     return Members(
         plant=vary_plant(plant, drawn),
         delay=as_float(wide(delay)[0]),
         assumed_inertia=as_float(wide(multiply(believed, drawn["assumed_inertia"]))),
         keys=make_member_keys(key, n),
-        noise=as_float(wide(drawn["noise"])) if "noise" in given else None,
-        gust=as_float(wide(drawn["gust"])) if "gust" in given else None,
-        payload=_payload(plant_inertia(nominal), given, drawn, wide),
+        noise=as_float(wide(drawn["noise"])) if "noise" in distributions else None,
+        gust=as_float(wide(drawn["gust"])) if "gust" in distributions else None,
+        payload=_payload(plant_inertia(nominal), distributions, drawn, wide),
         drive=loop.drive,
         encoder=loop.encoder,
         longest_delay=longest,
@@ -123,13 +124,17 @@ def draw_members(
 Given = dict[str, Distribution]
 
 
-def _count_rows(given: Given, independent: tuple[str, ...], axes: int) -> dict[str, int]:
+def _count_rows(distributions: Given, independent: tuple[str, ...], axes: int) -> dict[str, int]:
     """How many numbers each distribution draws for a member."""
-    return {name: axes if name in independent else 1 for name, one in given.items() if one.varies}
+    return {
+        name: axes if name in independent else 1
+        for name, one in distributions.items()
+        if one.varies
+    }
 
 
 def _points(
-    given: Given,
+    distributions: Given,
     rows: dict[str, int],
     deviates: int,
     n: int,
@@ -138,14 +143,16 @@ def _points(
 ) -> Shares:
     """Probabilities: of the distributions first, then of the posterior."""
     if sampling == "grid":
-        return make_grid([given[name] for name, count in rows.items() for _ in range(count)], n)
+        return make_grid(
+            [distributions[name] for name, count in rows.items() for _ in range(count)], n
+        )
     return draw_unit_points(sampling, key, sum(rows.values()) + deviates, n)
 
 
-def _values(given: Given, rows: dict[str, int], points: Shares, axes: int) -> Drawn:
+def _values(distributions: Given, rows: dict[str, int], points: Shares, axes: int) -> Drawn:
     """Of each quantity, [axes] where it is known and [axes, members] where it varies."""
     drawn, first = {}, 0
-    for name, one in given.items():
+    for name, one in distributions.items():
         if not one.varies:
             drawn[name] = np.broadcast_to(one.support[0], (axes,))
             continue
@@ -156,17 +163,17 @@ def _values(given: Given, rows: dict[str, int], points: Shares, axes: int) -> Dr
 
 
 def _payload(
-    nominal: Float[np.ndarray, "..."], given: Given, drawn: Drawn, wide: Wide
+    nominal: Float[np.ndarray, "..."], distributions: Given, drawn: Drawn, wide: Wide
 ) -> MemberPayload | None:
-    if "payload added" not in given:
+    if "payload added" not in distributions:
         return None
     inertia = multiply(nominal, drawn["payload added"])
     at = wide(drawn["payload at"])[0]
     until = np.full(at.shape, np.inf)
-    if "payload width" in given:
+    if "payload width" in distributions:
         until = at + wide(drawn["payload width"])[0]
     parts = (as_float(x) for x in (wide(inertia), at, until))
-    return MemberPayload(*parts, latest=_latest(given["payload at"]))
+    return MemberPayload(*parts, latest=_latest(distributions["payload at"]))
 
 
 def _latest(one: Distribution) -> float:

@@ -43,9 +43,11 @@ _UNITS = {
 
 def describe(ensemble: "Ensemble") -> str:
     """What varies, how and in which unit; then what is the same in all members."""
-    given = ensemble.distributions
-    varies = {name: one for name, one in given.items() if one.varies}
-    same = {n: one for n, one in given.items() if n not in varies and _is_worth_a_line(n, one)}
+    distributions = ensemble.distributions
+    varies = {name: one for name, one in distributions.items() if one.varies}
+    same = {
+        n: one for n, one in distributions.items() if n not in varies and _is_worth_a_line(n, one)
+    }
     corner = f", gusts of {ensemble.gust_corner:.4g} rad/s" if ensemble.gust is not None else ""
     lines = [f"ensemble, {ensemble.sampling} sampling{corner}"]
     lines += [f"  plants {ensemble.plants}"] if ensemble.plants is not None else []
@@ -96,29 +98,29 @@ def _check_ensemble(ensemble: "Ensemble") -> None:
             f"payload is {ensemble.payload!r}: give a jq.ensembles.Payload(added, at=...)"
         )
     require_all_positive(gust_corner=ensemble.gust_corner)
-    given = ensemble.distributions
-    _check_names(ensemble, given)
-    for name, one in given.items():
+    distributions = ensemble.distributions
+    _check_names(ensemble, distributions)
+    for name, one in distributions.items():
         if name in ensemble.independent and name in _ONE_FOR_ALL:
             raise ValueError(f"{name} is the same for all axes: leave it out of independent=")
         if name in FACTORS or not one.relative:
             _check_support(name, one)
-    _check_payload(ensemble, given)
+    _check_payload(ensemble, distributions)
     if ensemble.plants is not None:
         ensemble.plants.require_determined(ensemble.replaced)
 
 
-def _check_names(ensemble: "Ensemble", given: dict[str, Distribution]) -> None:
+def _check_names(ensemble: "Ensemble", distributions: dict[str, Distribution]) -> None:
     if ensemble.sampling not in SAMPLINGS:
         raise ValueError(f"sampling is {ensemble.sampling!r}: use one of {', '.join(SAMPLINGS)}")
     if ensemble.sampling == "grid" and ensemble.plants is not None:
         raise ValueError('a posterior has no grid to draw on: use sampling="latin"')
-    known = [name for name, one in given.items() if one.varies]
+    varying = [name for name, one in distributions.items() if one.varies]
     names = ensemble.independent
-    if isinstance(names, str) or any(name not in known for name in names):
+    if isinstance(names, str) or any(name not in varying for name in names):
         raise ValueError(
             f"independent is {names!r}: name quantities that vary, in brackets; here "
-            f"{', '.join(known) or 'none does'}"
+            f"{', '.join(varying) or 'none does'}"
         )
 
 
@@ -137,10 +139,10 @@ def _check_support(name: str, one: Distribution) -> None:
         )
 
 
-def _check_payload(ensemble: "Ensemble", given: dict[str, Distribution]) -> None:
+def _check_payload(ensemble: "Ensemble", distributions: dict[str, Distribution]) -> None:
     if ensemble.payload is None:
         return
-    least = [given[name].support[0] for name in ("inertia", "payload added")]
+    least = [distributions[name].support[0] for name in ("inertia", "payload added")]
     if not sum(np.min(x) for x in least) > 0:
         raise ValueError(
             f"the payload adds {number(least[1])} and a member can start from {number(least[0])} "
@@ -279,11 +281,11 @@ class Ensemble(eqx.Module):
     @property
     def distributions(self) -> dict[str, Distribution]:
         """The distribution of each quantity that has one."""
-        own = vars(self)
-        given: dict[str, Distribution | None] = {name: own[name] for name in QUANTITIES}
+        fields = vars(self)
+        named: dict[str, Distribution | None] = {name: fields[name] for name in QUANTITIES}
         if self.payload is not None:
-            given |= {f"payload {name}": x for name, x in vars(self.payload).items()}
-        return {name: one for name, one in given.items() if one is not None}
+            named |= {f"payload {name}": x for name, x in vars(self.payload).items()}
+        return {name: one for name, one in named.items() if one is not None}
 
     @property
     def replaced(self) -> tuple[str, ...]:
@@ -297,16 +299,16 @@ class Ensemble(eqx.Module):
         Raise ValueError for a loop that they do not fit.
         """
         plant = _require_single_loop(self, loop)
-        found = {}
+        resolved = {}
         for name, one in self.distributions.items():
             _check_axes(name, one, plant)
             if name in self.independent and isinstance(plant, Multirotor) and name in _OF_ROTORS:
                 raise ValueError(f"{name} is the same for all axes: leave it out of independent=")
-            found[name] = (
+            resolved[name] = (
                 one if name in FACTORS else one.about(self._nominal(loop, plant, name), name)
             )
-            _check_support(name, found[name])
-        return plant, found
+            _check_support(name, resolved[name])
+        return plant, resolved
 
     def _nominal(self, loop: Loop, plant: VariablePlant, name: str) -> np.ndarray | None:
         if self.plants is not None:

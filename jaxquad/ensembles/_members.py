@@ -42,12 +42,12 @@ def vary_plant(plant: VariablePlant, drawn: Drawn) -> VariablePlant:
     """
     names = ("damping", "stiffness", "coulomb")
     values = {name: drawn.get(name, nominal_value(plant, name)) for name in names}
-    own = {name: value for name, value in values.items() if value is not None}
+    changed = {name: value for name, value in values.items() if value is not None}
     inertia = multiply(plant_inertia(plant), drawn["inertia"])
     if isinstance(plant, DecoupledAxes):
         gain = multiply(np.asarray(plant.torque_gain), drawn["torque_gain"])
-        return DecoupledAxes(gain, inertia, lag=drawn.get("lag", plant.lag), **own)
-    attitude = Attitude(inertia, rotor_inertia=plant.attitude.rotor_inertia, **own)
+        return DecoupledAxes(gain, inertia, lag=drawn.get("lag", plant.lag), **changed)
+    attitude = Attitude(inertia, rotor_inertia=plant.attitude.rotor_inertia, **changed)
     motor = MotorLag(drawn["lag"][0]) if "lag" in drawn else plant.motor
     return Multirotor(attitude, _scale_torques(plant.allocation, drawn["torque_gain"][0]), motor)
 
@@ -249,8 +249,8 @@ class Members(eqx.Module):
 
 @eqx.filter_jit
 def _take(members: Members, places: Int[Array, " some"]) -> Members:
-    own = mark_members(members, (members.size,))
-    return jax.tree.map(lambda x, mine: x[..., places] if mine else x, members, own)
+    varies = mark_members(members, (members.size,))
+    return jax.tree.map(lambda x, mine: x[..., places] if mine else x, members, varies)
 
 
 def _require_indices(indices: ArrayLike | Sequence[int], size: int) -> Array:
@@ -297,7 +297,9 @@ def _gusts(keys: Key[Array, " members"], shape: tuple[int, int], corner: float, 
     return jax.vmap(draw, out_axes=-1)(keys)
 
 
-def _add(given: Array | None, own: Float[Array, "samples axes members"]) -> Array:
-    if given is None:
-        return own
-    return given.reshape(given.shape[:2] + (given.shape[2:] or (1,))) + own.astype(given.dtype)
+def _add(signal: Array | None, drawn: Float[Array, "samples axes members"]) -> Array:
+    if signal is None:
+        return drawn
+    return signal.reshape(signal.shape[:2] + (signal.shape[2:] or (1,))) + drawn.astype(
+        signal.dtype
+    )

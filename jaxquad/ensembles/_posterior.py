@@ -61,7 +61,7 @@ def make_plant(
 def _choose_builder(model: PyTree, believed: ArrayLike | None, plant: Given | None) -> Build:
     """How plants are made of models like this one. Raise ValueError where that is not known."""
     if plant is not None:
-        return _given(plant, believed)
+        return _build_given(plant, believed)
     if believed is not None:
         believed = on_host(as_float(believed))
         require_positive("believed", believed, "the inertia in kg m^2 that the gain belongs to")
@@ -90,20 +90,22 @@ def _choose_builder(model: PyTree, believed: ArrayLike | None, plant: Given | No
     return lambda m: build(m.transfer_function())
 
 
-def _given(plant: Given, believed: ArrayLike | None) -> Build:
+def _build_given(plant: Given, believed: ArrayLike | None) -> Build:
     if believed is not None:
         raise ValueError(
             "give plant= or believed=, not both: the function plant= sets the inertia itself"
         )
 
     def build(model: PyTree) -> tuple[DecoupledAxes, Array]:
-        made = plant(model)
-        if not (isinstance(made, tuple) and len(made) == 2 and isinstance(made[0], DecoupledAxes)):
+        built = plant(model)
+        if not (
+            isinstance(built, tuple) and len(built) == 2 and isinstance(built[0], DecoupledAxes)
+        ):
             raise ValueError(
-                f"plant(model) returned {type(made).__name__}, but it must return a pair: "
+                f"plant(model) returned {type(built).__name__}, but it must return a pair: "
                 "(jq.DecoupledAxes(...), delay in s)"
             )
-        return made[0], as_float(made[1])
+        return built[0], as_float(built[1])
 
     return build
 
@@ -281,12 +283,12 @@ class Posterior(eqx.Module):
 
     def require_nominal(self, plant: DecoupledAxes | Multirotor) -> None:
         """Raise ValueError unless `plant` is what the draws are around."""
-        own = self.plant
+        center = self.plant
         if not (
             isinstance(plant, DecoupledAxes)
-            and plant.shape == own.shape
-            and np.allclose(plant.inertia, own.inertia)
-            and np.allclose(plant.torque_gain, own.torque_gain)
+            and plant.shape == center.shape
+            and np.allclose(plant.inertia, center.inertia)
+            and np.allclose(plant.torque_gain, center.torque_gain)
         ):
             raise ValueError(
                 "the plant of the loop is not the one that was identified: give "
@@ -302,11 +304,11 @@ class Posterior(eqx.Module):
 
     def __str__(self) -> str:
         names = ", ".join(self.fit.names)
-        held = ""
+        remark = ""
         if not self.fit.identifiable:
             undetermined = ", ".join(self.fit.verdict.undetermined)
-            held = f"; of {undetermined} only what the record determines varies"
-        return f"drawn from the covariance of a fit of {names}{held}"
+            remark = f"; of {undetermined} only what the record determines varies"
+        return f"drawn from the covariance of a fit of {names}{remark}"
 
 
 def _draw_plants(
@@ -366,9 +368,9 @@ def _depends(fit: Fit, slope: Float[np.ndarray, " parameters"]) -> bool:
     if any(slope[fit.names.index(name)] != 0 for name in verdict.curved):
         return True
     keep = np.eye(len(slope)) - verdict.exact.T @ verdict.exact
-    whole = slope @ keep @ fit.relative_covariance @ keep @ slope
+    variance = slope @ keep @ fit.relative_covariance @ keep @ slope
     drawn = slope @ known_covariance(fit) @ slope
-    return bool(whole - drawn > _LOST * whole + 1e-12 * size**2)
+    return bool(variance - drawn > _LOST * variance + 1e-12 * size**2)
 
 
 def _refusal(fit: Fit, lost: list[str]) -> str:

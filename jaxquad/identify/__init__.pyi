@@ -73,8 +73,8 @@ from .frequency_domain._structure import (
     reduce_structure as reduce_structure,
     Reduction as Reduction,
 )
-from .frequency_domain._transfer_function_fit import fit_transfer_function as fit_transfer_function
-from .frequency_domain._transfer_function_guess import (
+from .frequency_domain._transfer_function import (
+    fit_transfer_function as fit_transfer_function,
     guess_transfer_function as guess_transfer_function,
 )
 from .output_error._noise import (

@@ -1,10 +1,12 @@
 from ._allocation import Allocation as Allocation
 from ._attitude import Attitude as Attitude
-from ._connect import realise as realise, series as series, state_space as state_space
+from ._convert import (
+    from_control as from_control,
+    realise as realise,
+    series as series,
+    state_space as state_space,
+)
 from ._decoupled import DecoupledAxes as DecoupledAxes, LinearAxis as LinearAxis
-from ._exponential import matrix_exponential as matrix_exponential
-from ._from_control import from_control as from_control
-from ._modes import Mode as Mode, modes as modes
 from ._multirotor import (
     CRAZYFLIE as CRAZYFLIE,
     crazyflie as crazyflie,
@@ -16,7 +18,9 @@ from ._multirotor import (
 )
 from ._protocols import (
     evaluate_response as evaluate_response,
+    is_optional as is_optional,
     Model as Model,
+    parameter_units as parameter_units,
     with_arrays as with_arrays,
 )
 from ._rotation import (
@@ -30,17 +34,22 @@ from ._rotation import (
 )
 from ._simulate_linear import (
     free_responses as free_responses,
+    matrix_exponential as matrix_exponential,
     sample_rational as sample_rational,
     SampledRational as SampledRational,
     simulate_linear as simulate_linear,
     split_delay as split_delay,
 )
-from ._state_space import explicit as explicit, StateSpace as StateSpace
+from ._state_space import (
+    explicit as explicit,
+    Mode as Mode,
+    modes as modes,
+    StateSpace as StateSpace,
+)
 from ._transfer_function import (
     AttitudeAxis as AttitudeAxis,
     imaginary as imaginary,
     LaggedIntegrator as LaggedIntegrator,
     TransferFunction as TransferFunction,
 )
-from ._units import is_optional as is_optional, parameter_units as parameter_units
 from ._vector_functions import arctan2 as arctan2, sincos as sincos

@@ -47,19 +47,18 @@ class Allocation(eqx.Module):
     - `ValueError`: convention or input is unknown, or a value is not positive.
     """
 
-    arm: Float[Array, "..."] = per_member(rank=0, converter=as_float)  # L, m
-    thrust_coefficient: Float[Array, "..."] = per_member(
-        rank=0, converter=as_float
-    )  # K_t, N/V or N s^2
-    torque_coefficient: Float[Array, "..."] = per_member(
-        rank=0, converter=as_float
-    )  # K_l, N m/V or N m s^2
+    arm: Float[Array, "..."] = per_member(rank=0, converter=as_float)  # L
+    thrust_coefficient: Float[Array, "..."] = per_member(rank=0, converter=as_float)  # K_t
+    torque_coefficient: Float[Array, "..."] = per_member(rank=0, converter=as_float)  # K_l
     convention: str = eqx.field(static=True, default="frd-frbl")
     input: str = eqx.field(static=True, default="voltage")
 
     def __check_init__(self):
-        _require_known("convention", self.convention, tuple(_FRAMES))
-        _require_known("input", self.input, _INPUTS)
+        for name, names in {"convention": tuple(_FRAMES), "input": _INPUTS}.items():
+            if getattr(self, name) not in names:
+                raise ValueError(
+                    f"{name} is {getattr(self, name)!r}, but it must be one of {names}."
+                )
         require_positive("arm", self.arm, "give the distance from centre to rotor in m")
         remedy = "give its magnitude; the convention says which way each rotor turns"
         require_positive("thrust_coefficient", self.thrust_coefficient, remedy)
@@ -127,8 +126,3 @@ def _product(matrix: np.ndarray, vectors: Float[Array, " n *ensemble"]) -> Array
         for row in matrix
     ]
     return jnp.stack(rows)
-
-
-def _require_known(name: str, value: str, known: tuple[str, ...]) -> None:
-    if value not in known:
-        raise ValueError(f"{name} is {value!r}, but it must be one of {known}.")

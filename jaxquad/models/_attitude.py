@@ -44,19 +44,15 @@ class Attitude(eqx.Module):
     - `ValueError`: an inertia is not positive, or a value is not finite.
     """
 
-    inertia: Float[Array, "3 ..."] = per_member(rank=1, converter=as_float)  # kg m^2
-    damping: Float[Array, "3 ..."] = per_member(
-        rank=1, converter=as_float, default=(0.0,) * 3
-    )  # N m s/rad
-    rotor_inertia: Float[Array, "..."] = per_member(
-        rank=0, converter=as_float, default=0.0
-    )  # kg m^2
+    inertia: Float[Array, "3 ..."] = per_member(rank=1, converter=as_float)
+    damping: Float[Array, "3 ..."] = per_member(rank=1, converter=as_float, default=(0.0,) * 3)
+    rotor_inertia: Float[Array, "..."] = per_member(rank=0, converter=as_float, default=0.0)
     stiffness: Float[Array, "3 ..."] | None = per_member(
         rank=1, converter=as_float_or_none, default=None
     )
     coulomb: Float[Array, "3 ..."] | None = per_member(
         rank=1, converter=as_float_or_none, default=None
-    )  # N m
+    )
 
     def __check_init__(self):
         require_vector("inertia", self.inertia, 3)

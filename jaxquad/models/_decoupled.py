@@ -76,22 +76,16 @@ class DecoupledAxes(eqx.Module):
         shapes do not match.
     """
 
-    torque_gain: Float[Array, "axes ..."] = per_member(
-        rank=1, converter=_per_axis
-    )  # N m per unit of u
-    inertia: Float[Array, "axes ..."] = per_member(rank=1, converter=_per_axis)  # kg m^2
+    torque_gain: Float[Array, "axes ..."] = per_member(rank=1, converter=_per_axis)
+    inertia: Float[Array, "axes ..."] = per_member(rank=1, converter=_per_axis)
     lag: Float[Array, "axes ..."] | None = per_member(
         rank=1, converter=_per_axis_or_none, default=None
-    )  # s
-    damping: Float[Array, "axes ..."] = per_member(
-        rank=1, converter=_per_axis, default=0.0
-    )  # N m s/rad
-    stiffness: Float[Array, "axes ..."] = per_member(
-        rank=1, converter=_per_axis, default=0.0
-    )  # N m/rad
+    )
+    damping: Float[Array, "axes ..."] = per_member(rank=1, converter=_per_axis, default=0.0)
+    stiffness: Float[Array, "axes ..."] = per_member(rank=1, converter=_per_axis, default=0.0)
     coulomb: Float[Array, "axes ..."] | None = per_member(
         rank=1, converter=_per_axis_or_none, default=None
-    )  # N m
+    )
 
     def __check_init__(self):
         _ = self.shape
@@ -132,8 +126,8 @@ class DecoupledAxes(eqx.Module):
         """
         dtype = self.inertia.dtype
         angle = jnp.zeros(1, dtype) if euler is None else jnp.asarray(euler, dtype)
-        axes, *own = self.shape
-        shape = jnp.broadcast_shapes(tuple(own), ensemble, angle.shape[1:])
+        axes, *members = self.shape
+        shape = jnp.broadcast_shapes(tuple(members), ensemble, angle.shape[1:])
         still = jnp.zeros((max(axes, angle.shape[0]), *shape), dtype)
         angle = jnp.broadcast_to(align(angle, still), still.shape)
         return AxesState(angle, still, None if self.lag is None else still)
@@ -167,7 +161,12 @@ class DecoupledAxes(eqx.Module):
         if not 0 <= axis < axes:
             has = f"axes 0 to {axes - 1}" if axes > 1 else "one axis only, number 0 (roll)"
             raise ValueError(f"axis is {axis}, but the plant has {has}")
-        of_axis = lambda x: _on_axis(x, axis, tuple(ensemble))
+
+        def of_axis(x: Array) -> Array:  # for each member; where all axes share a value, that one
+            value = x[axis if x.shape[0] > 1 else 0]
+            one_each = value.shape + (1,) * (len(ensemble) - value.ndim)
+            return jnp.broadcast_to(value.reshape(one_each), tuple(ensemble))
+
         inertia, lag = of_axis(self.inertia), None if self.lag is None else of_axis(self.lag)
         one, zero = jnp.ones_like(inertia), jnp.zeros_like(inertia)
         gain = of_axis(self.torque_gain) / inertia
@@ -181,14 +180,6 @@ class DecoupledAxes(eqx.Module):
     def with_added_inertia(self, inertia: Float[ArrayLike, "..."]) -> "DecoupledAxes":
         """The same axes carrying a known extra `inertia` in kg m^2, such as a payload."""
         return eqx.tree_at(lambda p: p.inertia, self, add_inertia(self.inertia, inertia))
-
-
-def _on_axis(x: Float[Array, "axes ..."], axis: int, ensemble: tuple[int, ...]) -> Array:
-    """The value of one axis for each member; where all axes share a value, that one."""
-    value = x[axis if x.shape[0] > 1 else 0]
-    return jnp.broadcast_to(
-        value.reshape(value.shape + (1,) * (len(ensemble) - value.ndim)), ensemble
-    )
 
 
 def add_inertia(inertia: Float[Array, "axes ..."], extra: Float[ArrayLike, "..."]) -> Array:

@@ -88,8 +88,8 @@ class Multirotor(eqx.Module):
 
     def __check_init__(self):
         rotor_inertia = self.attitude.rotor_inertia
-        known = is_concrete(rotor_inertia) and not is_zero(rotor_inertia)
-        if known and self.allocation.input == "voltage":
+        spins = is_concrete(rotor_inertia) and not is_zero(rotor_inertia)
+        if spins and self.allocation.input == "voltage":
             raise ValueError(
                 f"rotor_inertia is {rotor_inertia}, but voltages do not determine the rotor "
                 'speeds: set it to 0, or use an Allocation with input="omega2".'

@@ -1,6 +1,6 @@
 import functools as ft
 from collections.abc import Sequence
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -42,15 +42,15 @@ def inverse(matrix: Split, scales: Scales) -> Split:
     Source: Higham, Accuracy and Stability of Numerical Algorithms, section 14.4.
     """
     rows, columns = scales
-    found = _invert_in_place(Split(*(rows[:, None] * part * columns[None] for part in matrix)))
-    return Split(*(columns[:, None] * part * rows[None] for part in found))
+    result = _invert_in_place(Split(*(rows[:, None] * part * columns[None] for part in matrix)))
+    return Split(*(columns[:, None] * part * rows[None] for part in result))
 
 
 @inverse.defjvp
 def _inverse_jvp(primals, tangents):
-    found = inverse(*primals)  # whatever the scales
-    change = _product(_product(found, tangents[0]), found)
-    return found, Split(-change.real, -change.imag)
+    result = inverse(*primals)  # whatever the scales
+    change = _product(_product(result, tangents[0]), result)
+    return result, Split(-change.real, -change.imag)
 
 
 def equilibrium(
@@ -76,69 +76,51 @@ def _invert_in_place(matrix: Split) -> Split:
     states, _, frequencies = matrix.real.shape
     unused = jnp.ones((states, frequencies), matrix.real.dtype)
 
+    number = jnp.arange(states)
+
     def step(carry, k):
         table, unused = carry
-        row = _pivot_row(table, unused, k)
-        return (_exchange_pivot(table, row, k), jnp.where(_is_row(row, states), 0, unused)), row
+        column = Split(
+            *(jax.lax.dynamic_index_in_dim(part, k, 1, keepdims=False) for part in table)
+        )
+        size = (column.real * column.real + column.imag * column.imag) * unused - (1 - unused)
+        best = size == jnp.max(size, axis=0, keepdims=True)
+        # The last row as a fallback keeps the index valid where everything is NaN.
+        row = jnp.min(jnp.where(best, number[:, None], states - 1), axis=0)
+        pivots = Split(*(_take_along(part, row[None, None], 0)[0] for part in table))
+        is_pivot = number[:, None] == row[None]
+        table = _exchange(table, pivots, column, is_pivot, k)
+        return (table, jnp.where(is_pivot, 0, unused)), row
 
     (table, _), row = jax.lax.scan(step, (matrix, unused), jnp.arange(states))
     # Column k belongs to the right side row[k], and row[k] holds the unknown k.
-    number = jnp.arange(states)
     place = jnp.sum(jnp.where(row[:, None] == number[None, :, None], number[:, None, None], 0), 0)
     index = (row[:, None] * states + place[None]).reshape(-1, frequencies)
     order = lambda part: _take_along(part.reshape(-1, frequencies), index, 0).reshape(part.shape)
     return Split(order(table.real), order(table.imag))
 
 
-def _pivot_row(
-    table: Split, unused: Float[Array, "states frequencies"], k: Int[Array, ""]
-) -> Int[Array, " frequencies"]:
-    real, imag = _column(table, k)
-    size = (real * real + imag * imag) * unused - (1 - unused)
-    states = len(size)
-    best = size == jnp.max(size, axis=0, keepdims=True)
-    # The last row as a fallback keeps the index valid where everything is NaN.
-    return jnp.min(jnp.where(best, jnp.arange(states)[:, None], states - 1), axis=0)
-
-
-def _exchange_pivot(table: Split, row: Int[Array, " frequencies"], k: Int[Array, ""]) -> Split:
-    pivots = Split(*(_take_along(part, row[None, None], 0)[0] for part in table))
-    return _exchange(table, pivots, _column(table, k), _is_row(row, len(table.real)), k)
-
-
-def _exchange(table: Split, row: Split, column: Split, mine: Array, k: Int[Array, ""]) -> Split:
-    """Unknown k against the right side of a `row`, which is where `mine` says."""
+def _exchange(table: Split, row: Split, column: Split, is_pivot: Array, k: Int[Array, ""]) -> Split:
+    """Unknown k against the right side of a `row`, which is where `is_pivot` says."""
     diagonal = (jnp.arange(len(table.real)) == k)[:, None]
-    real, imag = _reciprocal(*(jax.lax.dynamic_index_in_dim(part, k) for part in row))
+    # The reciprocal of the pivot.
+    real, imag = (jax.lax.dynamic_index_in_dim(part, k) for part in row)
+    tiny = float(jnp.finfo(real.dtype).eps) ** 2
+    power = real * real + imag * imag
+    zero = power < tiny**2
+    real, power = jnp.where(zero, tiny, real), jnp.where(zero, tiny**2, power)
+    real, imag = real / power, -imag / power
     a, b = jnp.where(diagonal, 1, row.real), jnp.where(diagonal, 0, row.imag)
     scaled = Split((a * real - b * imag)[None], (a * imag + b * real)[None])
     column = Split(
-        jnp.where(mine, -1, column.real)[:, None], jnp.where(mine, 0, column.imag)[:, None]
+        jnp.where(is_pivot, -1, column.real)[:, None], jnp.where(is_pivot, 0, column.imag)[:, None]
     )
-    kept = jnp.where(mine[:, None] | diagonal[None], 0, jnp.ones((), a.dtype))
+    kept = jnp.where(is_pivot[:, None] | diagonal[None], 0, jnp.ones((), a.dtype))
     step = (
         column.real * scaled.real - column.imag * scaled.imag,
         column.real * scaled.imag + column.imag * scaled.real,
     )
     return Split(kept * table.real - step[0], kept * table.imag - step[1])
-
-
-def _reciprocal(
-    real: Float[Array, "1 frequencies"], imag: Float[Array, "1 frequencies"]
-) -> tuple[Float[Array, "1 frequencies"], Float[Array, "1 frequencies"]]:
-    tiny = float(jnp.finfo(real.dtype).eps) ** 2
-    power = real * real + imag * imag
-    zero = power < tiny**2
-    real, power = jnp.where(zero, tiny, real), jnp.where(zero, tiny**2, power)
-    return real / power, -imag / power
-
-
-def _column(table: Split, k: Int[Array, ""]) -> Split:
-    return Split(*(jax.lax.dynamic_index_in_dim(part, k, 1, keepdims=False) for part in table))
-
-
-def _is_row(row: Int[Array, " frequencies"], states: int) -> Array:
-    return jnp.arange(states)[:, None] == row[None]
 
 
 def _take_along(x: Array, index: Array, axis: int) -> Array:
@@ -180,16 +162,25 @@ class Solved(NamedTuple):
 
 def _solve_states(matrices: Matrices, omega: Float[Array, " frequencies"]) -> Solved:
     """The response without a look at its rounding error."""
-    scales = jax.lax.stop_gradient(_scales(matrices, omega))
+    # Scales from the geometric mean of the frequencies: units know no frequency.
+    middle = jnp.exp(jnp.mean(jnp.log(jnp.where(omega > 0, omega, 1.0))))[None]
+    shape = (len(matrices.F), omega.size)
+    real, imag = _pencil(matrices, middle)
+    rows, columns = equilibrium(jnp.maximum(jnp.abs(real), jnp.abs(imag)))
+    scales = jax.lax.stop_gradient(
+        (jnp.broadcast_to(rows, shape), jnp.broadcast_to(columns, shape))
+    )
     resolvent = inverse(_pencil(matrices, omega), scales)
     states = Split(*(no_fuse(_multiply_columns, part, matrices.G) for part in resolvent))
     value = _apply_delay(_output_of(matrices, omega, states), matrices.late, omega)
     return Solved(value, resolvent, states, scales)
 
 
-def _mark_rounding(matrices: Matrices, omega: Float[Array, " frequencies"], found: Solved) -> Split:
-    lost = _find_rounding(*jax.lax.stop_gradient((matrices, omega, found)))
-    real, imag = found.value
+def _mark_rounding(
+    matrices: Matrices, omega: Float[Array, " frequencies"], solved: Solved
+) -> Split:
+    lost = _is_rounding(*jax.lax.stop_gradient((matrices, omega, solved)))
+    real, imag = solved.value
     return Split(jnp.where(lost, jnp.inf, real), jnp.where(lost, jnp.nan, imag))
 
 
@@ -198,24 +189,25 @@ def _response_jvp(primals, tangents):
     # With the states X = R G and L = (H0 + s H1) R, both small, instead of the products R dF R:
     # dT = L (dG + dF X - d(s M) X) + d(H0 + s H1) X, late, and -j d(omega late) T.
     matrices, omega = primals
-    d, d_omega = (_drop_zeros(each) for each in tangents)
-    found = _solve_states(matrices, omega)
-    value, states = _mark_rounding(matrices, omega, found), found.states
+    # None for tangents that are known to be zero.
+    absent = lambda x: isinstance(x, SymbolicZero)
+    d, d_omega = jax.tree.map(lambda x: None if absent(x) else x, tangents, is_leaf=absent)
+    solved = _solve_states(matrices, omega)
+    value, states = _mark_rounding(matrices, omega, solved), solved.states
     rate = _derivative(states, omega)
-    push = [
-        _multiply(d.F, states),
-        _negative(_multiply(d.M, rate)),
-        _real_if_given(d.G, states),
-    ]
+    push = [_multiply(d.F, states), _negative(_multiply(d.M, rate))]
+    if d.G is not None:
+        real = jnp.broadcast_to(d.G[:, :, None], states.real.shape)
+        push.append(Split(real, jnp.zeros_like(states.imag)))
     change = [_multiply(d.H0, states), _multiply(d.H1, rate)]
     if d_omega is not None:
         turned = _derivative(states, d_omega)
         push.append(_negative(turned if matrices.M is None else _multiply(matrices.M, turned)))
         change.append(_multiply(matrices.H1, turned))
-    pushed = _add_given(push)
+    pushed = _add_present(push)
     if pushed is not None:
-        change.append(no_fuse(_product, _output_of(matrices, omega, found.resolvent), pushed))
-    changed = _add_given(change)
+        change.append(no_fuse(_product, _output_of(matrices, omega, solved.resolvent), pushed))
+    changed = _add_present(change)
     moved = [None if changed is None else _apply_delay(changed, matrices.late, omega)]
     for late, frequency in ((d.late, omega), (matrices.late, d_omega)):
         if late is not None and frequency is not None:
@@ -233,22 +225,10 @@ def _apply_delay(parts: Split, late: Array | None, omega: Float[Array, " frequen
 
 
 def _pencil(matrices: Matrices, omega: Float[Array, " frequencies"]) -> Split:
-    F, M = matrices.F, _mass(matrices)
+    F, M = matrices.F, matrices.M
+    M = jnp.eye(len(F), dtype=F.dtype) if M is None else M
     shape = (*F.shape, omega.size)
     return Split(jnp.broadcast_to(-F[:, :, None], shape), M[:, :, None] * omega[None, None])
-
-
-def _scales(matrices: Matrices, omega: Float[Array, " frequencies"]) -> Scales:
-    """Of rows and columns, from the geometric mean of the frequencies: units know no frequency."""
-    middle = jnp.exp(jnp.mean(jnp.log(jnp.where(omega > 0, omega, 1.0))))[None]
-    shape = (len(matrices.F), omega.size)
-    rows, columns = equilibrium(_size(_pencil(matrices, middle)))
-    return jnp.broadcast_to(rows, shape), jnp.broadcast_to(columns, shape)
-
-
-def _mass(matrices: Matrices) -> Float[Array, "states states"]:
-    F, M = matrices.F, matrices.M
-    return jnp.eye(len(F), dtype=F.dtype) if M is None else M
 
 
 def _output_of(matrices: Matrices, omega: Float[Array, " frequencies"], states: Split) -> Split:
@@ -257,13 +237,13 @@ def _output_of(matrices: Matrices, omega: Float[Array, " frequencies"], states: 
     return _add(_multiply_real(matrices.H0, states), rates)
 
 
-def _find_rounding(
-    matrices: Matrices, omega: Float[Array, " frequencies"], found: Solved
+def _is_rounding(
+    matrices: Matrices, omega: Float[Array, " frequencies"], solved: Solved
 ) -> Bool[Array, "outputs inputs frequencies"]:
     # A first-order bound of the rounding error in the states, beside the largest state in the
     # units that make the equations alike; and what only a pivot of zero can make so large.
-    row, unit = (scale[:, None] for scale in found.scales)
-    size, gain = (jnp.abs(x.real) + jnp.abs(x.imag) for x in (found.states, found.resolvent))
+    row, unit = (scale[:, None] for scale in solved.scales)
+    size, gain = (jnp.abs(x.real) + jnp.abs(x.imag) for x in (solved.states, solved.resolvent))
     mass = size if matrices.M is None else _dot(jnp.abs(matrices.M), size)
     terms = _dot(jnp.abs(matrices.F), size) + omega[None, None] * mass
     error = sum(gain[:, k, None] * terms[k][None] for k in range(len(gain)))
@@ -271,14 +251,10 @@ def _find_rounding(
     push = jnp.max(row * jnp.abs(matrices.G)[:, :, None], axis=0, keepdims=True)
     doubtful = ~(error / unit <= limit * jnp.max(size / unit, axis=0, keepdims=True))
     doubtful = doubtful | (size / unit > limit**1.5 * push)
-    H = [jnp.abs(each) for each in (matrices.H0, matrices.H1) if each is not None]
-    seen = sum(H[1:], H[0]) > 0
-    each = [seen[:, k, None, None] & doubtful[k][None] for k in range(len(doubtful))]
-    return ft.reduce(jnp.logical_or, each)
-
-
-def _size(parts: Split) -> Float[Array, "rows columns frequencies"]:
-    return jnp.maximum(jnp.abs(parts.real), jnp.abs(parts.imag))
+    H = [jnp.abs(matrix) for matrix in (matrices.H0, matrices.H1) if matrix is not None]
+    measured = sum(H[1:], H[0]) > 0
+    by_state = [measured[:, k, None, None] & doubtful[k][None] for k in range(len(doubtful))]
+    return ft.reduce(jnp.logical_or, by_state)
 
 
 def _derivative(states: Split, omega: Float[Array, " frequencies"]) -> Split:
@@ -293,21 +269,15 @@ def _multiply(matrix: Array | None, states: Split) -> Split | None:
 def _multiply_real(matrix: Array, states: Split) -> Split:
     """A real matrix times both parts, in one product."""
     both = jnp.concatenate(states, axis=1)
-    found, inputs = _dot(matrix, both), states.real.shape[1]
-    return Split(found[:, :inputs], found[:, inputs:])
-
-
-def _real_if_given(matrix: Array | None, like: Split) -> Split | None:
-    if matrix is None:
-        return None
-    return Split(jnp.broadcast_to(matrix[:, :, None], like.real.shape), jnp.zeros_like(like.imag))
+    product, inputs = _dot(matrix, both), states.real.shape[1]
+    return Split(product[:, :inputs], product[:, inputs:])
 
 
 def _negative(parts: Split | None) -> Split | None:
     return None if parts is None else Split(-parts.real, -parts.imag)
 
 
-def _add_given(terms: Sequence[Split | None]) -> Split | None:
+def _add_present(terms: Sequence[Split | None]) -> Split | None:
     present = [term for term in terms if term is not None]
     return _add(*present) if present else None
 
@@ -316,15 +286,6 @@ def _add(first: Split, *others: Split | None) -> Split:
     """The sum, without what is None."""
     present = [term for term in others if term is not None]
     return ft.reduce(lambda a, b: Split(a.real + b.real, a.imag + b.imag), present, first)
-
-
-_Tree = TypeVar("_Tree")
-
-
-def _drop_zeros(tangents: _Tree) -> _Tree:
-    """The tangents, with None for those that are known to be zero."""
-    absent = lambda x: isinstance(x, SymbolicZero)
-    return jax.tree.map(lambda x: None if absent(x) else x, tangents, is_leaf=absent)
 
 
 def _multiply_columns(array: Array, matrix: Array) -> Array:

@@ -1,6 +1,7 @@
 """Exact simulation of a linear model with delayed inputs and outputs."""
 
 import functools as ft
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -10,13 +11,76 @@ from jaxtyping import Array, ArrayLike, Float, Int
 from jaxquad._compile import brief_options, Jit
 from jaxquad._core import require_all_positive
 
-from ._connect import realise
-from ._exponential import dot, matrix_exponential, small_dot
-from ._state_space import explicit, StateSpace
+from ._convert import realise
+from ._state_space import dot, explicit, StateSpace
 from ._transfer_function import TransferFunction
 
 
 Number = float | Float[Array, ""]
+
+_TERMS = 18  # of the series at a norm of 1: 1 / 19! is below the last bit
+_SQUARINGS = 30
+_FEW = 8  # rows or columns
+
+
+def _small_dot(a: Array, b: Array) -> Array:
+    """`dot` as a sum, if all sides are short: XLA calls a library, which takes longer than that.
+
+    Derivatives in reverse keep every term of it.
+    """
+    if max(*a.shape, *b.shape) > _FEW:
+        return dot(a, b)
+    if a.ndim == 1:
+        return jnp.sum(a.reshape(-1, *(1,) * (b.ndim - 1)) * b, axis=0)
+    if b.ndim == 1:
+        return jnp.sum(a * b[None], axis=1)
+    return jnp.sum(a[:, :, None] * b[None], axis=1)
+
+
+def matrix_exponential(
+    matrix: Float[Array, "n n"], dot: Callable[[Array, Array], Array] = dot
+) -> Float[Array, "n n"]:
+    """e to the `matrix`, by its series with scaling and squaring, and by products of `dot`.
+
+    It compiles in a fraction of the time of `jax.scipy.linalg.expm`, and without LAPACK under vmap.
+    """
+    size = jnp.maximum(jnp.max(jnp.sum(jnp.abs(matrix), axis=0)), 1.0)
+    halvings = jax.lax.stop_gradient(jnp.clip(jnp.ceil(jnp.log2(size)), 0, _SQUARINGS))
+    small = matrix * jnp.exp2(-halvings)
+    unit = jnp.eye(len(matrix), dtype=matrix.dtype)
+
+    def nest(power: Array, k: Array) -> tuple[Array, None]:
+        return unit + dot(small, power) / k, None
+
+    terms = jnp.arange(_TERMS, 0, -1, dtype=matrix.dtype)
+    series = jax.lax.scan(nest, unit, terms)[0]
+    return _squared(series, halvings, dot)
+
+
+@ft.partial(jax.custom_jvp, nondiff_argnums=(2,))
+def _squared(
+    power: Float[Array, "n n"], times: Float[Array, ""], dot: Callable[[Array, Array], Array]
+) -> Float[Array, "n n"]:
+    """`power` squared so many times: of most matrices hardly one, of an ensemble's as the most."""
+    more = lambda state: state[1] < times
+    square = lambda state: (dot(state[0], state[0]), state[1] + 1)
+    return jax.lax.while_loop(more, square, (power, jnp.zeros_like(times)))[0]
+
+
+@_squared.defjvp
+def _squared_jvp(
+    dot: Callable[[Array, Array], Array], primals: tuple[Array, Array], tangents: tuple[Array, ...]
+) -> tuple[Array, Array]:
+    # A loop whose length is not known has no derivative in reverse.
+    power, times = primals
+
+    def square(power: Array, k: Array) -> tuple[Array, None]:
+        return jnp.where(k < times, dot(power, power), power), None
+
+    steps = jnp.arange(_SQUARINGS, dtype=power.dtype)
+    run = lambda power: jax.lax.scan(square, power, steps)[0]
+    return jax.jvp(run, (power,), (tangents[0],))
+
 
 _WHOLE = 1e-9  # samples; a delay this close to whole samples is whole, whatever the rounding
 
@@ -29,7 +93,7 @@ def split_delay(
     return shift.astype(int), delay / dt - shift
 
 
-def propagation(
+def _propagation(
     A: Float[Array, "states states"],
     B: Float[Array, "states inputs"],
     late: Float[Array, " inputs"],
@@ -42,47 +106,45 @@ def propagation(
     result acts on value and change over a whole sample of the old and of the new segment, input by
     input. A may be singular.
     """
-    over = lambda b, late: _crossing(A, b[:, None], late, span, dt)
-    transition, drive = jax.vmap(over, in_axes=(1, 0))(B, late)
-    return transition[0], jnp.swapaxes(drive, 1, 2).reshape(4 * len(late), len(A))
-
-
-def _crossing(A, b, late, span, dt):
-    old = jnp.minimum(late, span)
-    new = span - old
-    zero, one = jnp.zeros_like(late), jnp.ones_like(late)
-    # From value and change of a segment to those over the part of it that acts.
-    last = jnp.stack([jnp.stack([one, 1 - late]), jnp.stack([zero, old])])
-    first = jnp.stack([jnp.stack([one, zero]), jnp.stack([zero, new])])
-    both = jax.vmap(lambda time: _propagate(A, b, time))(jnp.stack([old, new]) * dt)
-    (before, of_old), (after, of_new) = (jax.tree.map(lambda x, k=k: x[k], both) for k in (0, 1))
-    drive = [small_dot(after, small_dot(of_old, last)), small_dot(of_new, first)]
-    return small_dot(after, before), jnp.concatenate(drive, axis=1)
-
-
-def _propagate(
-    A: Float[Array, "states states"], B: Float[Array, "states 1"], time: Float[Array, ""]
-) -> tuple[Float[Array, "states states"], Float[Array, "states 2"]]:
-    # Van Loan's augmented exponential; the second part acts on value and change over `time`.
     states = len(A)
-    plant = jnp.pad(jnp.concatenate([A, B], axis=1) * time, ((0, 0), (0, 1)))
-    line = jnp.eye(2, states + 2, k=states + 1, dtype=A.dtype)
-    step = matrix_exponential(jnp.concatenate([plant, line]), small_dot)[:states]
-    return step[:, :states], step[:, states:]
+
+    def of_input(b, late):
+        def over(time):
+            # Van Loan's augmented exponential; the second part acts on value and change.
+            plant = jnp.pad(jnp.concatenate([A, b[:, None]], axis=1) * time, ((0, 0), (0, 1)))
+            line = jnp.eye(2, states + 2, k=states + 1, dtype=A.dtype)
+            step = matrix_exponential(jnp.concatenate([plant, line]), _small_dot)[:states]
+            return step[:, :states], step[:, states:]
+
+        old = jnp.minimum(late, span)
+        new = span - old
+        zero, one = jnp.zeros_like(late), jnp.ones_like(late)
+        # From value and change of a segment to those over the part of it that acts.
+        last = jnp.stack([jnp.stack([one, 1 - late]), jnp.stack([zero, old])])
+        first = jnp.stack([jnp.stack([one, zero]), jnp.stack([zero, new])])
+        both = jax.vmap(over)(jnp.stack([old, new]) * dt)
+        (before, of_old), (after, of_new) = (
+            jax.tree.map(lambda x, k=k: x[k], both) for k in (0, 1)
+        )
+        drive = [_small_dot(after, _small_dot(of_old, last)), _small_dot(of_new, first)]
+        return _small_dot(after, before), jnp.concatenate(drive, axis=1)
+
+    transition, drive = jax.vmap(of_input, in_axes=(1, 0))(B, late)
+    return transition[0], jnp.swapaxes(drive, 1, 2).reshape(4 * len(late), states)
 
 
-def delay_input(
+def _delay_input(
     segments: Float[Array, "samples 2"], delay: Float[Array, ""], dt: Number
 ) -> Float[Array, " samples"]:
     """The input itself, `delay` s late, at the samples; where it jumps, the value just after."""
     shift, late = split_delay(delay, dt)
-    old, new = shift_samples(segments, shift + 1), shift_samples(segments, shift)
+    old, new = _shift_samples(segments, shift + 1), _shift_samples(segments, shift)
     # At whole samples the slope by the delay is that of a longer one.
     now = new[:, 0] - late * old[:, 1]
     return jnp.where(late <= _WHOLE, now, old[:, 0] + (1 - late) * old[:, 1])
 
 
-def shift_samples(
+def _shift_samples(
     x: Float[Array, "samples columns"], shift: Int[Array, ""]
 ) -> Float[Array, "samples columns"]:
     """`x` so many samples later, and zero before."""
@@ -90,7 +152,7 @@ def shift_samples(
     return jnp.where(index[:, None] >= 0, x[jnp.maximum(index, 0)], 0)
 
 
-def recursion(
+def _recursion(
     A: Float[Array, "states states"], drive: Float[Array, "samples states"]
 ) -> Float[Array, "samples states"]:
     """x[k] of x[k+1] = A x[k] + drive[k], from x[0] = 0."""
@@ -104,31 +166,31 @@ def recursion(
         return dot(x, A.T) + w, x
 
     ends, within = jax.lax.scan(sample, jnp.zeros((chunks, states), drive.dtype), by_place)
-    steps, over = powers(A, length)
+    steps, over = _powers(A, length)
     starts = jax.lax.scan(lambda x, w: (dot(over, x) + w, x), jnp.zeros_like(ends[0]), ends)[1]
     carried = jnp.einsum("lij,cj->lci", steps, starts, precision="highest")
     return jnp.swapaxes(within + carried, 0, 1).reshape(chunks * length, states)[:samples]
 
 
-def free_motion(
+def _free_motion(
     rows: Float[Array, "outputs states"], A: Float[Array, "states states"], samples: int
 ) -> Float[Array, "samples outputs states"]:
     """`rows` A^k for each sample k."""
     length = _chunk(samples)
-    steps, over = powers(A, length)
-    chunks = powers(over, -(-samples // length))[0]
+    steps, over = _powers(A, length)
+    chunks = _powers(over, -(-samples // length))[0]
     starts = jnp.einsum("oi,cij->coj", rows, chunks, precision="highest")
-    found = jnp.einsum("coi,lij->cloj", starts, steps, precision="highest")
-    return found.reshape(len(chunks) * length, *rows.shape)[:samples]
+    motion = jnp.einsum("coi,lij->cloj", starts, steps, precision="highest")
+    return motion.reshape(len(chunks) * length, *rows.shape)[:samples]
 
 
-def powers(
+def _powers(
     A: Float[Array, "states states"], count: int
 ) -> tuple[Float[Array, "count states states"], Float[Array, "states states"]]:
     """A^0 to A^(count - 1), and A^count."""
     one = jnp.eye(len(A), dtype=A.dtype)
-    last, found = jax.lax.scan(lambda P, _: (dot(A, P), P), one, length=count)
-    return found, last
+    last, below = jax.lax.scan(lambda P, _: (dot(A, P), P), one, length=count)
+    return below, last
 
 
 def _chunk(samples: int) -> int:
@@ -169,9 +231,15 @@ def simulate_linear(
     require_all_positive(dt=dt)
     if hold not in _HOLDS:
         raise ValueError(f"hold is {hold!r}, but it must be one of {_HOLDS}.")
-    inputs = _inputs(model, jnp.asarray(u))
-    found = _simulate(_plant(model), _segments(inputs, hold), dt)
-    return found[:, 0] if isinstance(model, TransferFunction) else found
+    columns = None if isinstance(model, TransferFunction) else model.G.shape[1]
+    shape = "(samples,)" if columns is None else f"(samples, {columns})"
+    u = jnp.asarray(u)
+    if u.ndim != (1 if columns is None else 2) or u.shape[1:] not in ((), (columns,)):
+        raise ValueError(f"u has the shape {u.shape}, but this model takes {shape}: reshape it.")
+    u = u[:, None] if columns is None else u
+    change = jnp.diff(u, axis=0, append=u[-1:]) if hold == "first" else jnp.zeros_like(u)
+    outputs = _simulate(_plant(model), jnp.stack([u.T, change.T], axis=2), dt)
+    return outputs[:, 0] if columns is None else outputs
 
 
 def free_responses(
@@ -229,7 +297,7 @@ def sample_rational(model: TransferFunction, dt: Number, hold: str) -> SampledRa
     plant = _plant(model)
     states, one = len(plant.A), jnp.ones((), plant.A.dtype)
     shift, late = split_delay(plant.input_delay, dt)
-    step, drive = propagation(plant.A, plant.B, late, one, dt)
+    step, drive = _propagation(plant.A, plant.B, late, one, dt)
     old, old_change, new, new_change = drive
     if hold == "first":  # by samples of u itself, the next one first
         drive = jnp.stack([new_change, old_change + new - new_change, old - old_change])
@@ -238,26 +306,22 @@ def sample_rational(model: TransferFunction, dt: Number, hold: str) -> SampledRa
     below, row, above = [], plant.C[0], jnp.zeros(states + 2, plant.A.dtype)
     power = jnp.eye(states, dtype=plant.A.dtype)
     for k in range(states):
-        above = above + jnp.pad(small_dot(drive, small_dot(row, power)), (k, states - 1 - k))
-        power = small_dot(step, power)
+        above = above + jnp.pad(_small_dot(drive, _small_dot(row, power)), (k, states - 1 - k))
+        power = _small_dot(step, power)
         below.append(-jnp.trace(power) / (k + 1))
         power = power + below[-1] * jnp.eye(states, dtype=plant.A.dtype)
     poles = jnp.stack(below) if below else jnp.zeros(0, plant.A.dtype)
     if plant.D is not None:
-        now, before = plant.D[0, 0] * _direct(late[0], hold)
-        whole = jnp.concatenate([jnp.ones(1, poles.dtype), poles])
-        above = above.at[:-1].add(now * whole).at[1:].add(before * whole)
+        # What `_delay_input` makes of u[k] and u[k-1].
+        at_sample = jnp.where(late[0] <= _WHOLE, jnp.ones_like(late[0]), 0)
+        share = 1 - late[0] if hold == "first" else at_sample
+        now, before = plant.D[0, 0] * jnp.stack([share, 1 - share])
+        monic = jnp.concatenate([jnp.ones(1, poles.dtype), poles])
+        above = above.at[:-1].add(now * monic).at[1:].add(before * monic)
     block = _with_bias(plant.A)
     rows = jnp.concatenate([plant.C, jnp.zeros_like(plant.C)], axis=1)
-    exponential = matrix_exponential(block * dt, small_dot)
+    exponential = matrix_exponential(block * dt, _small_dot)
     return SampledRational(above, poles, shift[0], exponential, rows)
-
-
-def _direct(late: Float[Array, ""], hold: str) -> Float[Array, "2"]:
-    """What `delay_input` makes of u[k] and u[k-1]."""
-    whole = jnp.where(late <= _WHOLE, jnp.ones_like(late), 0)
-    share = 1 - late if hold == "first" else whole
-    return jnp.stack([share, 1 - share])
 
 
 class _Plant(NamedTuple):
@@ -279,64 +343,36 @@ def _plant(model: TransferFunction | StateSpace) -> _Plant:
     return _Plant(A, B, C, passing, model.H1, late, model.output_delay)
 
 
-def _inputs(model: TransferFunction | StateSpace, u: Array) -> Float[Array, "samples inputs"]:
-    if isinstance(model, TransferFunction):
-        wanted, right = "(samples,)", u.ndim == 1
-    else:
-        columns = model.G.shape[1]
-        wanted, right = f"(samples, {columns})", u.ndim == 2 and u.shape[1] == columns
-    if not right:
-        raise ValueError(f"u has the shape {u.shape}, but this model takes {wanted}: reshape it.")
-    return u[:, None] if u.ndim == 1 else u
-
-
-def _segments(u: Float[Array, "samples inputs"], hold: str) -> Float[Array, "inputs samples 2"]:
-    change = jnp.diff(u, axis=0, append=u[-1:]) if hold == "first" else jnp.zeros_like(u)
-    return jnp.stack([u.T, change.T], axis=2)
-
-
 @ft.partial(Jit, options=brief_options)
 def _simulate(
     plant: _Plant, segments: Float[Array, "inputs samples 2"], dt: Number
 ) -> Float[Array, "samples outputs"]:
     shift, late = split_delay(plant.input_delay, dt)
-    parts = [jax.vmap(shift_samples)(segments, shift + n) for n in (1, 0)]
+    parts = [jax.vmap(_shift_samples)(segments, shift + n) for n in (1, 0)]
     acting = jnp.swapaxes(jnp.concatenate(parts, axis=2), 0, 1)
     acting = acting.reshape(segments.shape[1], 4 * len(segments))
-    step, drive = propagation(plant.A, plant.B, late, jnp.ones((), late.dtype), dt)
-    states = recursion(step, dot(acting, drive))
-    if plant.output_delay is None:
-        found = dot(states, plant.C.T)
-    else:
-        found = _late_outputs(plant, states, acting, late, dt)
-    return found if plant.D is None else found + _direct_outputs(plant, plant.D, segments, dt)
+    step, drive = _propagation(plant.A, plant.B, late, jnp.ones((), late.dtype), dt)
+    states = _recursion(step, dot(acting, drive))
 
-
-def _late_outputs(
-    plant: _Plant,
-    states: Float[Array, "samples states"],
-    acting: Float[Array, "samples segments"],
-    late: Float[Array, " inputs"],
-    dt: Number,
-) -> Float[Array, "samples outputs"]:
-    # An output that is late shows the state somewhere within an earlier sample.
-    def output(row, delay):
+    def late_output(row, delay):
+        # An output that is late shows the state somewhere within an earlier sample.
         shift, wait = split_delay(delay, dt)
-        step, drive = propagation(plant.A, plant.B, late, 1 - wait, dt)
+        step, drive = _propagation(plant.A, plant.B, late, 1 - wait, dt)
         within = dot(states, dot(row, step)) + dot(acting, dot(drive, row))
-        return shift_samples(within[:, None], shift + 1)[:, 0]
+        return _shift_samples(within[:, None], shift + 1)[:, 0]
 
-    return jax.vmap(output, out_axes=1)(plant.C, plant.output_delay)
-
-
-def _direct_outputs(
-    plant: _Plant, D: Array, segments: Float[Array, "inputs samples 2"], dt: Number
-) -> Float[Array, "samples outputs"]:
-    wait = jnp.zeros(len(D), D.dtype) if plant.output_delay is None else plant.output_delay
-    one = lambda wait, late, segments: delay_input(segments, wait + late, dt)
+    if plant.output_delay is None:
+        outputs = dot(states, plant.C.T)
+    else:
+        outputs = jax.vmap(late_output, out_axes=1)(plant.C, plant.output_delay)
+    if plant.D is None:
+        return outputs
+    wait = plant.output_delay
+    wait = jnp.zeros(len(plant.D), plant.D.dtype) if wait is None else wait
+    one = lambda wait, late, segments: _delay_input(segments, wait + late, dt)
     by_input = jax.vmap(one, in_axes=(None, 0, 0))
     by_both = jax.vmap(by_input, in_axes=(0, None, None))(wait, plant.input_delay, segments)
-    return jnp.einsum("oi,oik->ko", D, by_both, precision="highest")
+    return outputs + jnp.einsum("oi,oik->ko", plant.D, by_both, precision="highest")
 
 
 @ft.partial(Jit, options=brief_options)
@@ -349,8 +385,8 @@ def _free_outputs(
     if plant.output_delay is not None:
         back = jax.vmap(lambda delay: matrix_exponential(-delay * block))(plant.output_delay)
         rows = jnp.einsum("oi,oij->oj", rows, back, precision="highest")
-    found = free_motion(rows, matrix_exponential(block * dt), samples)
-    return found[:, :, :states], found[:, :, states:]
+    motion = _free_motion(rows, matrix_exponential(block * dt), samples)
+    return motion[:, :, :states], motion[:, :, states:]
 
 
 def _with_bias(A: Float[Array, "states states"]) -> Float[Array, "both both"]:

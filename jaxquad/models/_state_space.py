@@ -1,11 +1,11 @@
-from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
+from typing import NamedTuple, Protocol, runtime_checkable, TYPE_CHECKING
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Complex, Float
+from jaxtyping import Array, Complex, Float, Inexact
 
 from jaxquad._core import (
     as_float,
@@ -15,21 +15,14 @@ from jaxquad._core import (
     require_nonnegative,
 )
 
-from ._modes import transmission_zeros
-from ._pade import check_order, Explicit, require_package, without_delays
 from ._protocols import as_frequencies, Frequencies
 from ._response import Matrices, response
+from ._transfer_function import check_order, Explicit, require_package, without_delays
 
 
 if TYPE_CHECKING:
     import control
     import scipy.signal
-
-
-def _as_pairs(
-    names: Mapping[str, str] | Sequence[tuple[str, str]],
-) -> tuple[tuple[str, str], ...]:
-    return tuple(dict(names).items())
 
 
 class StateSpace(eqx.Module):
@@ -65,18 +58,51 @@ class StateSpace(eqx.Module):
         converter=as_float_or_none, default=None
     )  # s
     names: tuple[tuple[str, str], ...] = eqx.field(  # (name, entry)
-        converter=_as_pairs, default=(), static=True
+        converter=lambda names: tuple(dict(names).items()), default=(), static=True
     )
 
     def __check_init__(self):
-        _check_shapes(self)
-        _check_names(self)
-        for name, value in _arrays(self).items():
+        F, G, H0 = self.F, self.G, self.H0
+        if F.ndim != 2 or F.shape[0] != F.shape[1] or not F.size:
+            raise ValueError(f"F has shape {F.shape}: give a square matrix of one row per state.")
+        if G.ndim != 2 or H0.ndim != 2 or not G.shape[1] or not H0.shape[0]:
+            raise ValueError(
+                f"G has shape {G.shape} and H0 {H0.shape}: give matrices, a column of G per input "
+                "and a row of H0 per output."
+            )
+        (states, inputs), outputs = (len(F), G.shape[1]), len(H0)
+        shapes = {
+            "G": (states, inputs),
+            "H0": (outputs, states),
+            "H1": (outputs, states),
+            "M": (states, states),
+            "input_delay": (inputs,),
+            "output_delay": (outputs,),
+        }
+        arrays = _arrays(self)
+        for name, shape in shapes.items():
+            if name in arrays and arrays[name].shape != shape:
+                raise ValueError(
+                    f"{name} has shape {arrays[name].shape}, but {states} states, {inputs} inputs "
+                    f"and {outputs} outputs need {shape}: look at F, G and H0 too."
+                )
+        _check_names(self.names, arrays)
+        for name, value in arrays.items():
             if name.endswith("delay"):
                 require_nonnegative(name, value, "a model cannot answer before its input")
             else:
                 require_finite(name, value)
-        _check_mass(self.M)
+        if self.M is not None and is_concrete(self.M):
+            mass = np.asarray(self.M)
+            rows = np.max(np.abs(mass), axis=1, keepdims=True)
+            mass = mass / np.where(rows > 0, rows, 1)
+            columns = np.max(np.abs(mass), axis=0, keepdims=True)
+            mass = mass / np.where(columns > 0, columns, 1)
+            if np.linalg.matrix_rank(mass) < len(mass):
+                raise ValueError(
+                    f"M is {self.M}, which is singular: its rows must determine the derivative of "
+                    "each state. Eliminate states that have no differential equation."
+                )
 
     def frequency_response(
         self, omega: Frequencies
@@ -85,12 +111,22 @@ class StateSpace(eqx.Module):
 
         Infinite at a pole, to within rounding. Differentiable any number of times, in either mode.
         """
-        return _frequency_response(self, as_frequencies(omega))
+        return _evaluate(self, as_frequencies(omega))
 
     def select(self, outputs: Sequence[int], inputs: Sequence[int]) -> "StateSpace":
         """The model of some channels, by position and in the order given."""
         rows, columns = np.array(outputs, int), np.array(inputs, int)
-        moved = [(name, _select_entry(at, outputs, inputs)) for name, at in self.names]
+        axes = {"G": 1, "H0": 0, "H1": 0, "input_delay": 0, "output_delay": 0}
+        names = []
+        for name, entry in self.names:  # where an entry is in the model that is left
+            field, *index = entry.replace("]", "").split("[")
+            place, axis = [int(i) for i in index], axes.get(field)
+            if axis is not None:
+                kept = list(inputs if field in ("G", "input_delay") else outputs)
+                if place[axis] not in kept:
+                    continue
+                place[axis] = kept.index(place[axis])
+            names.append((name, f"{field}{_index(place)}"))
         pick = lambda x, where: None if x is None else x[where]
         return StateSpace(
             F=self.F,
@@ -100,7 +136,7 @@ class StateSpace(eqx.Module):
             M=self.M,
             input_delay=pick(self.input_delay, columns),
             output_delay=pick(self.output_delay, rows),
-            names=[(name, entry) for name, entry in moved if entry],
+            names=names,
         )
 
     def to_control(self, *, pade: int | None = None) -> "control.StateSpace":
@@ -142,7 +178,7 @@ class StateSpace(eqx.Module):
 
         Those of one pair are the zeros of `select([output], [input])`.
         """
-        return transmission_zeros(*_host(self))
+        return _transmission_zeros(*_host(self))
 
     @property
     def lateness(self) -> Float[Array, "outputs inputs"] | None:
@@ -172,11 +208,11 @@ def explicit(
         A, B = solved[:, : len(A)], solved[:, len(A) :]
     if model.H1 is None:
         return A, B, C, jnp.zeros((len(C), B.shape[1]), B.dtype)
-    return A, B, C + _dot(model.H1, A), _dot(model.H1, B)
+    return A, B, C + dot(model.H1, A), dot(model.H1, B)
 
 
 @eqx.filter_jit  # one call of many small operations is slow outside of it
-def _frequency_response(model: StateSpace, omega: Array) -> Array:
+def _evaluate(model: StateSpace, omega: Array) -> Array:
     matrices = Matrices(model.F, model.G, model.H0, model.H1, model.M, model.lateness)
     parts = response(matrices, omega)
     return jnp.moveaxis(jax.lax.complex(parts.real, parts.imag), -1, 0)
@@ -205,48 +241,20 @@ def _arrays(model: StateSpace) -> dict[str, Array]:
     return {name: x for name, x in arrays.items() if x is not None}
 
 
-def _check_shapes(model: StateSpace) -> None:
-    F, G, H0 = model.F, model.G, model.H0
-    if F.ndim != 2 or F.shape[0] != F.shape[1] or not F.size:
-        raise ValueError(f"F has shape {F.shape}: give a square matrix of one row per state.")
-    if G.ndim != 2 or H0.ndim != 2 or not G.shape[1] or not H0.shape[0]:
-        raise ValueError(
-            f"G has shape {G.shape} and H0 {H0.shape}: give matrices, a column of G per input and "
-            "a row of H0 per output."
-        )
-    (states, inputs), outputs = (len(F), G.shape[1]), len(H0)
-    wanted = {
-        "G": (states, inputs),
-        "H0": (outputs, states),
-        "H1": (outputs, states),
-        "M": (states, states),
-        "input_delay": (inputs,),
-        "output_delay": (outputs,),
-    }
-    arrays = _arrays(model)
-    for name, shape in wanted.items():
-        if name in arrays and arrays[name].shape != shape:
-            raise ValueError(
-                f"{name} has shape {arrays[name].shape}, but {states} states, {inputs} inputs and "
-                f"{outputs} outputs need {shape}: look at F, G and H0 too."
-            )
-
-
-def _check_names(model: StateSpace) -> None:
-    if not model.names:
+def _check_names(names: Sequence[tuple[str, str]], arrays: dict[str, Array]) -> None:
+    if not names:
         return
-    arrays = _arrays(model)
     entries = {f"{k}{_index(i)}": k for k, x in arrays.items() for i in np.ndindex(x.shape)}
-    for name, entry in model.names:
+    for name, entry in names:
         if entry not in entries:
-            known = ", ".join(f"{k} {x.shape}" for k, x in arrays.items())
+            shapes = ", ".join(f"{k} {x.shape}" for k, x in arrays.items())
             raise ValueError(
                 f"names gives {name!r} to {entry!r}, which the model does not have: write an entry "
-                f"as 'F[1][1]' or 'input_delay[0]', counted from 0. The model has {known}."
+                f"as 'F[1][1]' or 'input_delay[0]', counted from 0. The model has {shapes}."
             )
         if name.split("[")[0] in arrays or not name:
             raise ValueError(f"The name {name!r} for {entry} is that of an array: choose another.")
-    named = [entry for _, entry in model.names]
+    named = [entry for _, entry in names]
     twice = sorted({entry for entry in named if named.count(entry) > 1})
     if twice:
         raise ValueError(f"names gives {twice[0]} two names: give each entry one.")
@@ -256,34 +264,104 @@ def _index(place: Sequence[int]) -> str:
     return "".join(f"[{i}]" for i in place)
 
 
-def _select_entry(entry: str, outputs: Sequence[int], inputs: Sequence[int]) -> str:
-    """Where an entry is after `StateSpace.select`; empty where it is left out."""
-    field, *index = entry.replace("]", "").split("[")
-    place = [int(i) for i in index]
-    axis = {"G": 1, "H0": 0, "H1": 0, "input_delay": 0, "output_delay": 0}.get(field)
-    if axis is None:
-        return entry
-    kept = inputs if field in ("G", "input_delay") else outputs
-    if place[axis] not in kept:
-        return ""
-    place[axis] = list(kept).index(place[axis])
-    return f"{field}{_index(place)}"
-
-
-def _check_mass(M: Array | None) -> None:
-    if M is None or not is_concrete(M):
-        return
-    mass = np.asarray(M)
-    rows = np.max(np.abs(mass), axis=1, keepdims=True)
-    mass = mass / np.where(rows > 0, rows, 1)
-    columns = np.max(np.abs(mass), axis=0, keepdims=True)
-    mass = mass / np.where(columns > 0, columns, 1)
-    if np.linalg.matrix_rank(mass) < len(mass):
-        raise ValueError(
-            f"M is {M}, which is singular: its rows must determine the derivative of each state. "
-            "Eliminate states that have no differential equation."
-        )
-
-
-def _dot(a: Array, b: Array) -> Array:
+def dot(a: Array, b: Array) -> Array:
+    """The matrix product; a GPU would round float32 products to 10 bits."""
     return jnp.dot(a, b, precision="highest")
+
+
+_RANK = 1e-10  # of the norm, after balancing: below it a singular value is rounding
+
+
+def _transmission_zeros(
+    A: Float[np.ndarray, "states states"],
+    B: Float[np.ndarray, "states inputs"],
+    C: Float[np.ndarray, "outputs states"],
+    D: Float[np.ndarray, "outputs inputs"],
+) -> Inexact[np.ndarray, " zeros"]:
+    """Where the response from all inputs to all outputs loses rank, rad/s.
+
+    Zeros at infinity are taken out beforehand: an eigenvalue solver would scatter them over large
+    finite values. Source: Emami-Naeini & Van Dooren, Automatica 18 (1982), p. 415.
+    """
+    from scipy.linalg import matrix_balance
+
+    # In units of states, inputs and outputs that make the numbers alike.
+    (states, inputs), outputs = B.shape, len(C)
+    loop = np.block(
+        [
+            [A, B, np.zeros((states, outputs))],
+            [np.zeros((inputs, states + inputs)), np.ones((inputs, outputs))],
+            [C, D, np.zeros((outputs, outputs))],
+        ]
+    )
+    unit = np.asarray(matrix_balance(loop, permute=False, separate=True)[1][0])
+    x, u, y = np.split(unit, [states, states + inputs])
+    A, B, C, D = A * x / x[:, None], B * u / x[:, None], C * x / y[:, None], D * u / y[:, None]
+    limit = _RANK * float(np.linalg.norm(np.block([[A, B], [C, D]])))
+    A, B, C, D = _without_rows(A, B, C, D, limit)
+    A, C, B, D = (part.T for part in _without_rows(A.T, C.T, B.T, D.T, limit))
+    return np.linalg.eigvals(A - B @ np.linalg.solve(D, C))
+
+
+def _without_rows(A, B, C, D, limit):
+    """The system with the same finite zeros whose D has independent rows."""
+    while True:
+        left, size, _ = np.linalg.svd(D)
+        rank = int(np.sum(size > limit))
+        C, D = left.T @ C, (left.T @ D)[:rank]
+        free, bound = C[:rank], C[rank:]  # an output of 0 that no input reaches binds states
+        if not bound.size:
+            return A, B, free, D
+        _, size, right = np.linalg.svd(bound)
+        bound_count = int(np.sum(size > limit))
+        if not bound_count:
+            return A, B, free, D
+        A, B, free = right @ A @ right.T, right @ B, free @ right.T
+        C = np.vstack([A[:bound_count, bound_count:], free[:, bound_count:]])
+        D = np.vstack([B[:bound_count], D])
+        A, B = A[bound_count:, bound_count:], B[bound_count:]
+
+
+@runtime_checkable
+class HasPoles(Protocol):
+    """A linear model."""
+
+    @property
+    def poles(self) -> np.ndarray: ...
+
+
+class Mode(NamedTuple):
+    """A real pole, or a pair of complex ones, of which the upper is named."""
+
+    pole: complex  # rad/s
+    frequency: float  # |pole|, rad/s
+    damping: float  # - Re pole / |pole|; NaN for an integrator
+    time_constant: float  # - 1 / Re pole, s; negative if unstable, infinite on the imaginary axis
+
+    def __str__(self) -> str:
+        if self.pole.imag:
+            shape = f"zeta {self.damping:.3g}, omega {self.frequency:.4g} rad/s"
+        else:
+            shape = f"real, {self.pole.real:.4g} rad/s"
+        return f"{shape}, time constant {self.time_constant:.4g} s"
+
+
+def modes(model: HasPoles) -> tuple[Mode, ...]:
+    """Frequency, damping and time constant of each mode of a linear model, slowest first.
+
+    **Arguments:**
+
+    - `model`: has `poles` in rad/s. They are computed by NumPy, so not under jit.
+
+    **Returns:**
+
+    One `Mode` for each real pole and each pair of complex ones.
+    """
+    poles = [complex(pole) for pole in np.asarray(model.poles)]
+    upper = [pole for pole in poles if pole.imag >= 0]
+    result = []
+    for pole in sorted(upper, key=lambda pole: (abs(pole), pole.real)):
+        damping = -pole.real / abs(pole) if abs(pole) else float("nan")
+        constant = -1 / pole.real if pole.real else float("inf")
+        result.append(Mode(pole, abs(pole), damping, constant))
+    return tuple(result)

@@ -1,8 +1,11 @@
-"""Models of one input and one output in s."""
+"""Models of one input and one output in s, and Pade approximations of delays."""
 
 import dataclasses
+import importlib
+import math
 from collections.abc import Sequence
-from typing import Protocol, runtime_checkable, TYPE_CHECKING
+from types import ModuleType
+from typing import NamedTuple, Protocol, runtime_checkable, TYPE_CHECKING
 
 import equinox as eqx
 import jax
@@ -20,9 +23,7 @@ from jaxquad._core import (
     require_positive,
 )
 
-from ._pade import check_order, pade_coefficients, require_package
-from ._protocols import as_floats, as_frequencies, Frequencies
-from ._units import OPTIONAL, Scale, unit
+from ._protocols import as_floats, as_frequencies, Frequencies, OPTIONAL, Scale, unit
 
 
 if TYPE_CHECKING:
@@ -48,14 +49,14 @@ def coefficients_of(
     system: HasCoefficients,
 ) -> tuple[list[list[np.ndarray]], list[list[np.ndarray]]]:
     """Numerators and denominators, outputs per inputs, without leading zeros."""
-    return _rows(system.num), _rows(system.den)
-
-
-def _rows(given: Sequence | np.ndarray) -> list[list[np.ndarray]]:
-    # scipy.signal has one array, a row for each output; python-control rows of arrays.
-    rows = [[row] for row in np.atleast_2d(given)] if isinstance(given, np.ndarray) else given
     trim = lambda x: np.trim_zeros(np.atleast_1d(np.asarray(x, float)), "f")
-    return [[trim(x) if np.any(x) else np.zeros(1) for x in row] for row in rows]
+    polynomials = []
+    for rows in (system.num, system.den):
+        # scipy.signal has one array, a row for each output; python-control rows of arrays.
+        if isinstance(rows, np.ndarray):
+            rows = [[row] for row in np.atleast_2d(rows)]
+        polynomials.append([[trim(x) if np.any(x) else np.zeros(1) for x in row] for row in rows])
+    return polynomials[0], polynomials[1]
 
 
 def require_continuous(dt: float | int | bool | None) -> None:
@@ -75,11 +76,6 @@ def imaginary(omega: Frequencies) -> Complex[Array, "..."]:
     """s = j omega, in the precision of `omega`; whole numbers become floats."""
     omega = as_floats(omega)
     return jax.lax.complex(jnp.zeros_like(omega), omega)
-
-
-def _numerator_scale(model: "TransferFunction", k: int) -> Scale:
-    """With a denominator that starts with 1."""
-    return Scale(model.denominator.size - model.numerator.size + k)
 
 
 class TransferFunction(eqx.Module):
@@ -107,7 +103,9 @@ class TransferFunction(eqx.Module):
     """
 
     numerator: Float[Array, " zeros"] = eqx.field(
-        converter=as_float, metadata=unit(_numerator_scale)
+        converter=as_float,
+        # With a denominator that starts with 1.
+        metadata=unit(lambda model, k: Scale(model.denominator.size - model.numerator.size + k)),
     )
     denominator: Float[Array, " poles"] = eqx.field(
         converter=as_float, metadata=unit(lambda model, k: Scale(k, of_ratio=False))
@@ -120,8 +118,26 @@ class TransferFunction(eqx.Module):
         denominator: ArrayLike | Sequence | None = None,
         delay: ArrayLike = 0.0,
     ):
-        above, below = _coefficients(numerator, denominator)
-        self.numerator, self.denominator = as_float(above), as_float(below)
+        if isinstance(numerator, HasCoefficients):
+            if denominator is not None:
+                raise ValueError(
+                    f"TransferFunction has a {type(numerator).__name__} and a denominator: leave "
+                    "one out."
+                )
+            require_continuous(numerator.dt)
+            above, below = coefficients_of(numerator)
+            if len(above) * len(above[0]) != 1:
+                raise ValueError(
+                    f"The system has {len(above)} outputs and {len(above[0])} inputs: pick one "
+                    "pair, system[0, 0], or convert all with jq.models.from_control."
+                )
+            numerator, denominator = above[0][0], below[0][0]
+        elif denominator is None:
+            raise ValueError(
+                "TransferFunction has a numerator and no denominator: give both, or a transfer "
+                "function of python-control or scipy.signal."
+            )
+        self.numerator, self.denominator = as_float(numerator), as_float(denominator)
         self.delay = as_float(delay)
 
     def __check_init__(self):
@@ -197,34 +213,6 @@ class TransferFunction(eqx.Module):
         return np.roots(np.asarray(self.numerator))
 
 
-Coefficients = ArrayLike | Sequence
-
-
-def _coefficients(
-    system: Coefficients | HasCoefficients, denominator: Coefficients | None
-) -> tuple[Coefficients, Coefficients]:
-    """Numerator and denominator, also of a system in the place of a numerator."""
-    if not isinstance(system, HasCoefficients):
-        if denominator is not None:
-            return system, denominator
-        raise ValueError(
-            "TransferFunction has a numerator and no denominator: give both, or a transfer "
-            "function of python-control or scipy.signal."
-        )
-    if denominator is not None:
-        raise ValueError(
-            f"TransferFunction has a {type(system).__name__} and a denominator: leave one out."
-        )
-    require_continuous(system.dt)
-    above, below = coefficients_of(system)
-    if len(above) * len(above[0]) != 1:
-        raise ValueError(
-            f"The system has {len(above)} outputs and {len(above[0])} inputs: pick one pair, "
-            "system[0, 0], or convert all with jq.models.from_control."
-        )
-    return above[0][0], below[0][0]
-
-
 def _rational(model: TransferFunction, pade: int | None) -> tuple[np.ndarray, np.ndarray]:
     """Numerator and denominator with the delay approximated."""
     above, below, delay = (
@@ -233,7 +221,7 @@ def _rational(model: TransferFunction, pade: int | None) -> tuple[np.ndarray, np
     check_order(delay, pade)
     if pade is None or not delay:
         return above, below
-    over, under = pade_coefficients(float(delay), pade)
+    over, under = _pade_coefficients(float(delay), pade)
     return np.convolve(above, over), np.convolve(below, under)
 
 
@@ -383,3 +371,98 @@ class AttitudeAxis(eqx.Module):
         """The same axis carrying a known extra `inertia` in kg m^2."""
         J_x, added = on_host((self.J_x, as_float(inertia)))
         return dataclasses.replace(self, J_x=J_x + added)
+
+
+_MOST_ORDER = 10  # above it the coefficients lose digits
+
+
+class Explicit(NamedTuple):
+    """x' = A x + B u, y = C x + D u."""
+
+    A: Float[np.ndarray, "states states"]
+    B: Float[np.ndarray, "states inputs"]
+    C: Float[np.ndarray, "outputs states"]
+    D: Float[np.ndarray, "outputs inputs"]
+
+
+def require_package(name: str) -> ModuleType:
+    """A package of the extra `interop`; ImportError with the line that installs it."""
+    try:
+        return importlib.import_module(name)
+    except ImportError as error:
+        raise ImportError(
+            f"{name} is not installed: run pip install 'jaxquad[interop]', or pip install {name}."
+        ) from error
+
+
+def check_order(delay: Float[np.ndarray, "..."], pade: int | None) -> None:
+    """Raise ValueError for delays without an order, and for an order that loses digits."""
+    if pade is not None and not 1 <= pade <= _MOST_ORDER:
+        raise ValueError(
+            f"pade is {pade}: give an order of 1 to {_MOST_ORDER}, or None for no delay."
+        )
+    longest = float(np.max(delay, initial=0.0))
+    if longest and pade is None:
+        # omega times delay at which a phase of order 3 is 1 deg off, by its first term.
+        first = math.factorial(3) ** 2 / (math.factorial(6) * math.factorial(7))
+        limit = (math.radians(1.0) / first) ** (1 / 7) / longest
+        raise ValueError(
+            f"The model has a delay of {longest:.4g} s, and a rational model has none: give the "
+            f"order of a Pade approximation. pade=3 is within 1 deg of it up to {limit:.3g} rad/s "
+            f"({limit / (2 * math.pi):.3g} Hz). Or set the delay to 0 with dataclasses.replace."
+        )
+
+
+def _pade_coefficients(
+    delay: float, order: int
+) -> tuple[Float[np.ndarray, " powers"], Float[np.ndarray, " powers"]]:
+    """Numerator and denominator of exp(-delay s), the highest power of s first.
+
+    Source: Golub & Van Loan, Matrix Computations, section 9.3.1.
+    """
+    counts = np.arange(order, -1, -1)
+    choose = lambda k: math.comb(order, k) * math.factorial(2 * order - k)
+    terms = np.array([choose(int(k)) / math.factorial(2 * order) for k in counts])
+    below = terms * delay**counts
+    return below * (-1.0) ** counts, below
+
+
+def without_delays(
+    model: Explicit,
+    by_input: Float[np.ndarray, " inputs"],
+    by_output: Float[np.ndarray, " outputs"],
+    order: int,
+) -> Explicit:
+    """The model between approximations of its delays (s)."""
+    return _series(_series(_bank(by_input, order), model), _bank(by_output, order))
+
+
+def _bank(delays: Float[np.ndarray, " channels"], order: int) -> Explicit:
+    """Approximations side by side; no states where there is no delay."""
+    late = np.flatnonzero(delays)
+    count = late.size * order
+    A, B = np.zeros((count, count)), np.zeros((count, delays.size))
+    C, D = np.zeros((delays.size, count)), np.eye(delays.size)
+    # One approximation in time measured in delays, so that no digit is lost.
+    above, below = _pade_coefficients(1.0, order)
+    above, below = above / below[0], below / below[0]
+    first = np.eye(order)[0]
+    companion = np.eye(order, k=-1) - np.outer(first, below[1:])
+    for k, channel in enumerate(late):
+        block = slice(k * order, (k + 1) * order)
+        A[block, block] = companion / delays[channel]
+        B[block, channel] = first / delays[channel]
+        C[channel, block] = above[1:] - above[0] * below[1:]
+    D[late, late] = (-1.0) ** order
+    return Explicit(A, B, C, D)
+
+
+def _series(first: Explicit, second: Explicit) -> Explicit:
+    """The outputs of `first` drive the inputs of `second`."""
+    none = np.zeros((len(first.A), len(second.A)))
+    return Explicit(
+        np.block([[first.A, none], [second.B @ first.C, second.A]]),
+        np.concatenate([first.B, second.B @ first.D]),
+        np.concatenate([second.D @ first.C, second.C], axis=1),
+        second.D @ first.D,
+    )

@@ -31,25 +31,31 @@ from ._hardware import (
 )
 from ._memory import in_slices as in_slices
 from ._metrics import Metrics as Metrics, Spread as Spread, Summary as Summary
-from ._over_cores import over_cores as over_cores
-from ._over_devices import (
+from ._parallel import (
     asked_devices as asked_devices,
     Devices as Devices,
     devices_for as devices_for,
     loop_over_devices as loop_over_devices,
     may_be_several as may_be_several,
+    over_cores as over_cores,
     over_devices as over_devices,
     placed as placed,
 )
-from ._references import (
+from ._scenario import excite as excite, Scenario as Scenario, scenario as scenario
+from ._signal import (
+    Clock as Clock,
+    Motion as Motion,
     Ramp as Ramp,
     ReferenceModel as ReferenceModel,
+    Signal as Signal,
     Sine as Sine,
     SmoothStep as SmoothStep,
     Step as Step,
 )
-from ._run import check_run as check_run, scan_loop as scan_loop
-from ._scenario import excite as excite, Scenario as Scenario, scenario as scenario
-from ._signal import Clock as Clock, Motion as Motion, Signal as Signal
-from ._simulate import simulate as simulate, Simulation as Simulation
+from ._simulate import (
+    check_run as check_run,
+    scan_loop as scan_loop,
+    simulate as simulate,
+    Simulation as Simulation,
+)
 from ._step import runge_kutta as runge_kutta, SampleResult as SampleResult

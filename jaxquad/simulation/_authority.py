@@ -84,13 +84,13 @@ def authority(
 
     **Raises:** ValueError for a plant whose torque per unit of command is not known.
     """
-    found = eqx.filter_jit(find_authority)(plant, drive, controller)
-    if found is None:
+    result = eqx.filter_jit(find_authority)(plant, drive, controller)
+    if result is None:
         raise ValueError(
             f"a {type(plant).__name__} has no torque_gain [axes] in N m per unit of command: add "
             "one, as jq.DecoupledAxes has"
         )
-    return found
+    return result
 
 
 def find_authority(
@@ -108,29 +108,34 @@ def find_authority(
     return Authority(gain, command, *(jnp.multiply(*_same(gain, x)) for x in limits))
 
 
-def warn_beyond_authority(found: Authority | None, scenario: Scenario) -> None:
+def warn_beyond_authority(drive_authority: Authority | None, scenario: Scenario) -> None:
     """Warn of disturbances that no controller can hold. Silent for traced values."""
-    for message in beyond_authority(found, scenario):
+    for message in beyond_authority(drive_authority, scenario):
         warnings.warn(message, AuthorityWarning, stacklevel=3)
 
 
-def beyond_authority(found: Authority | None, scenario: Scenario) -> list[str]:
+def beyond_authority(drive_authority: Authority | None, scenario: Scenario) -> list[str]:
     """What to say of disturbances that no controller can hold; nothing for traced values."""
-    if found is None or not (is_concrete(scenario.disturbance) and is_concrete(found.torque)):
+    if drive_authority is None or not (
+        is_concrete(scenario.disturbance) and is_concrete(drive_authority.torque)
+    ):
         return []
     torque = np.abs(np.asarray(scenario.disturbance))
     limits = (
-        (np.asarray(found.torque), "that the drive has: no controller holds the angle there"),
-        (np.asarray(found.forward), "that the motors give without turning backwards"),
+        (
+            np.asarray(drive_authority.torque),
+            "that the drive has: no controller holds the angle there",
+        ),
+        (np.asarray(drive_authority.forward), "that the motors give without turning backwards"),
     )
     if all(torque.max(initial=0.0) <= limit.min(initial=np.inf) for limit, _ in limits):
         return []
     messages = []
     for k, name in enumerate(axis_names(torque.shape[1])):
         for limit, what in limits:
-            least, asked = limit[min(k, len(limit) - 1)], torque[:, k]
-            asked = asked.reshape(asked.shape + (1,) * (least.ndim + 1 - asked.ndim))
-            share = np.mean(asked > (1 + 1e-6) * least)
+            least, demanded = limit[min(k, len(limit) - 1)], torque[:, k]
+            demanded = demanded.reshape(demanded.shape + (1,) * (least.ndim + 1 - demanded.ndim))
+            share = np.mean(demanded > (1 + 1e-6) * least)
             if share:
                 messages.append(
                     f"the disturbance of {name} reaches {torque[:, k].max():.4g} N m: "
@@ -154,12 +159,12 @@ def _drive_limit(
         return jnp.full_like(like, jnp.inf)
     members = jnp.broadcast_shapes(like.shape[1:], ensemble_shape(drive))
     wide = jnp.zeros((like.shape[0], *members), like.dtype)
-    given = []
+    limits = []
     for k, unit in enumerate(jnp.eye(like.shape[0], dtype=like.dtype)):
         command = _ALL * jnp.broadcast_to(align(unit, wide), wide.shape)
         both = [drive.achieved(drive.inputs(sign * command))[k] for sign in (1.0, -1.0)]
-        given.append(jnp.minimum(*(jnp.abs(x) for x in both)))
-    most = jnp.stack(given)
+        limits.append(jnp.minimum(*(jnp.abs(x) for x in both)))
+    most = jnp.stack(limits)
     return jnp.where(most < 0.99 * _ALL, most, jnp.inf)
 
 

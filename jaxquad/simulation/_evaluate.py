@@ -20,11 +20,9 @@ from ._flight_metrics import (
     window,
 )
 from ._metrics import Metrics, NUMBERS
-from ._over_cores import over_cores
-from ._over_devices import DeviceChoice, Devices, loop_over_devices, placed, Run
-from ._run import check_run, scan_loop
+from ._parallel import DeviceChoice, Devices, loop_over_devices, over_cores, placed, Run
 from ._scenario import Scenario
-from ._simulate import Simulation
+from ._simulate import check_run, scan_loop, Simulation
 
 
 class _Sample(NamedTuple):
@@ -107,8 +105,8 @@ def evaluate(
     place = window(len(scenario.reference), loop.dt, start=start, stop=stop, load_start=load_start)
     span = Window(*map(jnp.asarray, place))
     run, places = placed(loop, scenario, devices)
-    found, numbers = over_cores(_run, run, (span,), places)
-    warn_beyond_authority(found, scenario)
+    drive_authority, numbers = over_cores(_run, run, (span,), places)
+    warn_beyond_authority(drive_authority, scenario)
     return _metrics(numbers, place, loop.dt)
 
 
@@ -121,25 +119,25 @@ def _metrics(numbers: dict[str, PyTree], place: tuple[int, int, int, int], dt: f
 def _run(
     loop: Loop, scenario: Scenario, span: Window, devices: Devices | None = None
 ) -> tuple[Authority | None, dict[str, Array]]:
-    found = find_authority(loop.plant, loop.drive, loop.controller)
-    return found, loop_over_devices(_measure, (loop, scenario), span, devices)
+    drive_authority = find_authority(loop.plant, loop.drive, loop.controller)
+    return drive_authority, loop_over_devices(_measure, (loop, scenario), span, devices)
 
 
 def _measure(run: Run, span: Window) -> dict[str, Array]:
     loop, scenario = run
-    found = find_authority(loop.plant, loop.drive, loop.controller)
-    gain = None if found is None else found.torque_gain
-    sums = _accumulator(scenario, span, loop.dt, found, gain)
+    drive_authority = find_authority(loop.plant, loop.drive, loop.controller)
+    gain = None if drive_authority is None else drive_authority.torque_gain
+    sums = _accumulator(scenario, span, loop.dt, drive_authority, gain)
     total, _, running = scan_loop(loop, scenario, sums)
-    return _numbers(sums, total, ~running, scenario, found)
+    return _numbers(sums, total, ~running, scenario, drive_authority)
 
 
 @eqx.filter_jit
 def _replay(simulation: Simulation, span: Window, gain: Array | None) -> dict[str, Array]:
-    scenario, found = simulation.scenario, simulation.authority
-    if gain is None and found is not None:
-        gain = found.torque_gain
-    sums = _accumulator(scenario, span, simulation.dt, found, gain)
+    scenario, drive_authority = simulation.scenario, simulation.authority
+    if gain is None and drive_authority is not None:
+        gain = drive_authority.torque_gain
+    sums = _accumulator(scenario, span, simulation.dt, drive_authority, gain)
     index = jnp.arange(simulation.angle.shape[0])
     stored = (simulation.angle, simulation.command, simulation.saturated, simulation.signals)
     signals = (index, scenario.reference, scenario.disturbance, *stored)
@@ -153,14 +151,14 @@ def _replay(simulation: Simulation, span: Window, gain: Array | None) -> dict[st
 
     start = sums.begin(jnp.zeros_like(simulation.angle[0]))
     total, _ = scan_members(sample, start, arrays, signals)
-    return _numbers(sums, total, simulation.diverged, scenario, found)
+    return _numbers(sums, total, simulation.diverged, scenario, drive_authority)
 
 
 def _accumulator(
     scenario: Scenario,
     span: Window,
     dt: float,
-    found: Authority | None,
+    drive_authority: Authority | None,
     torque_gain: Array | None,
 ) -> FlightMetrics:
     return FlightMetrics(
@@ -170,7 +168,7 @@ def _accumulator(
         steps=find_steps(scenario.reference, [(span.first, span.until)]),
         from_first=jnp.asarray(span.first == 0),
         torque_gain=torque_gain,
-        limit=None if found is None else found.command,
+        limit=None if drive_authority is None else drive_authority.command,
     )
 
 
@@ -179,7 +177,7 @@ def _numbers(
     total: Sums,
     diverged: Bool[Array, "*ensemble"],
     scenario: Scenario,
-    found: Authority | None,
+    drive_authority: Authority | None,
 ) -> dict[str, Array]:
     """What `Metrics` hold, of finished sums and of what the scenario asks of the drive."""
     values = sums.finish(total)
@@ -187,8 +185,8 @@ def _numbers(
         values[name] = jnp.where(diverged[None], jnp.nan, values[name])
     like, torque = values["itae"], scenario.disturbance
     shares = [jnp.full_like(like, jnp.nan)] * 2
-    if found is not None:
-        limits = (found.torque, found.forward)
+    if drive_authority is not None:
+        limits = (drive_authority.torque, drive_authority.forward)
         shares = [widened(share_beyond(x, torque, sums.window), like) for x in limits]
     named = {"beyond_authority": shares[0], "reversing": shares[1], "diverged": diverged}
     return values | named

@@ -64,7 +64,7 @@ class Steps(NamedTuple):
     first: Sequence[Int[Array, ""] | int]  # sample of each part at which it starts
     target: Float[Array, "parts axes ..."]  # rad, where the reference ends
     before: Float[Array, "parts axes ..."]  # rad, where it was before
-    known: Bool[Array, "parts axes ..."]  # whether the reference makes one step
+    is_single: Bool[Array, "parts axes ..."]  # whether the reference makes one step
 
 
 def find_steps(
@@ -75,8 +75,8 @@ def find_steps(
     start = lambda a: jnp.where(a == 0, 0.0, reference[jnp.maximum(a - 1, 0)])
     before = jnp.stack([start(a) for a, _ in parts])
     target = jnp.stack([reference[b] for _, b in parts])
-    known = jnp.stack([_makes_step(reference, a, b) for a, b in parts])
-    return Steps([a for a, _ in parts], target, before, known)
+    is_single = jnp.stack([_makes_step(reference, a, b) for a, b in parts])
+    return Steps([a for a, _ in parts], target, before, is_single)
 
 
 def _makes_step(
@@ -223,13 +223,13 @@ class _Moment:
     def step(self) -> tuple[Array, Array, Array]:
         """Where the reference goes, where it was before, and whether that is a step."""
         stacks = self.of.steps[1:]
-        held = [widened(x[0], self.now.angle) for x in stacks]
+        values = [widened(x[0], self.now.angle) for x in stacks]
         for k, first in enumerate(self.of.steps.first[1:], 1):
             later = [widened(x[k], self.now.angle) for x in stacks]
-            held = [
-                jnp.where(self.now.index >= first, b, a) for a, b in zip(held, later, strict=True)
+            values = [
+                jnp.where(self.now.index >= first, b, a) for a, b in zip(values, later, strict=True)
             ]
-        return held[0], held[1], held[2]
+        return values[0], values[1], values[2]
 
     @ft.cached_property
     def before(self) -> Array:
@@ -272,10 +272,10 @@ def _saturated(at: _Moment) -> Array:
     limit, command = widened(at.of.limit, now.angle), jnp.abs(now.command)
     if not at.of.smooth:  # A controller that knows its limit asks the drive for no more.
         return (now.saturated | (command >= (1 - _CLOSE) * limit)).astype(dtype)
-    known = jnp.isfinite(limit)
-    used = command / jnp.where(known, limit, 1)
+    is_finite = jnp.isfinite(limit)
+    used = command / jnp.where(is_finite, limit, 1)
     share = jax.nn.sigmoid((used - (1 - 2 * _SOFTNESS)) / (0.4 * _SOFTNESS))
-    return jnp.where(known, share, 0)
+    return jnp.where(is_finite, share, 0)
 
 
 def _overshoot(at: _Moment, greatest: Array) -> Array:
@@ -346,7 +346,7 @@ def _step_size(of: FlightMetrics, sums: Sums) -> Array:
 
 def _stepped(of: FlightMetrics, sums: Sums) -> Array:
     size = _step_size(of, sums)
-    return widened(of.steps.known[-1], size) & (size != 0)
+    return widened(of.steps.is_single[-1], size) & (size != 0)
 
 
 def _final_overshoot(of: FlightMetrics, sums: Sums) -> Array:

@@ -45,11 +45,11 @@ def size_of(tree: PyTree) -> int:
 def free_memory(device: Device) -> float | None:
     """In bytes; of the host for a CPU."""
     if device.platform != "cpu":
-        known = device.memory_stats() or {}
-        limit = known.get("bytes_limit")
-        return None if limit is None else limit - known.get("bytes_in_use", 0)
-    found = [x for x in (_available(), _container_limit()) if x is not None]
-    return min(found, default=None)
+        stats = device.memory_stats() or {}
+        limit = stats.get("bytes_limit")
+        return None if limit is None else limit - stats.get("bytes_in_use", 0)
+    free = [x for x in (_available(), _container_limit()) if x is not None]
+    return min(free, default=None)
 
 
 def _available() -> float | None:

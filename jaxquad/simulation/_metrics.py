@@ -272,8 +272,8 @@ def _text(x: float) -> str:
 def remarks(metrics: "Metrics") -> list[str]:
     """Why a number is missing, who diverged, and what the drive cannot do."""
     names = axis_names(metrics.itae.shape[0])
-    found = _divergence(metrics) + _steps(metrics, names)
-    return found + _estimate(metrics) + _torque(metrics, names)
+    texts = _divergence(metrics) + _steps(metrics, names)
+    return texts + _estimate(metrics) + _torque(metrics, names)
 
 
 def _divergence(metrics: "Metrics") -> list[str]:
@@ -288,9 +288,9 @@ def _steps(metrics: "Metrics", names: tuple[str, ...]) -> list[str]:
     stepped = _flat(metrics.stepped)
     missing = ~stepped.any(axis=1) & ~at_rest(metrics)
     without = [name for name, there in zip(names, missing, strict=True) if there]
-    found = []
+    texts = []
     if without:
-        found.append(
+        texts.append(
             f"{', '.join(without)}: the reference makes no step that it holds, hence no "
             "overshoot, rise or settling"
         )
@@ -299,8 +299,8 @@ def _steps(metrics: "Metrics", names: tuple[str, ...]) -> list[str]:
         ("settling_time", "is outside 2 % of the step at the end"),
     ):
         never = np.isnan(_flat(vars(metrics)[field])) & stepped
-        found += _shares(names, never.mean(axis=1), what, never.shape[1])
-    return found
+        texts += _shares(names, never.mean(axis=1), what, never.shape[1])
+    return texts
 
 
 def _shares(names: tuple[str, ...], shares: np.ndarray, what: str, members: int) -> list[str]:
@@ -320,7 +320,7 @@ def _estimate(metrics: "Metrics") -> list[str]:
 
 
 def _torque(metrics: "Metrics", names: tuple[str, ...]) -> list[str]:
-    found = []
+    texts = []
     for field, what in (
         ("beyond_authority", "exceed the torque of the drive"),
         ("reversing", "need motors that turn backwards"),
@@ -328,8 +328,8 @@ def _torque(metrics: "Metrics", names: tuple[str, ...]) -> list[str]:
         shares = np.nan_to_num(_flat(vars(metrics)[field])).mean(axis=1)
         where = [f"{x:.1%} on {name}" for name, x in zip(names, shares, strict=True) if x]
         if where:
-            found.append(f"disturbances {what}: samples {', '.join(where)}")
-    return found
+            texts.append(f"disturbances {what}: samples {', '.join(where)}")
+    return texts
 
 
 def _flat(values: ArrayLike) -> np.ndarray:

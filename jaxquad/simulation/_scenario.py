@@ -75,8 +75,8 @@ class Scenario(eqx.Module):
     @property
     def parts(self) -> dict[str, PyTree]:
         """The arrays that are given, by name."""
-        given = {name: part for name, part in vars(self).items() if name != "dt"}
-        return {name: part for name, part in given.items() if part is not None}
+        named = {name: part for name, part in vars(self).items() if name != "dt"}
+        return {name: part for name, part in named.items() if part is not None}
 
     @property
     def ensemble(self) -> tuple[int, ...]:
@@ -136,11 +136,11 @@ def scenario(
     names = _names(axes)
     members = (ensemble,) if isinstance(ensemble, int) else tuple(ensemble)
     clock = Clock(whole_samples("duration", duration, 1 / dt, fewest=2), dt, members)
-    given = (reference, injection, disturbance, noise, payload)
-    _require_room(given, clock, len(names))
+    signals = (reference, injection, disturbance, noise, payload)
+    _require_room(signals, clock, len(names))
     parts = {
         name: _sampled(name, part, names, clock, _fold(key, k))
-        for k, (name, part) in enumerate(zip(_PARTS, given, strict=True))
+        for k, (name, part) in enumerate(zip(_PARTS, signals, strict=True))
     }
     arrays = {name: _stack(name, "value", part, clock) for name, part in parts.items()}
     if payload is None:
@@ -151,9 +151,9 @@ def scenario(
     return Scenario(**arrays, dt=float(dt))
 
 
-def _require_room(given: tuple[Given, ...], clock: Clock, axes: int) -> None:
+def _require_room(parts: tuple[Given, ...], clock: Clock, axes: int) -> None:
     """For what each member draws for itself: as columns, and then side by side."""
-    signals = [list(x.values()) if isinstance(x, Mapping) else [x] for x in given]
+    signals = [list(x.values()) if isinstance(x, Mapping) else [x] for x in parts]
     drawn = sum(any(isinstance(x, Signal) and x.random for x in part) for part in signals)
     numbers = drawn * clock.samples * axes * math.prod(clock.ensemble)
     what = f"a scenario of {clock.samples} samples for {math.prod(clock.ensemble)} members"
@@ -172,12 +172,12 @@ def _names(axes: int | Sequence[str]) -> tuple[str, ...]:
 
 
 def _sampled(
-    name: str, given: Given, names: tuple[str, ...], clock: Clock, key: Key[Array, ""] | None
+    name: str, part: Given, names: tuple[str, ...], clock: Clock, key: Key[Array, ""] | None
 ) -> list[Motion | None]:
-    if given is not None and not isinstance(given, Mapping):
-        given = dict.fromkeys(names, given)
-    signals = {_place(name, axis, names): x for axis, x in (given or {}).items()}
-    if len(signals) < len(given or {}):
+    if part is not None and not isinstance(part, Mapping):
+        part = dict.fromkeys(names, part)
+    signals = {_place(name, axis, names): x for axis, x in (part or {}).items()}
+    if len(signals) < len(part or {}):
         raise ValueError(f"{name}: an axis is given twice, by name and by number")
     return [
         _motion(f"{name} of {axis}", signals[k], clock, _fold(key, k)) if k in signals else None
@@ -199,9 +199,9 @@ def _fold(key: Key[Array, ""] | None, k: int) -> Key[Array, ""] | None:
     return None if key is None else jax.random.fold_in(key, k)
 
 
-def _motion(what: str, given: One, clock: Clock, key: Key[Array, ""] | None) -> Motion:
+def _motion(what: str, one: One, clock: Clock, key: Key[Array, ""] | None) -> Motion:
     try:
-        return as_signal(given).sample(clock, key)
+        return as_signal(one).sample(clock, key)
     except ValueError as error:
         raise ValueError(f"{what}: {error}") from error
 

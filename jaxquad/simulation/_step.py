@@ -1,3 +1,9 @@
+"""One sample of a loop, and what keeps an unstable one finite in values and derivatives.
+
+A member whose angle leaves the bound, or whose numbers grow beyond all measure, is held where it
+was from then on.
+"""
+
 import functools as ft
 from collections.abc import Callable
 from typing import cast, NamedTuple
@@ -5,8 +11,10 @@ from typing import cast, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
+from jaxquad._compile import KEPT, Queue
 from jaxquad._core import align
 from jaxquad.control import Reference, Setpoint
 from jaxquad.loops import (
@@ -22,8 +30,7 @@ from jaxquad.loops import (
     signals_of,
 )
 
-from ._delay import delay_line, DelayLine, Queue
-from ._guard import are_numbers, are_tame, choose, within
+from ._hardware import delay_line, DelayLine
 from ._scenario import Scenario
 
 
@@ -108,7 +115,7 @@ class SampleResult(NamedTuple):
     angle: Float[Array, " axes *ensemble"]  # true, rad
     measurement: Float[Array, " axes *ensemble"]  # rad
     reference: Float[Array, " axes *ensemble"]  # rad
-    asked: Float[Array, " axes *ensemble"]  # of the drive, by controller and injection
+    requested: Float[Array, " axes *ensemble"]  # of the drive, by controller and injection
     command: Float[Array, " axes *ensemble"]  # achieved
     saturated: Bool[Array, " axes *ensemble"]  # the drive gave less than was asked
     injection: Float[Array, " axes *ensemble"]
@@ -163,7 +170,7 @@ class LoopStep(eqx.Module):
         fine = carry.running & jnp.all(jnp.abs(angle) <= bound, axis=0)
         angle = within(angle, bound)
         measurement = self._measured(angle + happens.noise)
-        memory, asked, inputs, achieved, fine = self._answer(carry, measurement, happens, fine)
+        memory, requested, inputs, achieved, fine = self._answer(carry, measurement, happens, fine)
         felt, signals = inputs if oldest is None else oldest, signals_of(self.controller, memory)
         following = self._move(carry, memory, felt, happens, fine)
         if oldest is not None:
@@ -174,9 +181,9 @@ class LoopStep(eqx.Module):
             angle=angle,
             measurement=measurement,
             reference=happens.reference,
-            asked=asked,
+            requested=requested,
             command=jnp.where(fine, achieved, 0),
-            saturated=_falls_short(asked, achieved),
+            saturated=_falls_short(requested, achieved),
             injection=happens.injection,
             disturbance=happens.disturbance,
             signals={name: _wide_signal(x, angle) for name, x in signals.items()},
@@ -197,17 +204,17 @@ class LoopStep(eqx.Module):
         memory, command = self.controller.step(carry.memory, _setpoint(happens), measurement)
         _require_shape(command, measurement)
         fine = fine & are_tame(command, self.ensemble)
-        asked = jnp.where(fine, command, 0) + happens.injection
-        inputs, achieved = self._driven(asked)
+        requested = jnp.where(fine, command, 0) + happens.injection
+        inputs, achieved = self._driven(requested)
         memory = after_drive(self.controller, memory, achieved)
         fine = fine & are_numbers(memory, self.ensemble)
-        return choose(fine, memory, carry.memory, self.ensemble), asked, inputs, achieved, fine
+        return choose(fine, memory, carry.memory, self.ensemble), requested, inputs, achieved, fine
 
     def _move(
         self, carry: Carry, memory: PyTree, inputs: Array, happens: Scenario, fine: Array
     ) -> Carry:
         """To the next sample, unless it leads out of what can be computed on."""
-        past, state = self._held(carry, inputs, happens)
+        past, state = self._integrate(carry, inputs, happens)
         runs = fine & are_tame(state, self.ensemble)
         if isinstance(self.plant, ChecksState):
             runs = runs & self.plant.is_resolved(state)
@@ -223,7 +230,7 @@ class LoopStep(eqx.Module):
         inputs = self.drive.inputs(command)
         return inputs, self.drive.achieved(inputs)
 
-    def _held(
+    def _integrate(
         self, carry: Carry, inputs: Float[Array, " inputs *ensemble"], happens: Scenario
     ) -> tuple[Array | None, PyTree]:
         """The inputs on their way and the plant's state, both at the next sample."""
@@ -305,6 +312,98 @@ def widen(x: Float[Array, "axes ..."], like: Float[Array, " axes *ensemble"]) ->
     return jnp.broadcast_to(align(x, like), like.shape).astype(like.dtype)
 
 
-def _falls_short(asked: Array, achieved: Array) -> Bool[Array, " axes *ensemble"]:
-    rounding = 1e3 * float(jnp.finfo(asked.dtype).eps)
-    return jnp.abs(asked - achieved) > rounding * (1 + jnp.abs(asked))
+def _falls_short(requested: Array, achieved: Array) -> Bool[Array, " axes *ensemble"]:
+    rounding = 1e3 * float(jnp.finfo(requested.dtype).eps)
+    return jnp.abs(requested - achieved) > rounding * (1 + jnp.abs(requested))
+
+
+# In SI units no angle, rate, voltage or squared rotor speed comes near it.
+VAST = 1e9
+
+
+def within(x: Float[Array, " axes *ensemble"], bound: float) -> Float[Array, " axes *ensemble"]:
+    """`x` kept within +-`bound`, and without a nan."""
+    return jnp.clip(jnp.where(jnp.isnan(x), bound, x), -bound, bound)
+
+
+def are_tame(tree: PyTree, ensemble: tuple[int, ...]) -> Bool[Array, "*ensemble"]:
+    """Whether every float of a member is finite and not vast."""
+    return _members(tree, ensemble, lambda x: jnp.abs(x) <= VAST)
+
+
+def are_numbers(tree: PyTree, ensemble: tuple[int, ...]) -> Bool[Array, "*ensemble"]:
+    """Whether no float of a member is nan (inf may be a bound or a spread that is not known)."""
+    return _members(tree, ensemble, lambda x: ~jnp.isnan(x))
+
+
+def are_sound(tree: PyTree) -> Bool[Array, ""]:
+    """Whether the first number of every array is one."""
+    firsts = [jnp.ravel(x)[:1] for x in jax.tree.leaves(tree)]
+    checks = [jnp.all(x == x) for x in firsts]
+    return ft.reduce(jnp.logical_and, checks, jnp.ones((), bool))
+
+
+def choose(
+    fresh: Bool[Array, "*ensemble"], new: PyTree, old: PyTree, ensemble: tuple[int, ...]
+) -> PyTree:
+    """Per member the `new` numbers or the `old`; what all members share is always new.
+
+    So is a single integer, such as a count of samples, in a single loop, too: what happens at some
+    samples only (`jax.lax.cond`) then stays so for all that are batched by `jax.vmap`.
+    """
+
+    def leaf(new: Array, old: Array) -> Array:
+        count = new.ndim == 0 and jnp.issubdtype(new.dtype, jnp.integer)
+        if count or not _is_per_member(new, ensemble):
+            return new
+        return jnp.where(fresh.reshape((1,) * (new.ndim - fresh.ndim) + ensemble), new, old)
+
+    return jax.tree.map(leaf, new, old)
+
+
+@ft.partial(jax.custom_jvp, nondiff_argnums=(0, 1))
+def guarded(
+    sample: Callable[..., PyTree], ensemble: tuple[int, ...], rest: PyTree, *args: PyTree
+) -> PyTree:
+    """`sample(*args)`, whose derivatives are those of the members that run after it.
+
+    The first of `args` is the carry, which tells who runs; `rest` is one that is safe to step from.
+    Reverse mode multiplies by a derivative even where its result is thrown away, and 0 * inf is
+    nan. So the sample of a member that is held is differentiated at `rest`, and the result is 0.
+    """
+    return sample(*args)
+
+
+@guarded.defjvp
+def _guarded_jvp(sample, ensemble, primals, tangents):
+    rest, carry, *others = primals
+    following, result = sample(carry, *others)
+    runs = _keep(following.running)
+    out = following._replace(running=runs), jax.tree.map(_keep, result)
+    carry = choose(runs, carry, rest, ensemble)
+    moved = jax.jvp(sample, (carry, *others), tangents[1:])[1]
+    still = jax.tree.map(lambda t: t if _is_void(t) else jnp.zeros_like(t), moved)
+    return out, choose(runs, moved, still, ensemble)
+
+
+def _keep(x: Array) -> Array:
+    """For reverse mode: who runs, and what was measured."""
+    return checkpoint_name(x, KEPT)
+
+
+def _is_void(tangent: Array) -> bool:
+    """Of an integer, which has no tangent."""
+    return tangent.dtype == jax.dtypes.float0
+
+
+def _members(tree: PyTree, ensemble: tuple[int, ...], valid) -> Bool[Array, "*ensemble"]:
+    checks = [jnp.ones(ensemble, bool)]
+    for x in jax.tree.leaves(tree):
+        if jnp.issubdtype(x.dtype, jnp.floating) and _is_per_member(x, ensemble):
+            checks.append(jnp.all(valid(x), axis=tuple(range(x.ndim - len(ensemble)))))
+    return ft.reduce(jnp.logical_and, checks)
+
+
+def _is_per_member(x: Array, ensemble: tuple[int, ...]) -> bool:
+    shared = x.ndim - len(ensemble)
+    return shared >= 0 and x.shape[shared:] == ensemble and not _is_void(x)

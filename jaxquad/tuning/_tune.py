@@ -360,7 +360,7 @@ def require_steps(problem: Problem, wanted: frozenset[str]) -> None:
     if "overshoot" not in wanted:
         return
     steps = find_steps(problem.flight.reference, problem.parts)
-    if not np.any(np.asarray(steps.known & (steps.target != steps.before))):
+    if not np.any(np.asarray(steps.is_single & (steps.target != steps.before))):
         raise ValueError(
             "overshoot is wanted, but the reference makes no step from event to event: give a "
             "scenario with one, and its times as Objective(events=...)"

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from jaxquad import LADRC
-from jaxquad._compile import _programs, Jit, KeptPrograms
+from jaxquad._compile import _programs, KeptPrograms
 
 
 ARGUMENTS = LADRC(10.0, 30.0, 0.85, dt=0.002), jnp.arange(3.0)
@@ -46,16 +46,12 @@ def traced(monkeypatch, tmp_path):
     return []
 
 
-def scaled_by(traced):
+def kept(traced):
     def scaled(controller, values, power=2):
         traced.append(power)
         return {"values": controller.wc * values.astype(float) ** power, "wc": controller.wc}
 
-    return scaled
-
-
-def kept(traced):
-    return KeptPrograms(scaled_by(traced), dict)
+    return KeptPrograms(scaled, dict)
 
 
 def test_a_program_is_found_again_without_tracing(traced):
@@ -64,15 +60,6 @@ def test_a_program_is_found_again_without_tracing(traced):
     assert traced == [2]
     np.testing.assert_array_equal(first["values"], 10 * np.arange(3.0) ** 2)
     assert first["wc"] == again["wc"] and np.array_equal(first["values"], again["values"])
-
-
-def test_what_was_begun_is_compiled_by_the_first_call(traced):
-    begun = Jit(scaled_by(traced), dict)
-    begun.begin(*ARGUMENTS)
-    assert begun(*ARGUMENTS)["wc"] == 10.0 and traced == [2]
-    again = Jit(scaled_by(traced), dict)
-    again.begin(*ARGUMENTS)
-    assert again(*ARGUMENTS)["wc"] == 10.0 and traced == [2]
 
 
 def filled(arrays):

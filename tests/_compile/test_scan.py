@@ -47,7 +47,7 @@ def swing(state, parts, now):
 
 def engine_run(start, gains, chunk=48):
     parts, signals = (gains, STIFFNESS), (SIGNAL, NOISE)
-    return run_ensemble(swing, start, parts, signals, own=OWN, chunk=chunk)
+    return run_ensemble(swing, start, parts, signals, of_members=OWN, chunk=chunk)
 
 
 def plain_run(start, gains):
@@ -99,7 +99,7 @@ def test_a_kernel_computes_a_value_that_several_need_once():
 
     step = lambda x, _: (sum(shared(x)) / 9, None)
     run = jax.jit(
-        lambda x: run_ensemble(lambda x, _, now: step(x, now), x, (), SIGNAL, own=False)[0]
+        lambda x: run_ensemble(lambda x, _, now: step(x, now), x, (), SIGNAL, of_members=False)[0]
     )
     compiled = str(run.lower(START).compile().as_text())
     assert compiled.count(" sine(") + compiled.count(" tanh(") == 2
@@ -122,7 +122,7 @@ def test_wide_arrays_make_smaller_chunks_which_are_kernels():
         128,
     ]
     step = lambda x, _, now: (jnp.tanh(x * now), None)
-    run = jax.jit(lambda x: run_ensemble(step, x, (), SIGNAL, own=False)[0])
+    run = jax.jit(lambda x: run_ensemble(step, x, (), SIGNAL, of_members=False)[0])
     assert TAG in run.lower(sums).as_text()
 
 

@@ -79,14 +79,14 @@ def test_an_option_that_xla_does_not_know_is_said_once_and_left_out(monkeypatch)
     assert engine().vector_bits == here["xla_cpu_prefer_vector_width"]
     monkeypatch.setattr(_switch, "TESTED", ())
     monkeypatch.setattr(_switch, "_WIDEST", {"xla_of_another_age": 1})
-    _switch._known.cache_clear()
+    _switch._vector_options.cache_clear()
     with pytest.warns(UserWarning, match="up to a tenth slower.*xla_of_another_age"):
         assert compiler_options() == {}
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert engine().vector_bits is None
     monkeypatch.undo()
-    _switch._known.cache_clear()
+    _switch._vector_options.cache_clear()
     assert compiler_options() == here
 
 

@@ -9,6 +9,7 @@ from html_pages import read_page
 from scipy.signal import lfilter
 from sweep_logs import write_sweep
 
+from jaxquad._core import Message
 from jaxquad.autopilot import (
     best_filters,
     Butterworth,
@@ -20,7 +21,6 @@ from jaxquad.autopilot import (
     PT1,
     StoredFilters,
 )
-from jaxquad.cli import main
 from jaxquad.cli import main
 from jaxquad.workflows import (
     identify,
@@ -140,7 +140,10 @@ def test_notches_that_follow_the_motors_are_divided_out_as_measured():
     for section in whole.sections():
         b0, b1, a1, b2, a2 = (0.0 if x is None else float(x) for x in section)
         rate = np.asarray(lfilter([b0, b1, b2], [1.0, a1, a2], rate))
-    names, hidden = ("gyroADC[0]", "gyroUnfilt[0]"), ("3 RPM notches per motor on the gyro: x",)
+    names, hidden = (
+        ("gyroADC[0]", "gyroUnfilt[0]"),
+        (Message("3 RPM notches per motor on the gyro: x", "notch"),),
+    )
     flight = FlightChannels(
         (rate,), 1e-3, 0 * rate, unfiltered=(raw,), unfiltered_dt=1e-3, names=names
     )

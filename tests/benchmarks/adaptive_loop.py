@@ -139,7 +139,7 @@ def costs(tuning: Any, inertia: Any, load: Any, chunk: int | None = 128) -> Any:
     tuning = jnp.broadcast_to(tuning[:, None], (12, inertia.shape[1]))
     parts = (tuple(tuning), (*inertia, *(1 / inertia)))
     own = (True, False)
-    return run_ensemble(step, begin, parts, load, own=own, chunk=chunk)[0].cost
+    return run_ensemble(step, begin, parts, load, of_members=own, chunk=chunk)[0].cost
 
 
 def plain(tuning: Any, inertia: Any, load: Any) -> Any:

@@ -73,7 +73,9 @@ def test_a_flight_becomes_one_kernel_of_a_gpu(delay):
 def test_an_ensemble_of_ones_own_becomes_one_kernel_of_a_gpu():
     def run(x, rate):
         step = lambda x, parts, now: (x + 0.1 * (now - parts[0] * x), x[0])
-        return run_ensemble(step, x, (rate,), jnp.linspace(0.0, 1.0, 9), own=((True,), False))
+        return run_ensemble(
+            step, x, (rate,), jnp.linspace(0.0, 1.0, 9), of_members=((True,), False)
+        )
 
     x = jnp.ones((2, MEMBERS))
     assert for_cuda(run, x, x).count("gpu.ptx") == 1

@@ -12,7 +12,7 @@ import pytest
 
 import jaxquad as jq
 from jaxquad._compile import Jit
-from jaxquad.simulation import _memory, _over_cores, _simulate
+from jaxquad.simulation import _memory, _parallel, _simulate
 
 
 MEMBERS, SAMPLES, PART = 100, 200, 32
@@ -21,10 +21,10 @@ MEMBERS, SAMPLES, PART = 100, 200, 32
 @pytest.fixture
 def cores(monkeypatch):
     def have(count):
-        monkeypatch.setattr(_over_cores, "available_cores", lambda: count)
+        monkeypatch.setattr(_parallel, "available_cores", lambda: count)
 
-    monkeypatch.setattr(_over_cores, "_LEAST", 1)
-    monkeypatch.setattr(_over_cores, "_USUAL", PART)
+    monkeypatch.setattr(_parallel, "_LEAST", 1)
+    monkeypatch.setattr(_parallel, "_USUAL", PART)
     return have
 
 
@@ -144,11 +144,11 @@ def test_ensembles_of_some_members_are_compiled_briefly(members, briefly):
 
     program = Asked(lambda *args: {})
     run = loop(members, **({} if members > 1 else {"inertia": [0.0552]})), happens()
-    assert ("briefly" in _over_cores.over_cores(program, run, (), tuple(jax.devices()))) == briefly
+    assert ("briefly" in _parallel.over_cores(program, run, (), tuple(jax.devices()))) == briefly
 
 
 def test_a_short_flight_is_not_worth_a_thread(monkeypatch, calls):
-    monkeypatch.setattr(_over_cores, "available_cores", lambda: 2)
+    monkeypatch.setattr(_parallel, "available_cores", lambda: 2)
     fly()
     assert len(calls) == 1
 

@@ -74,7 +74,7 @@ class Problem:
     omega: tuple[Float[Numbers, " frequencies"], ...]
     measured: tuple[Complex[Numbers, "frequencies outputs inputs"], ...]
     weights: tuple[Float[Numbers, "frequencies outputs inputs 2"], ...]  # of magnitude and phase
-    known: Float[Numbers, "priors 2"]  # value, standard error
+    prior: Float[Numbers, "priors 2"]  # value, standard error
     aliases: tuple[Aliases | None, ...] = ()  # of the responses whose input was held
     silent: tuple[tuple[tuple[int, int], ...], ...] = eqx.field(static=True, default=())
     mixings: tuple[Mixing | None, ...] = ()  # of the responses, after their weights
@@ -107,7 +107,7 @@ class Problem:
             aliases=(),
             silent=(),
         )
-        bare = dataclasses.replace(none, quantities=(), known=np.zeros((0, 2)))
+        bare = dataclasses.replace(none, quantities=(), prior=np.zeros((0, 2)))
         names = ("conditions", "omega", "measured", "aliases", "silent")
         fields = zip(
             self.conditions, self.omega, self.measured, self.aliases, self.silent, strict=True
@@ -163,7 +163,7 @@ def make_problem(
         measured=tuple(_known(np.asarray(frf.response)) for frf in frfs),
         weights=tuple(np.zeros(shape) for shape in shapes),
         mixings=(None,) * len(shapes),
-        known=np.asarray(numbers, dtype=float).reshape(-1, 2),
+        prior=np.asarray(numbers, dtype=float).reshape(-1, 2),
         aliases=tuple(_plan(model, *each) for each in zip(taken, frfs, strict=True)),
         silent=tuple(
             _silent_pairs(model, parameters, *each) for each in zip(taken, frfs, strict=True)
@@ -276,7 +276,7 @@ def prior_misfits(z: Float[Numbers, " n"], problem: Problem) -> Float[Array, " p
     values = [quantity(model) for quantity in problem.quantities]
     if not values:
         return jnp.zeros(0, dtype=z.dtype)
-    return (jnp.stack(values) - problem.known[:, 0]) / problem.known[:, 1]
+    return (jnp.stack(values) - problem.prior[:, 0]) / problem.prior[:, 1]
 
 
 def residuals(z: Float[Array, " n"], problem: Problem) -> Float[Array, " residuals"]:

@@ -234,12 +234,10 @@ def _kind(status: int, left: float, cost: float, curvature: float) -> str:
 _NEAR = 1.5  # ratio of costs within which another minimum is a rival
 
 
-def remarks_on_minima(
-    problem: Problem, falls_aside: bool, minima: tuple[Minimum, ...]
-) -> list[str]:
+def remarks_on_minima(problem: Problem, is_saddle: bool, minima: tuple[Minimum, ...]) -> list[str]:
     """Remarks on a saddle instead of a minimum, and on other minima of nearly the best cost."""
     remarks = []
-    if falls_aside:
+    if is_saddle:
         remarks.append(
             "stationary, but no minimum: the cost falls to one side; «start from other values»"
             "«, or give starts=20»"

@@ -1,9 +1,11 @@
-"""An ensemble computed on several devices, of one host or of several."""
+"""An ensemble computed on several devices, of one host or of several, or by the cores of a CPU."""
 
+import math
 import re
+import threading
 import zlib
-from collections.abc import Callable, Sequence
-from typing import TypeGuard
+from collections.abc import Callable, Iterator, Sequence
+from typing import NamedTuple, TypeGuard
 
 import equinox as eqx
 import jax
@@ -13,7 +15,14 @@ from jax import Device
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, PyTree
 
-from jaxquad._core import ensemble_shape, is_concrete, mark_members
+from jaxquad._compile import are_few, Jit, SINGLE
+from jaxquad._core import (
+    available_cores,
+    ensemble_shape,
+    is_concrete,
+    map_in_threads,
+    mark_members,
+)
 from jaxquad.loops import Loop
 
 from ._scenario import Scenario
@@ -62,41 +71,43 @@ def over_devices(
 
 def placed(loop: Loop, scenario: Scenario, devices: DeviceChoice) -> tuple[Run, Devices | None]:
     """Loop and scenario, and the devices that are asked for, else those their data were put on."""
-    asked = asked_devices(devices)
+    chosen = asked_devices(devices)
     run = (loop, scenario)
-    if not may_be_several(asked):
-        return run, asked
-    asked = where_put(run) if asked is None else asked
-    require_same({name: vars(loop)[name] for name in _PARTS} | {"scenario": scenario}, asked)
-    return movable(run, asked), asked
+    if not may_be_several(chosen):
+        return run, chosen
+    chosen = where_put(run) if chosen is None else chosen
+    require_same({name: vars(loop)[name] for name in _PARTS} | {"scenario": scenario}, chosen)
+    return movable(run, chosen), chosen
 
 
 def loop_over_devices(
-    function: Callable[[Run, PyTree], PyTree], run: Run, shared: PyTree, asked: Devices | None
+    function: Callable[[Run, PyTree], PyTree], run: Run, shared: PyTree, chosen: Devices | None
 ) -> PyTree:
     """`function((loop, scenario), shared)`, each device with its members, as `over_devices`."""
-    if not may_be_several(asked):
+    if not may_be_several(chosen):
         return function(run, shared)
     ensemble = ensemble_shape(*run)
     count = (1, *ensemble)[-1]
-    places = devices_for(count, asked)
+    places = devices_for(count, chosen)
     if min(count, len(places)) < 2:
         return function(run, shared)
     theirs, common = eqx.partition(run, mark_members(run, ensemble))
-    whole = lambda theirs, both: function(eqx.combine(theirs, both[0]), both[1])
-    return _split(whole, theirs, (common, shared), count, places)
+    joined = lambda theirs, both: function(eqx.combine(theirs, both[0]), both[1])
+    return _split(joined, theirs, (common, shared), count, places)
 
 
 def _split(
     function: Callable, members: PyTree, shared: PyTree, count: int, places: Devices
 ) -> PyTree:
     (members, shared), static = eqx.partition((members, shared), _is_array)
-    own = -(-count // len(places))
-    padded = jax.tree.map(lambda x: _lengthened(x, own * len(places) - count), members)
+    per_device = -(-count // len(places))
+    padded = jax.tree.map(lambda x: _lengthened(x, per_device * len(places) - count), members)
     local = lambda *arrays: function(*eqx.combine(arrays, static))
-    few = jax.tree.map(lambda x: jax.ShapeDtypeStruct((*x.shape[:-1], own), x.dtype), members)
+    few = jax.tree.map(
+        lambda x: jax.ShapeDtypeStruct((*x.shape[:-1], per_device), x.dtype), members
+    )
     results = jax.eval_shape(local, few, shared)
-    if _members_of(results, "the result") != own:
+    if _members_of(results, "the result") != per_device:
         raise ValueError("the result does not have the members of its arguments on the last axis")
     mesh = Mesh(np.array(places), (_AXIS,))
     run = jax.shard_map(
@@ -161,20 +172,20 @@ def _first(count: int) -> Devices:
     )
 
 
-def devices_for(members: int, asked: Devices | None) -> Devices:
+def devices_for(members: int, chosen: Devices | None) -> Devices:
     """The `asked` devices, or as many of this process's as gain from so many members."""
     if jax.sharding.get_abstract_mesh().manual_axes:  # already within a split computation
         return ()
-    if asked is not None:
-        return asked
+    if chosen is not None:
+        return chosen
     local = jax.local_devices()
     fewest = _FEWEST.get(local[0].platform, _FEWEST_ELSEWHERE)
     return tuple(local[: members // fewest])
 
 
-def may_be_several(asked: Devices | None) -> bool:
+def may_be_several(chosen: Devices | None) -> bool:
     """Whether there is anything to split among, before a look at the ensemble."""
-    return (jax.local_device_count() if asked is None else len(asked)) > 1
+    return (jax.local_device_count() if chosen is None else len(chosen)) > 1
 
 
 def where_put(tree: PyTree) -> Devices | None:
@@ -259,3 +270,152 @@ def _bytes(leaf: object) -> bytes:
         array = np.ascontiguousarray(leaf)
         return f"{array.shape}{array.dtype}".encode() + array.tobytes()
     return re.sub("0x[0-9a-f]+", "", repr(leaf)).encode()
+
+
+_VECTOR, _FEWEST_OF_PART, _USUAL = 16, 32, 128  # members that are computed at once, and of a part
+_MOST_PARTS = 64  # beyond which parts grow: each costs a call
+_LEAST = 2**15  # samples times members that make a thread worth its while
+_ALIGNED = 64  # bytes, for an array that JAX takes over without a copy
+
+
+def over_cores(
+    program: Jit,
+    run: Run,
+    further: tuple,
+    devices: Devices | None,
+    check: Callable[[PyTree], None] | None = None,
+) -> PyTree:
+    """`program(*run, *further, devices)`, whose results have the members on the last axis.
+
+    Parts of the members run side by side where the call is no part of another program, the ensemble
+    is worth it and nobody asked for devices; what a part shares with others comes from the first.
+    `check` is given the shapes of the whole result before there is room for it.
+    """
+    part, args = None, (*run, *further, devices)
+    leaves, structure = jax.tree.flatten(args)
+    members = _members(run, leaves)
+    if members >= 2 * _FEWEST_OF_PART:
+        part = _part(program, run, further, devices)
+    if are_few(members if part is None else part.width):
+        program = program.brief
+    if part is None:
+        return gathered(program.of_flat(args, leaves, structure))
+    joined = _Joined(part, check)
+
+    def compute(first: int) -> None:
+        joined.put(first, program(*part.cut(run, first), *further, devices))
+
+    firsts = part.firsts()
+    if program.is_new(*part.cut(run, 0), *further, devices):
+        compute(next(firsts))  # compiled here, once for all threads
+    map_in_threads(compute, firsts)
+    return joined.on_device()
+
+
+class _Part(NamedTuple):
+    """How an ensemble is parted."""
+
+    members: int
+    width: int  # members of a part
+    varies: list[bool]  # which leaves have the members on the last axis
+
+    def firsts(self) -> Iterator[int]:
+        """The first member of each part; the last part overlaps the one before."""
+        for first in range(0, self.members, self.width):
+            yield min(first, self.members - self.width)
+
+    def cut(self, run: Run, first: int) -> Run:
+        """The same for the members of a part."""
+        leaves, structure = jax.tree.flatten(run)
+        theirs = slice(first, first + self.width)
+        few = [
+            _cut(x, theirs) if varies else x for x, varies in zip(leaves, self.varies, strict=True)
+        ]
+        return jax.tree.unflatten(structure, few)
+
+
+def _part(program: Jit, run: Run, further: tuple, devices: Devices | None) -> _Part | None:
+    """None for an ensemble that is computed at once."""
+    cores = available_cores()
+    alone = jax.default_backend() == "cpu" and not may_be_several(None)
+    if devices is not None or not alone or cores < 2:
+        return None
+    leaves, ensemble = jax.tree.leaves(run), ensemble_shape(*run)
+    members, size = (1, *ensemble)[-1], len(run[1].reference) * math.prod(ensemble)
+    width, varies = _width(members, cores), jax.tree.leaves(mark_members(run, ensemble))
+    keys = any(mine and _is_key(x) for x, mine in zip(leaves, varies, strict=True))
+    if width == members or size * width < _LEAST * members or keys:
+        return None
+    return _Part(members, width, varies) if program.is_outermost(*run, *further) else None
+
+
+def _members(run: Run, leaves: list) -> int:
+    """On the last axis; 1 for a single loop, which its leaves show sooner than an ensemble."""
+    few = max(map(_last_axis, leaves)) <= SINGLE
+    return 1 if few else (1, *ensemble_shape(*run))[-1]
+
+
+def _last_axis(x: object) -> int:
+    shape = getattr(x, "shape", ())
+    return shape[-1] if shape else 0
+
+
+def _is_key(x: jax.Array) -> bool:
+    return jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
+
+
+def _width(members: int, cores: int) -> int:
+    """Whole vectors of members; the usual number, or a power of two times it, of a large ensemble.
+
+    So ensembles of many sizes share a program.
+    """
+    share = -(-members // (cores * _VECTOR)) * _VECTOR
+    usual = _USUAL
+    while usual * _MOST_PARTS < members:
+        usual *= 2
+    return min(members, max(min(share, usual), _FEWEST_OF_PART))
+
+
+def _cut(x: jax.Array, theirs: slice) -> jax.Array:
+    return jax.device_put(np.asarray(x)[..., theirs])
+
+
+class _Joined:
+    """The results of all members, to which each part adds its own."""
+
+    def __init__(self, part: _Part, check: Callable[[PyTree], None] | None):
+        self._part, self._check, self._lock = part, check, threading.Lock()
+        self._structure = jax.tree.structure(None)
+        self._room: list[np.ndarray | jax.Array] = []
+
+    def put(self, first: int, result: PyTree) -> None:
+        leaves, structure = jax.tree.flatten(result)
+        with self._lock:
+            if not self._room:
+                self._structure = structure
+                self._room = self._make_room(leaves)
+        for room, leaf in zip(self._room, leaves, strict=True):
+            if isinstance(room, np.ndarray):
+                room[..., first : first + self._part.width] = np.asarray(leaf)
+
+    def on_device(self) -> PyTree:
+        return jax.tree.unflatten(self._structure, jax.device_put(self._room))
+
+    def _make_room(self, leaves: list[jax.Array]) -> list[np.ndarray | jax.Array]:
+        shapes = [self._shape(x) for x in leaves]
+        if self._check is not None:
+            self._check(jax.tree.unflatten(self._structure, shapes))
+        return [_aligned(x) if isinstance(x, jax.ShapeDtypeStruct) else x for x in shapes]
+
+    def _shape(self, leaf: jax.Array) -> jax.Array | jax.ShapeDtypeStruct:
+        """Of all members; the leaf itself where it does not have them."""
+        if leaf.shape[-1:] != (self._part.width,):
+            return leaf
+        return jax.ShapeDtypeStruct((*leaf.shape[:-1], self._part.members), leaf.dtype)
+
+
+def _aligned(shape: jax.ShapeDtypeStruct) -> np.ndarray:
+    size = math.prod(shape.shape) * shape.dtype.itemsize
+    raw = np.empty(size + _ALIGNED, np.uint8)
+    first = -raw.ctypes.data % _ALIGNED
+    return raw[first : first + size].view(shape.dtype).reshape(shape.shape)

@@ -1,0 +1,242 @@
+"""Models from others: realisations, series connections, models of python-control and scipy."""
+
+from typing import Protocol, runtime_checkable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxquad._core import is_concrete
+
+from ._state_space import dot, StateSpace
+from ._transfer_function import (
+    coefficients_of,
+    HasCoefficients,
+    require_continuous,
+    TransferFunction,
+)
+
+
+@eqx.filter_jit  # one compilation instead of one for each small operation
+def realise(
+    model: TransferFunction,
+) -> tuple[
+    Float[Array, "states states"],
+    Float[Array, "states 1"],
+    Float[Array, "1 states"],
+    Float[Array, "1 1"],
+]:
+    """A, B, C, D of dx/dt = A x + B u, y = C x + D u: the model without its delay.
+
+    The controllable canonical form, in a time measured in units of the fastest pole: written in
+    seconds, its coefficients spread over many decades and its exponential loses digits.
+    """
+    states = model.denominator.size - 1
+    missing = model.denominator.size - model.numerator.size
+    a = (model.denominator / model.denominator[0])[1:]
+    b = jnp.pad(model.numerator / model.denominator[0], (missing, 0))
+    powers = jnp.arange(1, states + 1, dtype=a.dtype)
+    # The input-output behaviour does not depend on this scale, hence neither does its gradient.
+    speed = jnp.max(jax.lax.stop_gradient(jnp.abs(a)) ** (1 / powers), initial=0)
+    speed = jnp.where(speed > 0, speed, 1)
+    a, c = a / speed**powers, (b[1:] - b[0] * a) / speed**powers
+    first = jnp.eye(states, 1, dtype=a.dtype)
+    A = speed * (jnp.eye(states, k=-1, dtype=a.dtype) - first * a[None])
+    return A, speed * first, c[None], b[:1, None]
+
+
+def state_space(model: TransferFunction) -> StateSpace:
+    """A transfer function as a `StateSpace`; its delay becomes that of the input.
+
+    The states are those of `realise`. A direct passage from input to output, which H0 x + H1 x'
+    does not have, becomes a share of x'.
+
+    **Raises:**
+
+    - `ValueError`: the model is a pure gain, which has no states.
+    """
+    A, B, C, D = realise(model)
+    if not len(A):
+        raise ValueError(
+            f"numerator {model.numerator} and denominator {model.denominator} are a pure gain "
+            "without states: scale G or H0 of a neighbouring model by it."
+        )
+    late = model.delay[None]
+    if model.numerator.size < model.denominator.size:
+        return StateSpace(F=A, G=B, H0=C, input_delay=late)
+    # x' = A x + B u with B = (b, 0, ...): D / b of the first derivative holds D u.
+    H1 = jnp.zeros_like(C).at[0, 0].set(D[0, 0] / B[0, 0])
+    return StateSpace(F=A, G=B, H0=C - dot(H1, A), H1=H1, input_delay=late)
+
+
+def series(first: StateSpace, second: StateSpace) -> StateSpace:
+    """Two models in series: the outputs of `first` drive the inputs of `second`.
+
+    **Returns:**
+
+    The model whose response is that of `second` times that of `first`.
+
+    **Raises:**
+
+    - `ValueError`: the numbers of outputs and inputs differ, or several signals between the two
+        models have different delays, which no delay of an input or output can replace.
+    """
+    produced, taken = first.H0.shape[0], second.G.shape[1]
+    if produced != taken:
+        raise ValueError(
+            f"The first model has {produced} outputs, the second {taken} inputs: pick channels "
+            "with model.select."
+        )
+    late, between = first.input_delay, _add_delays(first.output_delay, second.input_delay)
+    if between is not None:
+        if between.size > 1 and not (is_concrete(between) and np.ptp(np.asarray(between)) == 0):
+            raise ValueError(
+                f"The signals between the models have the delays {between} s: give them one known "
+                "delay, or put the delays on the first inputs and the last outputs."
+            )
+        late = _add_delays(late, jnp.broadcast_to(between[0], (first.G.shape[1],)))
+    M = None
+    if not (first.M is None and second.M is None and first.H1 is None):
+        H1 = jnp.zeros_like(first.H0) if first.H1 is None else first.H1
+        ones = [jnp.eye(len(model.F), dtype=model.F.dtype) for model in (first, second)]
+        M = _blocks(
+            ones[0] if first.M is None else first.M,
+            -dot(second.G, H1),
+            ones[1] if second.M is None else second.M,
+        )
+    none = lambda H: jnp.zeros((len(H), len(first.F)), H.dtype)
+    return StateSpace(
+        F=_blocks(first.F, dot(second.G, first.H0), second.F),
+        G=jnp.concatenate([first.G, jnp.zeros((len(second.F), first.G.shape[1]), first.G.dtype)]),
+        H0=jnp.concatenate([none(second.H0), second.H0], axis=1),
+        H1=None if second.H1 is None else jnp.concatenate([none(second.H1), second.H1], axis=1),
+        M=M,
+        input_delay=late,
+        output_delay=second.output_delay,
+    )
+
+
+def _blocks(upper: Array, across: Array, lower: Array) -> Float[Array, "states states"]:
+    none = jnp.zeros((len(upper), len(lower)), upper.dtype)
+    return jnp.block([[upper, none], [across, lower]])
+
+
+def _add_delays(a: Array | None, b: Array | None) -> Array | None:
+    return b if a is None else a if b is None else a + b
+
+
+_INDEPENDENT = 1e-8  # smallest singular value of the columns of B, beside the largest
+
+
+@runtime_checkable
+class HasMatrices(Protocol):
+    """A state space of python-control or scipy.signal."""
+
+    @property
+    def A(self) -> np.ndarray: ...
+
+    @property
+    def B(self) -> np.ndarray: ...
+
+    @property
+    def C(self) -> np.ndarray: ...
+
+    @property
+    def D(self) -> np.ndarray: ...
+
+    @property
+    def dt(self) -> float | int | bool | None: ...  # s; None or 0 where it is continuous
+
+
+def from_control(system: HasCoefficients | HasMatrices) -> TransferFunction | StateSpace:
+    """A continuous model of python-control or scipy.signal.
+
+    A direct passage from input to output, which H0 x + H1 x' does not have, becomes a share of x';
+    where the inputs drive no states of their own, each gets one that cancels in the response. A
+    transfer function of several inputs or outputs becomes a state space with states of their own
+    for each pair.
+
+    !!! example
+
+        ```python
+        model = jq.models.from_control(control.tf([10.0], [1.0, 4.0, 0.0]))
+        ```
+
+    **Arguments:**
+
+    - `system`: a `TransferFunction` or a `StateSpace` of python-control or scipy.signal. Neither
+        has delays: put them in with `dataclasses.replace`.
+
+    **Returns:**
+
+    A `jq.TransferFunction` for a ratio of polynomials with one input and one output, otherwise a
+    `jq.StateSpace`.
+
+    **Raises:**
+
+    - `ValueError`: the system is sampled, improper, or of another kind.
+    """
+    if isinstance(system, HasMatrices):
+        require_continuous(system.dt)
+        return _with_passage(
+            *(np.asarray(x, float) for x in (system.A, system.B, system.C, system.D))
+        )
+    if isinstance(system, HasCoefficients):
+        require_continuous(system.dt)
+        above, below = coefficients_of(system)
+        if len(above) == len(above[0]) == 1:
+            return TransferFunction(above[0][0], below[0][0])
+        outputs, inputs = len(above), len(above[0])
+        parts, D = [], np.zeros((outputs, inputs))
+        for row in range(outputs):  # a bank of all pairs
+            for column in range(inputs):
+                A, b, c, D[row, column] = _companion(above[row][column], below[row][column])
+                unit_in, unit_out = np.eye(inputs)[column], np.eye(outputs)[row]
+                parts.append((A, np.outer(b, unit_in), np.outer(unit_out, c)))
+        from scipy.linalg import block_diag
+
+        A = np.asarray(block_diag(*(part[0] for part in parts)))
+        B = np.concatenate([part[1] for part in parts])
+        return _with_passage(A, B, np.concatenate([part[2] for part in parts], axis=1), D)
+    remedy = "TransferFunction or a StateSpace of python-control or scipy.signal (control.tf)"
+    if hasattr(system, "frdata"):
+        remedy += "; data go to jq.spectra.FrequencyResponse.from_table(system, random_error=0.02)"
+    raise ValueError(f"from_control cannot convert a {type(system).__name__}: give a {remedy}.")
+
+
+def _companion(
+    above: Float[np.ndarray, " zeros"], below: Float[np.ndarray, " poles"]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
+    """A, b, c, d of one pair: the controllable canonical form; no states for a response of 0."""
+    model = TransferFunction(above, below)
+    if not np.any(model.numerator):
+        return np.zeros((0, 0)), np.zeros(0), np.zeros(0), 0.0
+    a, states = below[1:] / below[0], below.size - 1
+    b = np.concatenate([np.zeros(below.size - above.size), above]) / below[0]
+    first = np.eye(states, 1)[:, 0]
+    A = np.eye(states, k=-1) - np.outer(first, a)
+    return A, first, b[1:] - b[0] * a, float(b[0])
+
+
+def _with_passage(
+    A: Float[np.ndarray, "states states"],
+    B: Float[np.ndarray, "states inputs"],
+    C: Float[np.ndarray, "outputs states"],
+    D: Float[np.ndarray, "outputs inputs"],
+) -> StateSpace:
+    """H0 x + H1 x' that equals C x + D u."""
+    if not np.any(D) and len(A):
+        return StateSpace(F=A, G=B, H0=C)
+    H1 = D @ np.linalg.pinv(B, rcond=_INDEPENDENT)
+    if not np.allclose(H1 @ B, D, rtol=0, atol=1e-13 * np.max(np.abs(D), initial=0.0)):
+        # One more state z' = u - a z for each input: H1 reads z', and H0 adds a z.
+        inputs = D.shape[1]
+        speed = float(np.max(np.abs(np.linalg.eigvals(A)), initial=0.0)) or 1.0  # a, rad/s
+        across = np.zeros((len(A), inputs))
+        A = np.block([[A, across], [across.T, -speed * np.eye(inputs)]])
+        B = np.concatenate([B, np.eye(inputs)])
+        C = np.concatenate([C, np.zeros_like(D)], axis=1)
+        H1 = np.concatenate([np.zeros((len(D), len(across))), D], axis=1)
+    return StateSpace(F=A, G=B, H0=C - H1 @ A, H1=H1)
