@@ -60,7 +60,7 @@ def step_section(
     except ValueError:
         return None
     head: Section = {"names": found.names, "doubts": found.doubts}
-    if not found.is_told:
+    if not found.is_conclusive:
         image = None if computed is None else _computed(computed)
         return head | {"image": None, "table": None, "notes": [], "computed": image}
     predicted = (

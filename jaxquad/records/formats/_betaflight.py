@@ -15,7 +15,7 @@ from jaxtyping import Float, Int, UInt
 
 from .._clock import unwrap
 from .._errors import ReadError
-from .._log import Log, Table
+from .._log import Log, number_in, Table
 from ._betaflight_frames import ADJUSTMENT, Frames, Payload, payload
 from ._betaflight_header import Header, headers, MARKER, scaled, with_derived
 from ._betaflight_mixer import with_mixed_axes
@@ -284,17 +284,10 @@ def _rows(
             try:
                 values = np.loadtxt(lines, delimiter=",", comments=None, usecols=wanted, ndmin=2)
             except ValueError:
-                values = [[_number(line.split(",")[i]) for i in wanted] for line in lines]
+                values = [[number_in(line.split(",")[i]) for i in wanted] for line in lines]
             parts[-1][rows[:, None], there] = values
     table = np.concatenate(parts) if parts else np.empty((0, len(columns)))
     return table, texts, np.array(numbers, int)
-
-
-def _number(cell: str) -> float:
-    try:
-        return float(cell)
-    except ValueError:
-        return np.nan
 
 
 def _flight_modes(texts: Iterable[str]) -> UInt[np.ndarray, " texts"] | None:
