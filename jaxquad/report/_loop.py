@@ -66,7 +66,7 @@ def step_section(
         return None
     (reference, output), image = step.names, None
     head: Section = {"names": step.names, "doubts": step.doubts}
-    if not step.is_told:
+    if not step.is_conclusive:
         if computed is not None:
             over = 100 * max(float(np.max(computed.middle)) - 1, 0.0)
             image = embed_figure(
