@@ -111,9 +111,8 @@ def test_values_and_gradients_are_those_of_the_plain_scan(memory, monkeypatch):
 
 def test_carries_are_kept_as_often_as_a_part_of_the_memory_allows(monkeypatch):
     count, carry, members, block = 5000, 140, 100_000, 128
-    assert _loop.segments_of(count, carry, members, block) == _loop.Segments(
-        count, 71, False
-    )  # no GPU
+    segments = _loop.segments_of
+    assert segments(count, carry, members, block) == _loop.Segments(count, 71, False)  # no GPU
     for room, expected in (
         (400e9, _loop.Segments(count, 2, True)),
         (160e9, _loop.Segments(count, 3, True)),
@@ -121,11 +120,9 @@ def test_carries_are_kept_as_often_as_a_part_of_the_memory_allows(monkeypatch):
         (70e9, _loop.Segments(count, 71, False)),  # 7 carries of a block take more than 113 kB
     ):
         monkeypatch.setattr(_loop, "_memory", lambda room=room: (int(room), 228 * 1024))
-        assert _loop.segments_of(count, carry, members, block) == expected
+        assert segments(count, carry, members, block) == expected
     monkeypatch.setattr(_loop, "_memory", lambda: (10**12, 64 * 1024))
-    assert not _loop.segments_of(
-        count, carry, members, block
-    ).are_shared  # not even two of them fit
+    assert not segments(count, carry, members, block).are_shared  # not even two of them fit
     assert _loop.segments_of(count, 40, members, block) == _loop.Segments(count, 2, True)
 
 

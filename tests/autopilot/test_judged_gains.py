@@ -11,7 +11,8 @@ from jaxquad.workflows import AutopilotSettings
 def stage(stable, peak=1.5, rejection=0.5):
     return SimpleNamespace(
         gains=(1.0, 1.0, 0.0), stable=stable, peak=peak, resonance=1.2, crossover=60.0,
-        rejection=rejection, noise=1.0, peaks=(), relaxed=None, delay_margin=float("inf"), angle=None,
+        rejection=rejection, noise=1.0, peaks=(), relaxed=None, delay_margin=0.01,
+        angle=None,
     )  # fmt: skip
 
 
