@@ -63,7 +63,7 @@ def over_devices(
     members on the last axis.
     """
     count = _members_of(members, "members")
-    places = devices_for(count, asked_devices(devices))
+    places = devices_for(count, devices)
     if len(places) < 2:
         return function(members, shared)
     return _split(function, members, shared, count, places)
@@ -162,8 +162,9 @@ def asked_devices(devices: int | Sequence | None) -> Devices | None:
     )
 
 
-def devices_for(members: int, chosen: Devices | None) -> Devices:
-    """The `asked` devices, or as many of this process's as gain from so many members."""
+def devices_for(members: int, devices: DeviceChoice) -> Devices:
+    """Those that a user names, or as many of this process's as gain from so many members."""
+    chosen = asked_devices(devices)
     if jax.sharding.get_abstract_mesh().manual_axes:  # already within a split computation
         return ()
     if chosen is not None:
