@@ -1,8 +1,3 @@
-from ._adrc import ADRCProposal as ADRCProposal, propose_adrc as propose_adrc
-from ._adrc_loops import Flown as Flown, gyro_filters as gyro_filters
-from ._adrc_result import ADRCAutopilot as ADRCAutopilot, doubted_throttle as doubted_throttle
-from ._adrc_stages import ADRCStage as ADRCStage, ADRCTargets as ADRCTargets
-from ._axes_proposal import AxesProposal as AxesProposal
 from ._files import (
     change_table as change_table,
     parameter_file as parameter_file,
@@ -11,11 +6,6 @@ from ._files import (
     propose_changes as propose_changes,
     WordChange as WordChange,
     write_parameter_files as write_parameter_files,
-)
-from ._filter_choices import (
-    change_filters as change_filters,
-    filter_choices as filter_choices,
-    flown_loop as flown_loop,
 )
 from ._filters import (
     ardupilot_notch as ardupilot_notch,
@@ -47,10 +37,8 @@ from ._firmware import (
 )
 from ._flight_channels import (
     FlightChannels as FlightChannels,
-    read_channels_if_any as read_channels_if_any,
-)
-from ._flown_autopilot import (
     FlownAutopilot as FlownAutopilot,
+    read_channels_if_any as read_channels_if_any,
     read_flown as read_flown,
     settings_of as settings_of,
 )
@@ -58,6 +46,7 @@ from ._flown_law import (
     best_filters as best_filters,
     flown_law as flown_law,
     FlownLaw as FlownLaw,
+    loop_of_law as loop_of_law,
     StoredFilters as StoredFilters,
 )
 from ._gains import (
@@ -84,9 +73,7 @@ from ._law import (
     pick_axis as pick_axis,
     RateLoop as RateLoop,
 )
-from ._law_check import check_law as check_law
-from ._loop_check import check_loop as check_loop
-from ._loop_of_law import loop_of_law as loop_of_law
+from ._law_check import check_law as check_law, check_loop as check_loop
 from ._over_throttle import study_throttle as study_throttle
 from ._page import (
     B0Section as B0Section,
@@ -94,15 +81,18 @@ from ._page import (
     write_pilot_page as write_pilot_page,
 )
 from ._parameters import (
+    change_filters as change_filters,
     check_ranges as check_ranges,
+    filter_choices as filter_choices,
     find_parameter as find_parameter,
     firmware_of as firmware_of,
+    flown_loop as flown_loop,
     list_parameters as list_parameters,
     PARAMETERS as PARAMETERS,
     store_parameters as store_parameters,
     with_parameters as with_parameters,
 )
-from ._proposal import AutopilotProposal as AutopilotProposal
+from ._proposal import AutopilotProposal as AutopilotProposal, AxesProposal as AxesProposal
 from ._rate_design import design_gains as design_gains
 from ._replay import (
     fly_again as fly_again,
@@ -117,11 +107,12 @@ from ._reproduce_flight import (
     Reproduction as Reproduction,
 )
 from .ardupilot._firmware import ardupilot_loop as ardupilot_loop, FlownArduPilot as FlownArduPilot
-from .ardupilot._harmonic_notch import (
+from .ardupilot._law import (
     ardupilot_harmonic_notch as ardupilot_harmonic_notch,
+    ArduPilotAttitude as ArduPilotAttitude,
+    ArduPilotRate as ArduPilotRate,
     HarmonicNotch as HarmonicNotch,
 )
-from .ardupilot._law import ArduPilotAttitude as ArduPilotAttitude, ArduPilotRate as ArduPilotRate
 from .betaflight._adrc import (
     adrc_b0 as adrc_b0,
     adrc_parameters as adrc_parameters,
@@ -131,6 +122,17 @@ from .betaflight._adrc import (
     flies_adrc as flies_adrc,
     FlownADRC as FlownADRC,
 )
+from .betaflight._adrc_loops import (
+    ADRCStage as ADRCStage,
+    ADRCTargets as ADRCTargets,
+    Flown as Flown,
+    gyro_filters as gyro_filters,
+)
+from .betaflight._adrc_result import (
+    ADRCAutopilot as ADRCAutopilot,
+    doubted_throttle as doubted_throttle,
+)
+from .betaflight._adrc_search import ADRCProposal as ADRCProposal, propose_adrc as propose_adrc
 from .betaflight._demo_flight import CHIRP_TRUTH as CHIRP_TRUTH, write_chirp_log as write_chirp_log
 from .betaflight._header import (
     betaflight_loop as betaflight_loop,

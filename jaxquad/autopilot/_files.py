@@ -128,12 +128,12 @@ def parameter_file(
     - `ValueError`: a parameter does not exist in this version of Betaflight, or another firmware
         is to change words.
     """
-    known = firmware_named(firmware)
-    if words and not known.words:
+    kind = firmware_named(firmware)
+    if words and not kind.words:
         raise ValueError(f"{words[0].name} is a word, and {firmware} stores numbers alone.")
     values = [(x.parameter, *((x.old, x.new) if revert else (x.new, x.old))) for x in changes]
     pairs = [(x.name, *((x.old, x.new) if revert else (x.new, x.old))) for x in words]
-    return known.parameter_file(
+    return kind.parameter_file(
         values, title, version=version, profile=profile, raised=raised, words=pairs
     )
 
@@ -144,7 +144,7 @@ def change_table(changes: Sequence[ParameterChange], words: Sequence[WordChange]
     for row, old, new, reason in changes:
         bounds = "none documented" if row.low == -_INF else f"{row.low:g} to {row.high:g}"
         bounds = f"{row.low:g} or above" if row.high == _INF != -row.low else bounds
-        numbers = f"{number_text(old, row.whole)} | {number_text(new, row.whole)}"
+        numbers = f"{number_text(old, row.integer)} | {number_text(new, row.integer)}"
         rows.append(f"| {row.name} | {numbers} | {row.unit} | {bounds} | {reason} |")
     rows += [f"| {name} | {old} | {new} |  |  | {reason} |" for name, old, new, reason in words]
     return joined_lines(rows)

@@ -232,7 +232,7 @@ class FilterChain(eqx.Module):
 
     def sections(self) -> tuple[Section, ...]:
         """The difference equations of all filters."""
-        return tuple(x for each in self.filters for x in each.sections(self.rate_hz))
+        return tuple(x for filter in self.filters for x in filter.sections(self.rate_hz))
 
     def response(self, frequency_hz: Frequencies) -> Complex[Array, " frequencies"]:
         """The complex response at these frequencies in Hz."""
@@ -248,7 +248,7 @@ class FilterChain(eqx.Module):
         The responses multiply to that of the whole, and the delays add up to its delay.
         """
         at = as_float(frequency_hz)
-        parts = [(each.in_words(), each.sections(self.rate_hz)) for each in self.filters]
+        parts = [(filter.in_words(), filter.sections(self.rate_hz)) for filter in self.filters]
         return tuple(
             FilterShare(name, _response(x, at, self.rate_hz), _delay_ms(x, at, self.rate_hz))
             for name, x in [*parts, ("all", self.sections())]
@@ -265,7 +265,7 @@ class FilterChain(eqx.Module):
 
 def rest_of(sections: Sequence[Section], like: Array) -> Memory:
     """What sections remember that have seen nothing but zeros."""
-    return tuple((jnp.zeros_like(like),) * each.order for each in sections)
+    return tuple((jnp.zeros_like(like),) * section.order for section in sections)
 
 
 def run_sections(
@@ -273,15 +273,15 @@ def run_sections(
 ) -> tuple[Memory, Array]:
     """One sample through all sections."""
     after = []
-    for section, held in zip(sections, memory, strict=True):
+    for section, state in zip(sections, memory, strict=True):
         b0, b1, a1 = (broadcast_gain(x, sample) for x in section[:3])
-        passed = b0 * sample + held[0]
+        passed = b0 * sample + state[0]
         first = b1 * sample - a1 * passed
         if section.b2 is None or section.a2 is None:
             after.append((first,))
         else:
             b2, a2 = broadcast_gain(section.b2, sample), broadcast_gain(section.a2, sample)
-            after.append((first + held[1], b2 * sample - a2 * passed))
+            after.append((first + state[1], b2 * sample - a2 * passed))
         sample = passed
     return tuple(after), sample
 
@@ -333,8 +333,8 @@ def _delay_ms(sections: Sequence[Section], frequency_hz: Array, rate_hz: float) 
     back, parts = _section_responses(sections, frequency_hz, rate_hz)
     phase: Values = np.zeros(back.shape)
     hertz = np.asarray(frequency_hz) if isinstance(back, np.ndarray) else frequency_hz
-    for each in parts:
-        phase = phase + (np.angle(each) if isinstance(each, np.ndarray) else jnp.angle(each))
+    for part in parts:
+        phase = phase + (np.angle(part) if isinstance(part, np.ndarray) else jnp.angle(part))
     return jnp.asarray(-1e3 * phase / (2 * np.pi * hertz))
 
 

@@ -7,12 +7,13 @@ import abc
 import dataclasses
 import importlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Complex, Float
 
 from jaxquad._core import Number
+from jaxquad.identify import CurveFirmware
 from jaxquad.records.firmware import firmware_names, FirmwareLog, register_log
 
 from ._filters import Filter, FilterChain
@@ -34,7 +35,7 @@ class Parameter(NamedTuple):
     - `name`, `unit`: as the firmware calls them.
     - `default`: of the firmware.
     - `low`, `high`: of the documented range; an infinity where none is documented.
-    - `whole`: whether the firmware stores a whole number; else it is a single-precision one.
+    - `integer`: whether the firmware stores a whole number; else it is a single-precision one.
     - `field`, `axis`: of the law that it sets: ("p", 0); -1 for all axes. "angle.p" is a field of
       the angle loop, "gyro" the cutoff of the only Butterworth low-pass of the gyro.
     """
@@ -44,7 +45,7 @@ class Parameter(NamedTuple):
     default: float
     low: float
     high: float
-    whole: bool = False
+    integer: bool = False
     field: str = ""
     axis: int = -1
 
@@ -54,13 +55,13 @@ Range = tuple[Number, Number]
 
 def rows_of_axes(
     names: Sequence[str], unit: str, defaults: Sequence[Number], ranges: tuple[Range, ...] | Range,
-    field: str, *, whole: bool = False,
+    field: str, *, integer: bool = False,
 ) -> list[Parameter]:  # fmt: skip
     """A parameter of roll, pitch and yaw, with one range or with three."""
-    low, *_ = ranges
-    bounds = [ranges] * 3 if isinstance(low, int | float) else ranges
+    one: Any = ranges
+    bounds: Any = one if isinstance(one[0], tuple) else [one] * 3
     return [
-        Parameter(name, unit, default, *bound, whole, field, axis)
+        Parameter(name, unit, default, bound[0], bound[1], integer, field, axis)
         for axis, (name, default, bound) in enumerate(zip(names, defaults, bounds, strict=True))
     ]  # fmt: skip
 
@@ -301,9 +302,9 @@ class Firmware(abc.ABC):
         """The values of a log with other filters. Raises ValueError where one has no place."""
         return {**values, **{name: repr(float(x)) for name, x in parameters.items()}}
 
-    def curve_kind(self, version: Sequence[int]) -> str:
+    def curve_kind(self, version: Sequence[int]) -> CurveFirmware:
         """What `jq.identify` calls the family of the `thrust_curve`."""
-        return self.log.name
+        raise NotImplementedError
 
     def flies_adrc(self, values: Mapping[str, str]) -> bool:
         """Whether the log is of a flight with Betaflight's proposed ADRC."""
@@ -330,14 +331,14 @@ class Firmware(abc.ABC):
         """The text to load, see `jq.autopilot.parameter_file`; by default lines `NAME,value`."""
         rows = [f"# {title}"] if title else []
         for row, value, other in values:
-            rows.append(f"# {row.name} was {number_text(other, row.whole)}")
-            rows.append(f"{row.name},{number_text(value, row.whole)}")
+            rows.append(f"# {row.name} was {number_text(other, row.integer)}")
+            rows.append(f"{row.name},{number_text(value, row.integer)}")
         return joined_lines(rows)
 
 
-def number_text(value: Number, whole: bool) -> str:
+def number_text(value: Number, is_whole: bool) -> str:
     """The shortest text that single precision reads back exactly."""
-    if whole:
+    if is_whole:
         return str(int(value))
     return np.format_float_positional(np.float32(value), trim="-")
 

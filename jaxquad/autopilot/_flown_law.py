@@ -3,23 +3,37 @@
 import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Complex, Float
 
 from jaxquad._core import announce, Message
-from jaxquad.identify import KnownFilter, measured_chain, MeasuredChain
+from jaxquad.identify import (
+    as_sampled,
+    filter_response,
+    Fit,
+    KnownFilter,
+    measured_chain,
+    MeasuredChain,
+    model_response,
+    usable,
+    with_values,
+)
+from jaxquad.models import Model
+from jaxquad.plot import StepBand
 from jaxquad.records import AXES, Mix, Proposal, propose
 from jaxquad.records.firmware import firmware_log, firmware_names
-from jaxquad.report import reason_of
+from jaxquad.report import LawLoop, reason_of
+from jaxquad.spectra import BrokenLoop, FrequencyResponse
 
 from ._filters import FilterChain
 from ._firmware import firmware_named
-from ._flight_channels import FlightChannels, read_channels_if_any
-from ._flown_autopilot import settings_of
+from ._flight_channels import FlightChannels, read_channels_if_any, settings_of
 from ._identified import RecordSettings
 from ._law import RateLoop
+from ._pilot_page import StepGrid
+from ._rate_gains import law_responses
 
 
 Frequencies = Float[np.ndarray, " frequencies"]
@@ -52,12 +66,12 @@ class FlownLaw:
 
     def content(self) -> dict[str, object]:
         """For `result.json`; `StoredFilters.of` reads the filters."""
-        measured = [each for each in self.filters if isinstance(each, MeasuredChain)]
+        measured = [x for x in self.filters if isinstance(x, MeasuredChain)]
         chains = [
-            {"rate_hz": x.rate_hz, "sections": [_numbers(each) for each in x.sections()]}
+            {"rate_hz": x.rate_hz, "sections": [_numbers(x) for x in x.sections()]}
             for x in self.chains
         ]
-        correction = [{"delay_s": each.delay, "lag_s": each.lag} for each in measured]
+        correction = [{"delay_s": x.delay, "lag_s": x.lag} for x in measured]
         return {"text": self.text, "chains": chains, "correction": (*correction, {})[0]}
 
 
@@ -78,7 +92,10 @@ class StoredFilters:
         """From what `FlownLaw.content` has stored. Raises ValueError for anything else."""
         try:
             chains = tuple(
-                (float(x["rate_hz"]), tuple(tuple(map(float, each)) for each in x["sections"]))
+                (
+                    float(x["rate_hz"]),
+                    tuple(tuple(map(float, section)) for section in x["sections"]),
+                )
                 for x in content["chains"]
             )
             correction = content["correction"]
@@ -130,7 +147,7 @@ def flown_law(
     except Exception as error:
         return FlownLaw((), f"the gyro's filters are in the model: {reason_of(error)}")
     first, *others = laws
-    if first is None or any(_differs(first, each) for each in others):
+    if first is None or any(_differs(first, law) for law in others):
         text = "the gyro's filters are in the model: those of the logs differ"
         return None if first is None else FlownLaw((), text)
     return first
@@ -139,7 +156,7 @@ def flown_law(
 def _differs(one: FlownLaw, other: FlownLaw | None) -> bool:
     if other is None:
         return True
-    both = [np.prod([x.response(_AT) for x in each.filters], axis=0) for each in (one, other)]
+    both = [np.prod([x.response(_AT) for x in law.filters], axis=0) for law in (one, other)]
     return bool(np.max(np.abs(np.asarray(both[0]) / np.asarray(both[1]) - 1)) > _SAME)
 
 
@@ -152,8 +169,8 @@ def _law_of(
             proposal = propose(path, axis=AXES[axis])
         except ValueError:  # a table whose channels have these names
             return None
-    known = firmware_log(proposal.vehicle)
-    if proposal.setup.rate != rate or known is None or not known.gyro_cutoffs:
+    log = firmware_log(proposal.vehicle)
+    if proposal.setup.rate != rate or log is None or not log.gyro_cutoffs:
         return None
     return _read_law(path, axis, command, proposal, settings)
 
@@ -190,8 +207,8 @@ def best_filters(
     axis: int,
 ) -> tuple[tuple[KnownFilter, ...], str]:
     """As measured where notches follow motors or spectrum, else those of the parameters."""
-    hidden = [each for each in unmodelled if each.kind == "notch"]
-    missing = "" if not hidden else f" (not {'; '.join(each.partition(':')[0] for each in hidden)})"
+    hidden = [text for text in unmodelled if text.kind == "notch"]
+    missing = "" if not hidden else f" (not {'; '.join(text.partition(':')[0] for text in hidden)})"
     if hidden and flight is not None and len(flight.unfiltered) > axis and not flight.averaged:
         measured = _measured(chains, flight, axis)
         if isinstance(measured, MeasuredChain):
@@ -199,7 +216,7 @@ def best_filters(
         missing = f"{missing[:-1]}, which could not be measured: {measured})"
     if not chains:
         return (), f"the gyro has no filter that is known{missing}"
-    words = ", ".join(each.in_words() for chain in chains for each in chain.filters)
+    words = ", ".join(text.in_words() for chain in chains for text in chain.filters)
     late = sum(float(chain.delay_ms([_SHOWN])[0]) for chain in chains)
     text = f"the gyro's filters, {words}{missing}, are divided out: {late:.2g} ms at {_SHOWN:g} Hz"
     return chains, text
@@ -221,3 +238,90 @@ def _measured(
         )  # fmt: skip
     except ValueError as error:
         return str(error)
+
+
+Response = Complex[np.ndarray, " frequencies"]
+_COHERENT = 0.6  # magnitude-squared coherence from which a frequency counts
+_LOWEST, _HIGHEST, _GRID = 0.3, 0.45, 512  # rad/s, of the law's rate, and how many frequencies
+_PLANTS, _SEED = 64, 77  # of the step's band
+
+
+class _Loop(NamedTuple):
+    """Responses of the law at some frequencies, and what turns a plant into that of the log.
+
+    **Attributes:**
+
+    - `ahead`, `back`: from set-point and logged rate, in the rate's unit, to the command.
+    - `passed`: of the filters that the responses are without.
+    """
+
+    omega: Frequencies
+    ahead: Response
+    back: Response
+    passed: Response
+
+    def open(self, plant: Response) -> Response:
+        """The broken loop with a plant up to what the filters are given."""
+        return -self.back * plant * self.passed
+
+    def closed(self, plant: Response) -> Response:
+        """From set-point to rate."""
+        return self.ahead * plant * self.passed / (1 + self.open(plant))
+
+
+def loop_of_law(
+    flown: FlownLaw | None, fit: Fit, frf: FrequencyResponse, filters: Sequence[KnownFilter],
+    unit: str,
+) -> LawLoop | None:  # fmt: skip
+    """The flown rate loop as law times plant; None where the log does not tell the law.
+
+    The plant is up to what `filters` were given, with a rate in `unit`.
+    """
+    units = {"deg/s": np.pi / 180, "rad/s": 1.0}
+    if flown is None or flown.law is None or unit not in units:
+        return None
+    used = np.asarray(usable(frf, None, _COHERENT))[:, 0, 0]
+    omega = np.asarray(frf.omega)[used]
+    pick = lambda x: np.asarray(x)[used, 0, 0]
+    measured = BrokenLoop(
+        omega,
+        _law_at(flown, filters, omega, units[unit]).open(pick(frf.response)),
+        pick(frf.random_error),
+        pick(frf.coherence),
+    )
+    if not fit.identifiable:
+        return LawLoop(measured, None, None, flown.unmodelled)
+    grid = np.geomspace(_LOWEST, _HIGHEST * 2 * np.pi / flown.law.dt / 2, _GRID)
+    response = _plant(frf, fit.model, grid)
+    none, every = np.zeros(grid.size), np.ones(grid.size)
+    model = BrokenLoop(grid, _law_at(flown, filters, grid, units[unit]).open(response), none, every)
+    return LawLoop(measured, model, _step(flown, fit, frf, filters, units[unit]), flown.unmodelled)
+
+
+def _law_at(
+    flown: FlownLaw, filters: Sequence[KnownFilter], omega: Frequencies, radians: float
+) -> _Loop:
+    assert flown.law is not None
+    law = flown.law.without_gyro_filters()  # the logged rate is behind them
+    ahead, back = radians * law_responses(law, flown.axis, omega)
+    return _Loop(omega, ahead, back, filter_response(filters, omega))
+
+
+def _plant(frf: FrequencyResponse, model: Model, omega: Frequencies) -> Response:
+    return model_response(as_sampled(model, frf), omega)[:, 0, 0]
+
+
+def _step(
+    flown: FlownLaw, fit: Fit, frf: FrequencyResponse, filters: Sequence[KnownFilter],
+    radians: float,
+) -> StepBand:  # fmt: skip
+    """From set-point to rate, of plants that the fit leaves possible."""
+    assert flown.law is not None
+    grid = StepGrid.of(flown.law.dt)
+    loop = _law_at(flown, filters, grid.omega, radians)
+    places, random = fit.parameters.places[: len(fit.names)], np.random.default_rng(_SEED)
+    values = random.multivariate_normal(fit.values, fit.covariance, _PLANTS, method="eigh")
+    sign = np.sign(fit.values)
+    values = np.where(sign * values > 0, values, 0.0 * sign)  # a parameter keeps its sign
+    plants = [_plant(frf, with_values(fit.model, places, plant), grid.omega) for plant in values]
+    return grid.band(np.stack([loop.closed(plant) for plant in plants]))

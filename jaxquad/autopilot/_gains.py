@@ -54,8 +54,8 @@ def rate_parameters(
     """
     _require_axis(axis)
     require_positive("torque_per_unit", torque_per_unit, "give the plant's gain")
-    known = firmware_named(firmware)
-    triples = zip(_names(known, axis), gains, known.si_scales(axis), strict=True)
+    kind = firmware_named(firmware)
+    triples = zip(_names(kind, axis), gains, kind.si_scales(axis), strict=True)
     return {name: gain * scale / torque_per_unit for name, gain, scale in triples}
 
 
@@ -72,12 +72,12 @@ def rate_gains(
     - `ValueError`: the axis is unknown, or a parameter is missing.
     """
     _require_axis(axis)
-    known = firmware_named(firmware)
-    names = _names(known, axis)
+    kind = firmware_named(firmware)
+    names = _names(kind, axis)
     missing = [name for name in names if name not in values]
     if missing:
         raise ValueError(f"the parameters lack {', '.join(missing)}: give P, I and D of the axis.")
-    pairs = zip(names, known.si_scales(axis), strict=True)
+    pairs = zip(names, kind.si_scales(axis), strict=True)
     return RateGains(*(values[name] / scale * torque_per_unit for name, scale in pairs))
 
 
@@ -229,10 +229,10 @@ def find_inexpressible(firmware: str, controller: object) -> tuple[str, ...]:
 
     - `controller`: a `jq.PID` of the angle. A `LADRC` is never expressible: see `ladrc_as_pid`.
     """
-    known = firmware_named(firmware)
-    name = known.log.title
+    kind = firmware_named(firmware)
+    name = kind.log.title
     if isinstance(controller, LADRC | ScheduledLADRC | AdaptiveLADRC):
-        why = known.no_ladrc()
+        why = kind.no_ladrc()
         return (f"{name} cannot run a LADRC of the angle: {why}. Use ladrc_as_pid.",)
     if not isinstance(controller, PID):
         return (f"A {type(controller).__name__} is not known: give a jq.PID.",)
@@ -248,7 +248,7 @@ def find_inexpressible(firmware: str, controller: object) -> tuple[str, ...]:
             + (
                 " A feed-forward of (weight - 1) times P does the same, and is negative below 1, "
                 "beyond the documented range."
-                if known.weighs_setpoint
+                if kind.weighs_setpoint
                 else ""
             )
         )

@@ -91,29 +91,29 @@ def gyro_noise(
     least = max(least_hz, _SLOWEST)
     chain = lambda hertz: np.abs(gyro_chain_response(law, 2 * np.pi * hertz)) ** 2
     sources = _sources(flight, chain, least, law.dt)
-    behind = {k: each for k, each in enumerate(sources)}
-    own = behind.pop(axis if axis in behind else 0)
-    known = own.known
-    name = flight.names[1] if own.is_raw else flight.names[0]
-    how = "unfiltered" if own.is_raw else "filtered, divided by the filters that flew"
+    behind = {k: source for k, source in enumerate(sources)}
+    tuned = behind.pop(axis if axis in behind else 0)
+    reach = tuned.reach
+    name = flight.names[1] if tuned.is_raw else flight.names[0]
+    how = "unfiltered" if tuned.is_raw else "filtered, divided by the filters that flew"
     shown = [Density(x.behind.hertz, x.behind.power) for x in behind.values()]
     noise = GyroNoise(
-        own.before, own.behind, dict(zip(behind, shown, strict=True)), known, least,
-        f"{name} ({how}), up to {known:.0f} Hz", _steady_line(flight, axis, least),
+        tuned.before, tuned.behind, dict(zip(behind, shown, strict=True)), reach, least,
+        f"{name} ({how}), up to {reach:.0f} Hz", _steady_line(flight, axis, least),
     )  # fmt: skip
-    return _unless_unseen(noise, own.is_raw, law, axis)
+    return _unless_unseen(noise, tuned.is_raw, law, axis)
 
 
 class _Source(NamedTuple):
     before: Density
     behind: Density
-    known: float
+    reach: float
     is_raw: bool
 
 
 def _sources(flight, chain, least: float, loop_dt: float) -> list[_Source]:
     """Of each axis: behind the filters as it was logged, and before them."""
-    found = []
+    sources = []
     most = _reach(flight.dt, loop_dt)
     for k, rate in enumerate(flight.rates):
         hertz, power = _residual(rate, flight.setpoint, flight.dt)
@@ -133,7 +133,7 @@ def _sources(flight, chain, least: float, loop_dt: float) -> list[_Source]:
                 near = np.interp(high, hertz, power)
                 both = (through >= _CLEAR) & (high <= most)
                 behind = np.where(both, near, level * through)
-                found.append(
+                sources.append(
                     _Source(
                         Density(high, _flat_below(high, level, least)),
                         Density(high, _flat_below(high, behind, least)), reach, True,
@@ -143,10 +143,10 @@ def _sources(flight, chain, least: float, loop_dt: float) -> list[_Source]:
         behind = _flat_below(hertz, power, least)
         # In a notch the level is that beside it.
         before = np.interp(hertz, hertz[clear], behind[clear] / passed[clear])
-        found.append(
+        sources.append(
             _Source(Density(hertz, before), Density(hertz, behind), min(limit, most), False)
         )
-    return found
+    return sources
 
 
 def _reach(dt: float, loop_dt: float) -> float:
@@ -163,11 +163,13 @@ def _residual(
     taper = np.hanning(size)
     spectra = [np.fft.rfft((x[places] - x[places].mean(1, keepdims=True)) * taper, axis=1)
                for x in (rate, setpoint)]  # fmt: skip
-    own, asked = (np.mean(np.abs(x) ** 2, axis=0) for x in spectra)
+    of_rate, of_setpoint = (np.mean(np.abs(x) ** 2, axis=0) for x in spectra)
     cross = np.mean(spectra[1].conj() * spectra[0], axis=0)
-    told = np.abs(cross) ** 2 / np.maximum(asked, 1e-12 * max(float(asked.max()), 1e-300))
+    explained = np.abs(cross) ** 2 / np.maximum(
+        of_setpoint, 1e-12 * max(float(of_setpoint.max()), 1e-300)
+    )
     many = len(places)
-    left = np.maximum(own - told, 0.0) * many / max(many - 1, 1)
+    left = np.maximum(of_rate - explained, 0.0) * many / max(many - 1, 1)
     return np.fft.rfftfreq(size, dt), 2 * dt * left / np.sum(taper**2)
 
 
@@ -185,10 +187,10 @@ def _steady_line(flight: FlightChannels, axis: int, least: float) -> SpectralLin
     )  # fmt: skip
     time = np.arange(len(rate)) * dt
     moving = flight.throttle is not None and np.ptp(flight.throttle) > 0
-    beside = rate if flight.throttle is None or not moving else np.interp(
+    drive = rate if flight.throttle is None or not moving else np.interp(
         time, np.linspace(0.0, time[-1], len(flight.throttle)), flight.throttle
     )  # fmt: skip
-    record = Record(time, beside, rate, input_names=("throttle",), output_names=("gyro",))
+    record = Record(time, drive, rate, input_names=("throttle",), output_names=("gyro",))
     above = 2 * np.pi * max(2 * least, _LINES)
     line = find_line(record, "gyro", above=above, over="throttle" if moving else None)
     if line is None or line.high - line.low > _STEADY * line.omega:

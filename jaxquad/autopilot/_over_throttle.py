@@ -10,6 +10,7 @@ from jaxquad._core import announce
 from jaxquad.identify import (
     actuator,
     curve_of_parameter,
+    CurveFirmware,
     FirmwareValue,
     gain_over_throttle,
     GainOverThrottle,
@@ -23,7 +24,7 @@ from jaxquad.records.firmware import firmware_names
 
 from ._files import ParameterChange, propose_changes
 from ._firmware import firmware_named
-from ._flown_autopilot import FlownAutopilot
+from ._flight_channels import FlownAutopilot
 from ._identified import IdentifiedPlant
 from ._parameters import find_parameter
 from ._plants import PlantSource
@@ -42,26 +43,26 @@ class CurveVerdict:
 
     - `name`: of the firmware's parameter.
     - `flown`: its value, or None where the log does not hold it.
-    - `found`: with its 95 % interval; None where the log holds too little of the curve.
+    - `estimate`: with its 95 % interval; None where the log holds too little of the curve.
     - `change`: what its own files hold; None where what flew is as good, or is not known.
     - `text`: all of it in words.
     """
 
     name: str
     flown: float | None
-    found: FirmwareValue | None
+    estimate: FirmwareValue | None
     change: ParameterChange | None
     text: str
 
     def content(self) -> dict[str, object]:
         """All of it, for JSON."""
-        found = self.found
+        estimate = self.estimate
         return {
             "parameter": self.name,
             "flown": self.flown,
-            "value": None if found is None else found.value,
-            "standard_error": None if found is None else found.standard_error,
-            "interval_95": None if found is None else list(found.interval),
+            "value": None if estimate is None else estimate.value,
+            "standard_error": None if estimate is None else estimate.standard_error,
+            "interval_95": None if estimate is None else list(estimate.interval),
             "proposed": self.change is not None,
             "text": self.text,
         }
@@ -96,11 +97,11 @@ class ThrottleVerdict:
         return () if self.gains is None else (low, (low + high) / 2, high)
 
     def plants(
-        self, found: IdentifiedPlant, measured: Sequence[KnownFilter] | None = None
+        self, plant: IdentifiedPlant, measured: Sequence[KnownFilter] | None = None
     ) -> PlantSource:
         """What plants are drawn from, behind the gyro's filters as `measured`."""
-        unit = found.records[0].output_units[0]
-        return PlantSource(found.fit, unit, self.gains, self.span, measured)
+        unit = plant.records[0].output_units[0]
+        return PlantSource(plant.fit, unit, self.gains, self.span, measured)
 
     @property
     def table(self) -> str:
@@ -120,7 +121,7 @@ class ThrottleVerdict:
 
 
 def study_throttle(
-    found: IdentifiedPlant, proposal: Proposal, flown: FlownAutopilot, read: ReadBeside
+    plant: IdentifiedPlant, proposal: Proposal, flown: FlownAutopilot, read: ReadBeside
 ) -> ThrottleVerdict:
     """The gain over the throttle, where the log holds at least two levels of it.
 
@@ -147,7 +148,7 @@ def study_throttle(
     try:
         gains = gain_over_throttle(
             records, filters=flown.filters, flown_curve=parameter.curve,
-            band=_band(found, levels),
+            band=_band(plant, levels),
         )  # fmt: skip
         span = float(gains.low.min()), float(gains.high.max())
         ratio = _ratio(gains, span)
@@ -165,11 +166,11 @@ def study_throttle(
     )  # fmt: skip
 
 
-def _band(found: IdentifiedPlant, levels: ThrottleLevels) -> tuple[float, float] | None:
+def _band(plant: IdentifiedPlant, levels: ThrottleLevels) -> tuple[float, float] | None:
     """In rad/s, where one is known; from 3 cycles of the shortest level, at least 1.5 Hz."""
-    if found.settings.band is None:
+    if plant.settings.band is None:
         return None
-    low, high = found.settings.band
+    low, high = plant.settings.band
     low = max(low, 1.5, 3 / float(levels.seconds.min()))
     return (2 * np.pi * low, 2 * np.pi * min(high, 45.0)) if low < high else None
 
@@ -179,16 +180,16 @@ class _Parameter:
     """The thrust curve's parameter as it flew."""
 
     name: str
-    kind: str
+    kind: CurveFirmware | None
     value: float | None  # None where the log does not hold it
     curve: float
 
 
 def _flown_parameter(flown: FlownAutopilot) -> _Parameter:
     firmware = firmware_named(flown.firmware)
-    name, kind = firmware.thrust_curve, firmware.curve_kind(flown.version)
-    if not name:
-        return _Parameter("", kind, None, 0.0)
+    if not (name := firmware.thrust_curve):
+        return _Parameter("", None, None, 0.0)
+    kind = firmware.curve_kind(flown.version)
     logged = float(flown.values[name]) if name in flown.values else None
     assumed = find_parameter(flown.firmware, name).default if logged is None else logged
     return _Parameter(name, kind, logged, curve_of_parameter(kind, assumed))
@@ -246,31 +247,33 @@ def _curve_verdict(
     gains: GainOverThrottle, flown: FlownAutopilot, parameter: _Parameter
 ) -> CurveVerdict | None:
     name, value = parameter.name, parameter.value
-    if not name:
+    if parameter.kind is None:
         return None
-    verdict = lambda text, found=None, change=None: CurveVerdict(name, value, found, change, text)
+    verdict = lambda text, estimate=None, change=None: CurveVerdict(
+        name, value, estimate, change, text
+    )
     try:
-        found = gains.firmware_value(parameter.kind)
+        estimate = gains.firmware_value(parameter.kind)
     except UndeterminedError as error:
         return verdict(str(error))
-    low, high = found.interval
-    shows = f"the log shows {found.value:.3g} (95 %: {low:.3g} .. {high:.3g})"
+    low, high = estimate.interval
+    shows = f"the log shows {estimate.value:.3g} (95 %: {low:.3g} .. {high:.3g})"
     if value is None:
-        return verdict(f"{name}: {shows}, not what flew, so that no file has it", found)
+        return verdict(f"{name}: {shows}, not what flew, so that no file has it", estimate)
     if low <= value <= high:
-        return verdict(f"{name} {value:g} flew, and {shows}: it is kept", found)
+        return verdict(f"{name} {value:g} flew, and {shows}: it is kept", estimate)
     reason = f"proposal of its own: 95 % {low:.3g} .. {high:.3g}; all loops change with it"
     changes = propose_changes(
-        flown.firmware, {name: value}, {name: round(found.value, 3)}, reasons={name: reason}
+        flown.firmware, {name: value}, {name: round(estimate.value, 3)}, reasons={name: reason}
     )
     if not changes:
-        return verdict(f"{name} {value:g} flew, and {shows}, stored as the same", found)
+        return verdict(f"{name} {value:g} flew, and {shows}, stored as the same", estimate)
     text = (
         f"{name} {value:g} flew, but {shows}. It is a proposal in files of its own, apart from "
         f"the gains, which hold with the curve that flew: {_consequences(gains, flown)}. Load it "
         "alone, fly, and tune the gains on that log"
     )
-    return verdict(text, found, changes[0])
+    return verdict(text, estimate, changes[0])
 
 
 def _consequences(gains: GainOverThrottle, flown: FlownAutopilot) -> str:

@@ -42,7 +42,7 @@ def _filters(page: PilotPage) -> Section:
 def _passed(chains: Chains, signal: str) -> list[FilterChain]:
     """All filters that a signal has passed: those of the gyro, too."""
     names = list(chains)[: list(chains).index(signal) + 1]
-    return [each for name in names for each in chains[name] if each.filters]
+    return [chain for name in names for chain in chains[name] if chain.filters]
 
 
 def _delays(design: str, chains: Chains) -> Table:

@@ -17,10 +17,9 @@ from ._firmware import firmware_named
 from ._flight_channels import FlightChannels
 from ._gyro_noise import gyro_noise, GyroNoise
 from ._law import RateLoop
-from ._limits import limits_text
 from ._page import PilotPage
 from ._rate_gains import gains_in, gains_of, gyro_chain_response, law_paths
-from ._stages import margin_text, Stage
+from ._stages import limits_text, Stage
 
 
 if TYPE_CHECKING:
@@ -34,28 +33,28 @@ _NEAR = 0.005  # of a motor's range, from its ends
 _SLOWEST = 20.0  # Hz, below which motion is taken for noise
 
 
-def pilot_page(found: "AutopilotProposal", origin: Provenance, overview: str = "") -> PilotPage:
+def pilot_page(proposal: "AutopilotProposal", origin: Provenance, overview: str = "") -> PilotPage:
     """All that the page shows; what cannot be computed says why. `overview` is of all axes."""
-    flown, axis = found.flown, found.flown.axis
-    after, failures = _proposed_law(found), dict[str, str]()
-    noise = _tried(failures, "noise", lambda: _noise_shown(found), None)
+    flown, axis = proposal.flown, proposal.flown.axis
+    after, failures = _proposed_law(proposal), dict[str, str]()
+    noise = _tried(failures, "noise", lambda: _noise_shown(proposal), None)
     designs = {"flown": (flown.law, gains_of(flown.law, axis))}
     if after is not None:
-        designs["proposed"] = (after, gains_in(flown.law, axis, found.new))
+        designs["proposed"] = (after, gains_in(flown.law, axis, proposal.new))
     spectra = lambda: ({}, {}) if noise is None else _spectra(noise, axis, designs)
     gyro, derivative = _tried(failures, "noise", spectra, ({}, {}))
-    steps = lambda: _steps(found, designs) if found.identification.fit.identifiable else {}
+    steps = lambda: _steps(proposal, designs) if proposal.identification.fit.identifiable else {}
     terms, terms_are = _tried(
-        failures, "balance", lambda: _terms(found.flight, flown.law, axis), ({}, "")
+        failures, "balance", lambda: _terms(proposal.flight, flown.law, axis), ({}, "")
     )
-    version, check = ".".join(map(str, flown.version)), found.reproduction
+    version, check = ".".join(map(str, flown.version)), proposal.reproduction
     return PilotPage(
         title=f"{flown.firmware} {version}, rate loop of {AXES[axis]}".replace(" ,", ","),
-        headlines=_headlines(found),
+        headlines=_headlines(proposal),
         remarks=[
-            *(f"not modelled: {each}" for each in flown.unmodelled),
+            *(f"not modelled: {text}" for text in flown.unmodelled),
             *([flown.filters_text] if flown.filters_text else []),
-            *([limits_text(found.settings)] if found.new else []),
+            *([limits_text(proposal.settings)] if proposal.new else []),
         ],
         filters=_filters(flown.law, after, axis),
         gyro=gyro,
@@ -67,10 +66,10 @@ def pilot_page(found: "AutopilotProposal", origin: Provenance, overview: str = "
         steps=_tried(failures, "steps", steps, {}),
         terms=terms,
         terms_are=terms_are,
-        motors=[] if found.flight is None else motor_rows(found.flight),
-        stages=_stage_rows(found) if found.stages else None,
-        changes=change_rows(found.changes) if found.new else None,
-        text=str(found),
+        motors=[] if proposal.flight is None else motor_rows(proposal.flight),
+        stages=_stage_rows(proposal) if proposal.stages else None,
+        changes=change_rows(proposal.changes) if proposal.new else None,
+        text=str(proposal),
         unit=firmware_named(flown.firmware).unit,
         again=None if check is None else FlownAgain(
             check.time, check.setpoint, check.rate, check.again
@@ -96,11 +95,11 @@ def _tried(
         return missing
 
 
-def _noise_shown(found: "AutopilotProposal") -> GyroNoise | None:
-    if found.noise is not None or found.flight is None:
-        return found.noise
-    told = gyro_noise(found.flight, found.flown.law, found.flown.axis, _SLOWEST)
-    return told if isinstance(told, GyroNoise) else None
+def _noise_shown(proposal: "AutopilotProposal") -> GyroNoise | None:
+    if proposal.noise is not None or proposal.flight is None:
+        return proposal.noise
+    noise = gyro_noise(proposal.flight, proposal.flown.law, proposal.flown.axis, _SLOWEST)
+    return noise if isinstance(noise, GyroNoise) else None
 
 
 VERDICTS = {
@@ -109,31 +108,31 @@ VERDICTS = {
 }  # fmt: skip
 
 
-def _headlines(found: "AutopilotProposal") -> list[Headline]:
-    headlines = [Headline(*VERDICTS[found.kind], found.verdict)]
-    again = found.reproduction
+def _headlines(proposal: "AutopilotProposal") -> list[Headline]:
+    headlines = [Headline(*VERDICTS[proposal.kind], proposal.verdict)]
+    again = proposal.reproduction
     if again is not None and again.kind == "flown":  # else the verdict says it
         headlines.append(Headline("good", "THE FLOWN LOOP AGAIN", again.verdict))
-    if found.filters is not None:
-        level = "good" if found.filters.flown else "warn"
-        headlines.append(Headline(level, "FILTERS", found.filters.text))
-    if found.throttle is not None:
-        level = "warn" if found.throttle.gains is None else "good"
-        headlines.append(Headline(level, "THROTTLE", found.throttle.text))
-        if found.throttle.curve is not None:
-            level = "warn" if found.throttle.curve.change else "good"
-            headlines.append(Headline(level, "THRUST CURVE", found.throttle.curve.text))
+    if proposal.filters is not None:
+        level = "good" if proposal.filters.flown else "warn"
+        headlines.append(Headline(level, "FILTERS", proposal.filters.text))
+    if proposal.throttle is not None:
+        level = "warn" if proposal.throttle.gains is None else "good"
+        headlines.append(Headline(level, "THROTTLE", proposal.throttle.text))
+        if proposal.throttle.curve is not None:
+            level = "warn" if proposal.throttle.curve.change else "good"
+            headlines.append(Headline(level, "THRUST CURVE", proposal.throttle.curve.text))
     return headlines
 
 
-def _proposed_law(found: "AutopilotProposal") -> RateLoop | None:
+def _proposed_law(proposal: "AutopilotProposal") -> RateLoop | None:
     """The law with the proposed filters; None where nothing is proposed."""
-    if not found.new:
+    if not proposal.new:
         return None
-    filters = {} if found.filters is None else dict(found.filters.flown)
+    filters = {} if proposal.filters is None else dict(proposal.filters.flown)
     if not filters:
-        return found.flown.law
-    return found.flown.with_filters({name: found.new[name] for name in filters})
+        return proposal.flown.law
+    return proposal.flown.with_filters({name: proposal.new[name] for name in filters})
 
 
 def _filters(law: RateLoop, after: RateLoop | None, axis: int) -> dict[str, Chains]:
@@ -159,23 +158,23 @@ def _spectra(
     noise: GyroNoise, axis: int, designs: Designs
 ) -> tuple[dict[str, Spectrum], dict[str, Spectrum]]:
     """Of gyro and D term: before all filters, then behind those of each design."""
-    seen = (noise.before.hertz > 1.0) & (noise.before.hertz <= noise.known_hz)
-    hertz, before = noise.before.hertz[seen], noise.before.power[seen]
-    behind = noise.behind.power[seen]
+    inside = (noise.before.hertz > 1.0) & (noise.before.hertz <= noise.known_hz)
+    hertz, before = noise.before.hertz[inside], noise.before.power[inside]
+    behind = noise.behind.power[inside]
     omega = 2 * np.pi * np.minimum(hertz, 0.4999 / designs["flown"][0].dt)
     law, gains = designs["flown"]
     gyro, derivative = {"before the filters": Spectrum(hertz, before)}, {}
     chain = gyro_chain_response(law, omega)
-    for name, (each, own) in designs.items():
-        changed = np.abs(gyro_chain_response(each, omega) / chain) ** 2
-        if name == "flown" or each is not law:
+    for name, (other, its_gains) in designs.items():
+        changed = np.abs(gyro_chain_response(other, omega) / chain) ** 2
+        if name == "flown" or other is not law:
             gyro[name] = Spectrum(hertz, behind * changed)
-        through = np.abs(own[2] * law_paths(each, axis, omega)[0][2]) ** 2
+        through = np.abs(its_gains[2] * law_paths(other, axis, omega)[0][2]) ** 2
         if name == "flown" and gains[2] > 0:
             slope = _response(chains_of(law, axis).get("D term", ()), hertz)
             open = before * through / np.abs(slope) ** 2
             derivative["before the filters"] = Spectrum(hertz, open)
-        if own[2] > 0:
+        if its_gains[2] > 0:
             derivative[name] = Spectrum(hertz, behind * changed * through)
     return gyro, derivative
 
@@ -183,17 +182,17 @@ def _spectra(
 def _response(
     chains: Sequence[FilterChain], hertz: Float[np.ndarray, " frequencies"]
 ) -> Complex[np.ndarray, " frequencies"]:
-    found = np.ones(hertz.size, complex)
-    for each in chains:
-        found = found * np.asarray(each.response(hertz))
-    return found
+    response = np.ones(hertz.size, complex)
+    for chain in chains:
+        response = response * np.asarray(chain.response(hertz))
+    return response
 
 
-def _steps(found: "AutopilotProposal", designs: Designs) -> dict[str, StepBand]:
+def _steps(proposal: "AutopilotProposal", designs: Designs) -> dict[str, StepBand]:
     """From set-point to rate, of plants drawn from the fit: by their responses."""
-    flown, axis = found.flown, found.flown.axis
-    grid, seed = StepGrid.of(flown.law.dt), found.settings.seed + _SEED
-    loops = found.plants.loops(flown.law, axis, _PLANTS, seed, omega=grid.omega)
+    flown, axis = proposal.flown, proposal.flown.axis
+    grid, seed = StepGrid.of(flown.law.dt), proposal.settings.seed + _SEED
+    loops = proposal.plants.loops(flown.law, axis, _PLANTS, seed, omega=grid.omega)
     steps = {}
     for name, (law, gains) in designs.items():
         mine = loops if law is flown.law else loops.of_law(law, axis)
@@ -227,8 +226,8 @@ class StepGrid(NamedTuple):
     def band(self, closed: Complex[np.ndarray, "plants frequencies"]) -> StepBand:
         """Of the responses from set-point to rate: median and 95 % of the plants."""
         ends = np.ones((len(closed), 1)), np.zeros((len(closed), 1))
-        whole = np.concatenate([ends[0], self.fade * closed, ends[1]], axis=1)
-        impulse = np.fft.irfft(whole, 2 * (self.omega.size + 1), axis=1)
+        response = np.concatenate([ends[0], self.fade * closed, ends[1]], axis=1)
+        impulse = np.fft.irfft(response, 2 * (self.omega.size + 1), axis=1)
         shown = int(_SHOWN / self.dt)
         low, middle, high = np.percentile(
             np.cumsum(impulse, axis=1)[:, :shown], [2.5, 50.0, 97.5], axis=0
@@ -254,20 +253,20 @@ def logged_terms(flight: FlightChannels) -> dict[str, float]:
 def _computed_terms(flight: FlightChannels, law: RateLoop, axis: int) -> dict[str, float]:
     size = min(int(_WINDOW / flight.dt), len(flight.setpoint))
     hertz = np.fft.rfftfreq(size, flight.dt)
-    seen = (hertz > 0) & (hertz < 0.4999 / law.dt)
-    back, ahead = law_paths(law, axis, 2 * np.pi * hertz[seen])
+    inside = (hertz > 0) & (hertz < 0.4999 / law.dt)
+    back, ahead = law_paths(law, axis, 2 * np.pi * hertz[inside])
     places = np.arange(0, len(flight.setpoint) - size + 1, size // 2)[:, None] + np.arange(size)
     taper = np.hanning(size)
     rate = flight.rates[min(axis, len(flight.rates) - 1)]
     r, y = (
-        np.fft.rfft((x[places] - x[places].mean(axis=1, keepdims=True)) * taper, axis=1)[:, seen]
+        np.fft.rfft((x[places] - x[places].mean(axis=1, keepdims=True)) * taper, axis=1)[:, inside]
         for x in (flight.setpoint, rate)
     )
-    found = {}
+    terms = {}
     for k, (name, gain) in enumerate(zip("PID", gains_of(law, axis), strict=True)):
         power = np.mean(np.sum(np.abs(gain * (ahead[k] * r - back[k] * y)) ** 2, axis=1))
-        found[name] = float(np.sqrt(2 * power / (size * np.sum(taper**2))))
-    return found
+        terms[name] = float(np.sqrt(2 * power / (size * np.sum(taper**2))))
+    return terms
 
 
 def motor_rows(flight: FlightChannels) -> list[tuple[str, float, float]]:
@@ -282,17 +281,17 @@ def motor_rows(flight: FlightChannels) -> list[tuple[str, float, float]]:
     ]
 
 
-def _stage_rows(found: "AutopilotProposal") -> Table:
+def _stage_rows(proposal: "AutopilotProposal") -> Table:
     names = ["what flew", "a third of the way", "all of it"]
-    stages = list(found.stages)
-    levels = () if found.throttle is None else found.throttle.logged
-    if found.filters is not None and found.filters.flown and found.filters.gains_alone:
+    stages = list(proposal.stages)
+    levels = () if proposal.throttle is None else proposal.throttle.logged
+    if proposal.filters is not None and proposal.filters.flown and proposal.filters.gains_alone:
         names.append("gains alone, filters as flown")
-        stages.append(found.filters.gains_alone)
+        stages.append(proposal.filters.gains_alone)
     rows: list[list[str | Cell]] = [
         [
             name, f"{100 * x.stable:.1f}", f"{x.peak:.2f}", f"{x.resonance:.2f}",
-            f"{x.crossover / (2 * np.pi):.1f}", margin_text(x),
+            f"{x.crossover / (2 * np.pi):.1f}", x.margin_text,
             f"{x.rejection:.2f}", f"{x.noise:.2f}", *_further(x),
             *(f"{peak:.2f}" for peak in x.peaks[: len(levels)]),
         ]
@@ -303,16 +302,16 @@ def _stage_rows(found: "AutopilotProposal") -> Table:
         "gains", "stable, %", "worst Ms", "worst peak", "crossover, Hz", "delay margin, ms",
         "torque", "noise", *(("Ms, integral held",) if first.relaxed is not None else ()),
         *(("Ms, angle loop", "peak, angle loop") if first.angle is not None else ()),
-        *(f"Ms at throttle {each:.2f}" for each in levels),
+        *(f"Ms at throttle {level:.2f}" for level in levels),
     )  # fmt: skip
-    return Table(f"On {found.settings.fresh} fresh plants", heads, rows)
+    return Table(f"On {proposal.settings.fresh} fresh plants", heads, rows)
 
 
 def _further(stage: Stage) -> list[str]:
     """With the integral held, and of the angle loop, where there are such."""
-    held = [] if stage.relaxed is None else [f"{stage.relaxed:.2f}"]
+    relaxed = [] if stage.relaxed is None else [f"{stage.relaxed:.2f}"]
     angle = stage.angle
-    return held if angle is None else [*held, f"{angle.peak:.2f}", f"{angle.resonance:.2f}"]
+    return relaxed if angle is None else [*relaxed, f"{angle.peak:.2f}", f"{angle.resonance:.2f}"]
 
 
 def change_rows(changes: Sequence[ParameterChange], words: Sequence[WordChange] = ()) -> Table:
@@ -323,7 +322,7 @@ def change_rows(changes: Sequence[ParameterChange], words: Sequence[WordChange] 
         ]
         for row, old, new, reason in changes
     ]  # fmt: skip
-    rows += [[Cell(each.name), each.old, each.new, "", "", each.reason] for each in words]
+    rows += [[Cell(word.name), word.old, word.new, "", "", word.reason] for word in words]
     heads = ("parameter", "old", "new", "unit", "range", "reason")
     return Table("From what flew to the proposal", heads, rows)
 

@@ -2,30 +2,101 @@
 
 import dataclasses
 import shlex
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
-from jaxquad._core import announce, Message, plain_content
+from jaxquad._core import announce, Message, plain_content, write_file
 from jaxquad.records import AXES
 from jaxquad.report import Provenance, provenance, write_json
 
-from ._files import change_table, ParameterChange
+from ._files import (
+    change_table,
+    parameter_file,
+    ParameterChange,
+    propose_changes,
+    write_parameter_files,
+)
 from ._firmware import firmware_named
-from ._flight_channels import FlightChannels
-from ._flown_autopilot import FlownAutopilot
+from ._flight_channels import FlightChannels, FlownAutopilot
 from ._gyro_noise import GyroNoise
 from ._identified import DesignSettings, IdentifiedPlant
-from ._limits import limits_text
-from ._loop_check import LoopCheck
+from ._law_check import LoopCheck
 from ._over_throttle import ThrottleVerdict
 from ._page import write_pilot_page
+from ._parameters import find_parameter
 from ._pilot_page import pilot_page
 from ._plants import PlantSource
-from ._proposed_parameters import ProposedParameters
 from ._rate_design import FilterVerdict, Kind
-from ._stages import margin_text, OuterStage, Stage
+from ._stages import limits_text, Stage
+
+
+_THIRD, _ALL = 1 / 3, 1.0
+_STEM = "proposal"
+
+
+@dataclasses.dataclass(frozen=True)
+class ProposedParameters:
+    """Old and new values by the firmware's names, of one axis or of all.
+
+    **Attributes:**
+
+    - `old`: what flew; `new`: what is proposed, empty where nothing is.
+    - `reasons`: for each new one; `at_once`: those that have no third of the way.
+    """
+
+    firmware: str
+    version: tuple[int, ...]
+    old: dict[str, float]
+    new: dict[str, float] = dataclasses.field(default_factory=dict)
+    reasons: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    at_once: tuple[str, ...] = ()
+
+    @classmethod
+    def joined(cls, parts: Sequence["ProposedParameters"]) -> "ProposedParameters":
+        """Of several axes; what they share is the first one's."""
+        first, old, new, reasons = parts[0], {}, {}, {}
+        for part in reversed(parts):
+            old, new, reasons = old | part.old, new | part.new, reasons | dict(part.reasons)
+        at_once = tuple(dict.fromkeys(name for part in parts for name in part.at_once))
+        order = {name: None for part in parts for name in part.old}
+        in_order = lambda values: {name: values[name] for name in order if name in values}
+        return cls(first.firmware, first.version, in_order(old), in_order(new), reasons, at_once)
+
+    @property
+    def changes(self) -> tuple[ParameterChange, ...]:
+        """From what flew to the proposal."""
+        return propose_changes(
+            self.firmware, self.old, self.new, reasons=self.reasons, beyond=list(self.new)
+        )
+
+    def write(self, folder: Path) -> list[Path]:
+        """A third of the way, all of it, what reverts them and a table; or what flew alone."""
+        if not self.new:
+            same = [
+                ParameterChange(find_parameter(self.firmware, name), value, value)
+                for name, value in self.old.items()
+            ]
+            return [self.write_one(f"{_STEM}_revert", same, "what flew", folder, revert=True)]
+        files = write_parameter_files(
+            folder, self.firmware, self.old, self.new, stem=_STEM, shares=(_THIRD, _ALL),
+            reasons=self.reasons, beyond=list(self.new), version=self.version or (2025, 12),
+            at_once=self.at_once, profile=None,
+        )  # fmt: skip
+        return [*files.stages, files.revert, files.table]
+
+    def write_one(
+        self, stem: str, changes: Sequence[ParameterChange], title: str, folder: Path, *,
+        revert: bool,
+    ) -> Path:  # fmt: skip
+        """One file with these changes, or with what they were."""
+        raised = [axis for axis in AXES if f"d_max_{axis}" in self.old]
+        text = parameter_file(
+            self.firmware, changes, revert=revert, version=self.version or (2025, 12),
+            raised=raised, title=title, profile=None,
+        )  # fmt: skip
+        return write_file(folder / f"{stem}.{firmware_named(self.firmware).suffix}", text)
 
 
 _CURVE = "thrust_curve"
@@ -70,11 +141,10 @@ class AutopilotProposal:
     @property
     def plants(self) -> PlantSource:
         """What the log leaves possible."""
-        found = self.identification
+        plant, measured = self.identification, self.flown.measured
         if self.throttle is not None:
-            return self.throttle.plants(found, self.flown.measured)
-        unit = found.records[0].output_units[0]
-        return PlantSource(found.fit, unit, filters=self.flown.measured)
+            return self.throttle.plants(plant, measured)
+        return PlantSource(plant.fit, plant.records[0].output_units[0], filters=measured)
 
     @property
     def old(self) -> dict[str, float]:
@@ -118,8 +188,13 @@ class AutopilotProposal:
             f"what flew; Ms {before.peak:.2f} -> {after.peak:.2f}"
         )
         reasons = dict.fromkeys(self.new, why)
-        for name in self._at_limit:
-            reasons[name] += f"; at the limit of a factor of {self.settings.change:g} (`change`)"
+        far = _FAR * self.settings.change
+        for name, old in self.flown.old.items():
+            factor = self.new[name] / old if name in self.new else 1.0
+            if max(factor, 1 / factor) >= far:
+                reasons[name] += (
+                    f"; at the limit of a factor of {self.settings.change:g} (`change`)"
+                )
         if self.filters is not None:
             reasons |= dict.fromkeys(self.filters.flown, self.filters.reason)
         if before.angle is not None and after.angle is not None:
@@ -128,16 +203,9 @@ class AutopilotProposal:
             )
         return {name: reason for name, reason in reasons.items() if name in self.new}
 
-    @property
-    def _at_limit(self) -> list[str]:
-        """Gains that are as far from what flew as `change` lets them be."""
-        flown, far = self.flown.old, _FAR * self.settings.change
-        away = {name: self.new[name] / old for name, old in flown.items() if name in self.new}
-        return [name for name, factor in away.items() if max(factor, 1 / factor) >= far]
-
     def content(self) -> dict[str, object]:
         """All of it, for JSON."""
-        found = {
+        content = {
             "kind": self.kind,
             "verdict": self.verdict,
             "firmware": self.flown.firmware,
@@ -157,7 +225,7 @@ class AutopilotProposal:
             "settings": self.settings.content(),
             "identified_with": self.identification.settings.content(),
         }
-        return {key: plain_content(value) for key, value in found.items()}
+        return {key: plain_content(value) for key, value in content.items()}
 
     @property
     def _plant(self) -> dict[str, object]:
@@ -191,10 +259,10 @@ class AutopilotProposal:
 
     def provenance(self, settings: DesignSettings) -> Provenance:
         """Of a result with these settings."""
-        known = {k: v for k, v in settings.content().items() if v is not None}
+        stated = {k: v for k, v in settings.content().items() if v is not None}
         log = self.identification.path
         words = ["jaxquad", "autopilot", str(log), *settings.words()]
-        return provenance(log, command=shlex.join(words), settings=known)
+        return provenance(log, command=shlex.join(words), settings=stated)
 
     def write_curve(self, folder: Path) -> list[Path]:
         """The thrust curve's parameter and what flew of it, never in a file with gains."""
@@ -217,7 +285,7 @@ class AutopilotProposal:
         version = ".".join(map(str, flown.version))
         lines = [f"{flown.firmware} {version}, rate loop of {AXES[flown.axis]}".replace(" ,", ",")]
         lines += [f"  {name} = {value:.6g}" for name, value in self.old.items()]
-        lines += [f"  not modelled: {each}" for each in flown.unmodelled]
+        lines += [f"  not modelled: {text}" for text in flown.unmodelled]
         lines += [f"  {flown.filters_text}"] if flown.filters_text else []
         plant = "plant up to the gyro's filters, in the firmware's units"
         lines += ["", f"{plant}:\n{self.identification.fit}"]
@@ -237,14 +305,8 @@ class AutopilotProposal:
             lines += ["", f"thrust curve: {curve.text}"]
             if curve.change is not None:
                 lines += ["", change_table([curve.change]).rstrip()]
-        return "\n".join([*lines, "", self._verdict_below_the_plant])
-
-    @property
-    def _verdict_below_the_plant(self) -> str:
-        """The verdict, without what was just said of the plant."""
-        return Message(self.verdict).in_words(
-            lambda term: "it does not determine the plant (above)"
-        )
+        below = "it does not determine the plant (above)"
+        return "\n".join([*lines, "", Message(self.verdict).in_words(lambda summary: below)])
 
 
 _WAYS = ("what flew", "a third of the way", "all of it")
@@ -262,7 +324,7 @@ def _throttle_lines(throttle: ThrottleVerdict, stages: tuple[Stage, ...]) -> lis
         return lines
     lines.append(throttle.table)
     if stages:
-        heads = " ".join(f"{each:6.2f}" for each in throttle.logged)
+        heads = " ".join(f"{level:6.2f}" for level in throttle.logged)
         lines += ["", f"{'worst Ms at throttle':<20} {heads}"]
         for name, stage in zip(_WAYS, stages, strict=False):
             lines.append(f"{name:<20} " + " ".join(f"{peak:6.2f}" for peak in stage.peaks))
@@ -271,25 +333,107 @@ def _throttle_lines(throttle: ThrottleVerdict, stages: tuple[Stage, ...]) -> lis
 
 def _stage_table(stages: tuple[Stage, ...]) -> str:
     first = stages[0]
-    held = "   Ms held" if first.relaxed is not None else ""
-    angle = "   Ms angle" if first.angle is not None else ""
+    relaxed = "   Ms held" if first.relaxed is not None else ""
+    around = "   Ms angle" if first.angle is not None else ""
     heads = "stable   worst Ms   resonance   crossover   delay margin   torque   noise"
-    rows = [f"{'on fresh plants':<20} {heads}{held}{angle}"]
+    rows = [f"{'on fresh plants':<20} {heads}{relaxed}{around}"]
     for name, stage in zip(_WAYS, stages, strict=False):
         row = (
             f"{name:<20} {100 * stage.stable:5.1f} % {stage.peak:9.2f} {stage.resonance:9.2f} "
-            f"  {stage.crossover / (2 * np.pi):8.1f} Hz {margin_text(stage):>9} ms "
+            f"  {stage.crossover / (2 * np.pi):8.1f} Hz {stage.margin_text:>9} ms "
             f"{stage.rejection:8.2f} {stage.noise:7.2f}"
         )
         row += "" if stage.relaxed is None else f" {stage.relaxed:9.2f}"
         rows.append(row + ("" if stage.angle is None else f" {stage.angle.peak:10.2f}"))
-    of_held = [_OF_HELD] if held else []
-    return "\n".join([*rows, _OF_STAGES, *of_held, *_of_angle(first.angle)])
+    rows += [_OF_STAGES, *([_OF_HELD] if relaxed else [])]
+    if (angle := first.angle) is not None:
+        flew = "as it flew" if angle.closed else "which was open in this flight"
+        which = f"{angle.parameter} {angle.value:.3g}, {flew}"
+        rows.append(f"(Ms angle: of the angle loop around it, {which})")
+    return "\n".join(rows)
 
 
-def _of_angle(angle: OuterStage | None) -> list[str]:
-    """Which angle loop is meant, and whether it flew."""
-    if angle is None:
-        return []
-    flew = "as it flew" if angle.closed else "which was open in this flight"
-    return [f"(Ms angle: of the angle loop around it, {angle.parameter} {angle.value:.3g}, {flew})"]
+_ORDER: tuple[Kind, ...] = ("proposed", "kept", "not to be flown", "cannot tell")
+
+
+@dataclasses.dataclass(frozen=True)
+class AxesProposal:
+    """What `autopilot` found for each axis of a log; `str()` is its report as text.
+
+    **Attributes:**
+
+    - `axes`: an `AutopilotProposal` by the axis' name.
+    - `unread`: why an axis is not among them.
+    """
+
+    settings: DesignSettings
+    axes: Mapping[str, AutopilotProposal]
+    unread: Mapping[str, str] = dataclasses.field(default_factory=dict)
+
+    @property
+    def kind(self) -> Kind:
+        """The best of the axes: "proposed" where one of them has gains."""
+        kinds = {one.kind for one in self.axes.values()}
+        return next(kind for kind in _ORDER if kind in kinds)
+
+    @property
+    def verdict(self) -> str:
+        """In words, an axis each line."""
+        lines = [f"{axis}: {one.verdict}" for axis, one in self.axes.items()]
+        return "\n".join([*lines, *(f"{axis}: {why}" for axis, why in self.unread.items())])
+
+    @property
+    def new(self) -> dict[str, float]:
+        """The proposed parameters of all axes by name."""
+        return self._parameters.new
+
+    @property
+    def old(self) -> dict[str, float]:
+        """What flew of them; without a proposal what flew of all axes."""
+        return self._parameters.old
+
+    @property
+    def _parameters(self) -> ProposedParameters:
+        parts = [one.parameters for one in self.axes.values()]
+        proposed = [part for part in parts if part.new]
+        return ProposedParameters.joined(proposed or parts)
+
+    def content(self) -> dict[str, object]:
+        """All of it, for JSON."""
+        return {
+            "kind": self.kind,
+            "verdict": self.verdict,
+            "old": self.old,
+            "new": self.new,
+            "axes": {axis: one.content() for axis, one in self.axes.items()},
+            "unread": dict(self.unread),
+            "settings": self.settings.content(),
+        }
+
+    def write(self, folder: str | Path) -> list[Path]:
+        """Write the page, `autopilot.json`, and one parameter file of all axes for each stage.
+
+        **Returns:** their paths.
+        """
+        announce("parameter files")
+        folder, first = Path(folder), next(iter(self.axes.values()))
+        origin = first.provenance(self.settings)
+        stored = write_json(
+            folder / "autopilot.json", self.content() | {"provenance": origin.content()}
+        )
+        curves = (one.write_curve(folder) for one in self.axes.values())
+        curve = next((paths for paths in curves if paths), [])
+        files = self._parameters.write(folder)
+        announce("the page")
+        flown = first.flown
+        overview = f"{flown.firmware} {'.'.join(map(str, flown.version))}, rate loops".strip()
+        pages = [pilot_page(one, origin, overview) for one in self.axes.values()]
+        page = write_pilot_page(folder / "autopilot.html", *pages)
+        return [page, stored, *curve, *files]
+
+    def __str__(self) -> str:
+        parts = [str(one) for one in self.axes.values()]
+        parts += [f"{axis}: {why}" for axis, why in self.unread.items()]
+        if len(self.axes) > 1:
+            parts.append(f"All axes:\n{self.verdict}")
+        return "\n\n".join(parts)

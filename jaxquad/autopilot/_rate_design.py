@@ -10,15 +10,12 @@ import numpy as np
 from jaxquad._core import announce
 
 from ._files import propose_changes
-from ._filter_choices import filter_choices
 from ._firmware import firmware_named, OuterLoop
-from ._flight_channels import FlightChannels
-from ._flown_autopilot import FlownAutopilot
+from ._flight_channels import FlightChannels, FlownAutopilot
 from ._gyro_noise import gyro_noise, GyroNoise, NoNoise
 from ._identified import DesignSettings, IdentifiedPlant
-from ._limits import beyond_angle, beyond_limits
 from ._over_throttle import ThrottleVerdict
-from ._parameters import find_parameter
+from ._parameters import filter_choices, find_parameter
 from ._rate_gains import (
     ceiling_in,
     gains_in,
@@ -28,7 +25,7 @@ from ._rate_gains import (
     RateLoops,
 )
 from ._rate_search import filter_values, FilterBank, Search, shared_change, SharedChange, Targets
-from ._stages import certify_angle, certify_gains, Stage
+from ._stages import beyond_angle, beyond_limits, certify_angle, certify_gains, Stage
 
 
 Kind = Literal["proposed", "kept", "cannot tell", "not to be flown"]
@@ -74,7 +71,7 @@ class FilterVerdict:
         }
 
 
-class Design(NamedTuple):
+class RateDesign(NamedTuple):
     """What is proposed, and what it gives on fresh plants: what flew, a third, and all of it."""
 
     kind: Kind
@@ -87,18 +84,18 @@ class Design(NamedTuple):
 
 def design_gains(
     settings: DesignSettings,
-    found: IdentifiedPlant,
+    plant: IdentifiedPlant,
     flown: FlownAutopilot,
     flight: FlightChannels | None,
     throttle: ThrottleVerdict,
     filters: Mapping[str, float],
-) -> Design:
+) -> RateDesign:
     """Search gains, and filters where the log shows the gyro's noise; certify the rounded ones.
 
     With `filters` that another axis has changed, these stay, and gains alone are searched.
     """
     swings = 0.0 if flight is None else float(np.mean(flight.limited))
-    work = _Work(settings, found, flown, throttle, swings=swings)
+    work = _Work(settings, plant, flown, throttle, swings=swings)
     noise, why = _noise_of(settings, flown, flight, work)
     if filters:
         return _design_behind(dataclasses.replace(work, noise=noise), filters, swings)
@@ -126,15 +123,15 @@ def design_gains(
                 design = work.certified(fresh, parameters_of(flown.law, flown.axis, both), filters)
             design, verdict = _compared(work, plain, design, bank, noise)
         kind, text = _judge(
-            design.stages, settings, found.band[1], verdict.shared, throttle, swings
+            design.stages, settings, plant.band[1], verdict.shared, throttle, swings
         )
         if kind != "not to be flown":
             break
         loops = loops.joined(design.loops[-1].worst(design.gains[-1][None], _WORST))
-    return Design(kind, text, design.stages, design.new, verdict, noise)
+    return RateDesign(kind, text, design.stages, design.new, verdict, noise)
 
 
-def _design_behind(work: "_Work", filters: Mapping[str, float], swings: float) -> Design:
+def _design_behind(work: "_Work", filters: Mapping[str, float], swings: float) -> RateDesign:
     """Gains alone, behind filters that another axis has changed."""
     flown, settings = work.flown, work.settings
     loops, gains = work.loops(settings.members, 0), None
@@ -147,7 +144,7 @@ def _design_behind(work: "_Work", filters: Mapping[str, float], swings: float) -
         gains = search.gains(gains)
         parameters = parameters_of(flown.law, flown.axis, gains)
         design = work.certified(work.fresh(attempt), parameters, filters)
-        edge = work.found.band[1]
+        edge = work.plant.band[1]
         kind, text = _judge(design.stages, settings, edge, None, work.throttle, swings)
         if kind != "not to be flown":
             break
@@ -155,7 +152,7 @@ def _design_behind(work: "_Work", filters: Mapping[str, float], swings: float) -
     before = work.flown_filters(filters)
     listed = ", ".join(filters)
     verdict = FilterVerdict(f"{listed} as changed for another axis", before, "for another axis")
-    return Design(kind, text, design.stages, design.new, verdict, work.noise)
+    return RateDesign(kind, text, design.stages, design.new, verdict, work.noise)
 
 
 class _Certified(NamedTuple):
@@ -169,7 +166,7 @@ class _Certified(NamedTuple):
 @dataclasses.dataclass(frozen=True)
 class _Work:
     settings: DesignSettings
-    found: IdentifiedPlant
+    plant: IdentifiedPlant
     flown: FlownAutopilot
     throttle: ThrottleVerdict
     noise: GyroNoise | None = None
@@ -186,7 +183,7 @@ class _Work:
         stable = float(np.mean(loops.qualities(self.before[None]).stable))
         far = 2 if stable < _BELIEVED and self.swings > _SWINGING else 1
         return Targets(
-            kept.sensitivity, kept.resonance, kept.noise, kept.change**far, self.found.band[1]
+            kept.sensitivity, kept.resonance, kept.noise, kept.change**far, self.plant.band[1]
         )
 
     def loops(self, count: int, seed: int) -> RateLoops:
@@ -197,8 +194,8 @@ class _Work:
         """
         share = -(-count // max(len(self.throttle.certified), 1))
         first, *others = self._groups(share, seed)
-        if all(each.law is self.flown.law for each in self._flown_there):  # one group is quicker
-            plants = np.concatenate([first.plants, *(each.plants for each in others)])
+        if all(flown.law is self.flown.law for flown in self._flown_there):  # one group is quicker
+            plants = np.concatenate([first.plants, *(flown.plants for flown in others)])
             return dataclasses.replace(first, plants=plants)
         return grouped([first, *others])
 
@@ -208,13 +205,13 @@ class _Work:
 
     def _groups(self, count: int, seed: int) -> list[RateLoops]:
         source, seed = (
-            self.throttle.plants(self.found, self.flown.measured),
+            self.throttle.plants(self.plant, self.flown.measured),
             self.settings.seed + seed,
         )
         places = self.throttle.certified or (None,)
         groups = [
-            source.loops(each.law, each.axis, count, seed, throttle=throttle, angle=each.angle)
-            for each, throttle in zip(self._flown_there, places, strict=True)
+            source.loops(flown.law, flown.axis, count, seed, throttle=throttle, angle=flown.angle)
+            for flown, throttle in zip(self._flown_there, places, strict=True)
         ]
         return self._heard(groups)
 
@@ -230,10 +227,12 @@ class _Work:
         if self.noise is None:
             return groups
         # What was measured has passed the flown loop.
-        opened = [np.abs(1 + (self.before @ each.feedback) * each.plants) ** 2 for each in groups]
+        opened = [
+            np.abs(1 + (self.before @ group.feedback) * group.plants) ** 2 for group in groups
+        ]
         power = self.noise.powers(self.noise.behind, groups[0].omega)
         noise = power * np.median(np.concatenate(opened), axis=0)
-        return [dataclasses.replace(each, noise=noise) for each in groups]
+        return [dataclasses.replace(group, noise=noise) for group in groups]
 
     def bank(self, loops: RateLoops) -> FilterBank | None:
         if self.noise is None:
@@ -251,11 +250,11 @@ class _Work:
     ) -> _Certified:
         """What flew, a third of the way and all of it, with their filters, as stored."""
         announce(f"certifying the rounded numbers on {self.settings.fresh} new plants")
-        law, axis, whole = self.flown.law, self.flown.axis, dict(gains) | dict(filters)
-        third = self._third(whole, filters)
-        ways = (third, whole)
+        law, axis, new = self.flown.law, self.flown.axis, dict(gains) | dict(filters)
+        third = self._third(new, filters)
+        ways = (third, new)
         ceiling = ceiling_in(law, axis, ways)
-        loops = [grouped(dataclasses.replace(each, ceiling=ceiling) for each in fresh.groups)]
+        loops = [grouped(dataclasses.replace(group, ceiling=ceiling) for group in fresh.groups)]
         for way in ways:
             parts = {name: way[name] for name in filters}
             loops.append(self.filtered(loops[0], parts) if filters else loops[0])
@@ -265,20 +264,20 @@ class _Work:
         if angle is not None:
             last = self._angle_value(loops[-1].worst(designs[-1][None], _WORST), designs[-1], angle)
             if last != angle.value:
-                whole[angle.name] = last
-            values = angle.value, self._third(whole, filters).get(angle.name, angle.value), last
+                new[angle.name] = last
+            values = angle.value, self._third(new, filters).get(angle.name, angle.value), last
             stages = [
                 stage._replace(angle=certify_angle(one, gains, angle, value))
                 for stage, one, gains, value in zip(stages, loops, designs, values, strict=True)
             ]
-        return _Certified(tuple(stages), whole, dict(filters), designs, loops)
+        return _Certified(tuple(stages), new, dict(filters), designs, loops)
 
     def _angle_value(self, loops: RateLoops, gains: np.ndarray, angle: OuterLoop) -> float:
         """The greatest stored gain, up to what flew, with which the angle loop keeps the limits."""
         kept = self.settings
         row = find_parameter(self.flown.firmware, angle.name)
         values = angle.value * np.geomspace(1.0, 1 / kept.change, _ANGLES)
-        values[1:] = [np.rint(x) if row.whole else float(f"{x:.2g}") for x in values[1:]]
+        values[1:] = [np.rint(x) if row.integer else float(f"{x:.2g}") for x in values[1:]]
         if not angle.closed:
             return angle.value
         for value in values:
@@ -290,7 +289,7 @@ class _Work:
 
     def filtered(self, flown: RateLoops, filters: Mapping[str, float]) -> RateLoops:
         """The loops with other filters, at each throttle."""
-        laws = [each.with_filters(filters) for each in self._flown_there]
+        laws = [flown_there.with_filters(filters) for flown_there in self._flown_there]
         return grouped(
             loops.of_law(law, self.flown.axis)
             for loops, law in zip(flown.groups, laws, strict=True)
@@ -342,8 +341,8 @@ def _noise_of(
     announce("the gyro's noise")
     loops = work.loops(1, 0)
     crossover = float(loops.qualities(work.before[None]).crossover[0, 0])
-    found = gyro_noise(flight, flown.law, flown.axis, 2 * crossover / (2 * np.pi))
-    return (None, found.reason) if isinstance(found, NoNoise) else (found, "")
+    noise = gyro_noise(flight, flown.law, flown.axis, 2 * crossover / (2 * np.pi))
+    return (None, noise.reason) if isinstance(noise, NoNoise) else (noise, "")
 
 
 def _compared(
@@ -399,17 +398,17 @@ def _judge(
     swings: float = 0.0,
 ) -> tuple[Kind, str]:
     """The verdict; `swings` is the share of the flight with a motor at its limit."""
-    flown, third, whole = stages
+    flown, third, new = stages
     bounded = flown.stable < _BELIEVED and swings > _SWINGING  # by the motors alone
-    third = whole if bounded else third
-    beyond = beyond_limits(flown, third, whole, settings, edge, loud=_ALLOWED)
+    third = new if bounded else third
+    beyond = beyond_limits(flown, third, new, settings, edge, loud=_ALLOWED)
     if shared is not None and shared.noise > _ALLOWED * settings.noise:
         beyond.append(
             f"the command's noise on another axis is {shared.noise:.2f} of what flew, above "
             f"{settings.noise:g}"
         )
-    if whole.angle is not None and whole.angle.closed:
-        beyond += beyond_angle(whole.angle, settings)
+    if new.angle is not None and new.angle.closed:
+        beyond += beyond_angle(new.angle, settings)
     if beyond and flown.stable < _BELIEVED and not bounded:
         return "cannot tell", (
             "this log cannot tell: the loop flew, but with the gains that flew it is stable on "
@@ -424,34 +423,34 @@ def _judge(
         )
     limit, plants = settings.sensitivity, f"{settings.fresh} fresh plants"
     if throttle.logged:
-        at = ", ".join(f"{each:.2f}" for each in throttle.logged)
+        at = ", ".join(f"{level:.2f}" for level in throttle.logged)
         plants += f" at each of the throttles {at}"
-    better = f"{whole.rejection:.2f} of the flown effect of a step of torque"
+    better = f"{new.rejection:.2f} of the flown effect of a step of torque"
     within = flown.peak <= limit and flown.resonance <= settings.resonance
     if flown.angle is not None and flown.angle.closed:
         within = within and not beyond_angle(flown.angle, settings)
-    if flown.stable == 1 and within and whole.rejection > _WORTH:
+    if flown.stable == 1 and within and new.rejection > _WORTH:
         return "kept", (
             f"what flew is kept: within the limits the best gains leave {better}. Its worst Ms on "
             f"{plants} is {flown.peak:.2f}"
         )
     if bounded:
         return "proposed", (
-            f"proposed: stable on all {plants}, worst Ms {whole.peak:.2f} of at most {limit:g}"
-            f"{_around(flown, whole)}. What flew is stable on {100 * flown.stable:.0f} % of them: "
+            f"proposed: stable on all {plants}, worst Ms {new.peak:.2f} of at most {limit:g}"
+            f"{_around(flown, new)}. What flew is stable on {100 * flown.stable:.0f} % of them: "
             f"it swung between the motors' limits ({100 * swings:.0f} % of the flight). A third of "
             "the way would swing, too, so both files hold all of it, and gains may be further from "
             f"what flew than {settings.change:g} times (`change`): hover low with it first"
         )
     return "proposed", (
-        f"proposed: stable on all {plants}, worst Ms {whole.peak:.2f} of at most "
-        f"{limit:g}, {better}{_around(flown, whole)}. {_first(flown, third, settings)}"
+        f"proposed: stable on all {plants}, worst Ms {new.peak:.2f} of at most "
+        f"{limit:g}, {better}{_around(flown, new)}. {_first(flown, third, settings)}"
     )
 
 
-def _around(flown: Stage, whole: Stage) -> str:
+def _around(flown: Stage, new: Stage) -> str:
     """What the proposal does to the angle loop."""
-    before, after = flown.angle, whole.angle
+    before, after = flown.angle, new.angle
     if before is None or after is None or not after.closed:
         return ""
     moved = f"{after.parameter} {before.value:.3g}"

@@ -85,7 +85,7 @@ class RateLoops:
     - `forward`: response of the law's feed-forward, from the set-point to the command.
     - `angle`: of the angle loop around this one, from rate to minus the set-point, per 1/s of its
         gain; None where there is none.
-    - `beside`: loops at other throttles, under the law there; their plants count, too.
+    - `others`: loops at other throttles, under the law there; their plants count, too.
     """
 
     omega: Float[np.ndarray, " frequencies"]
@@ -99,12 +99,12 @@ class RateLoops:
     relaxed: bool = False
     forward: Complex[np.ndarray, " frequencies"] | None = None
     angle: Complex[np.ndarray, " frequencies"] | None = None
-    beside: tuple["RateLoops", ...] = ()
+    others: tuple["RateLoops", ...] = ()
 
     @property
     def groups(self) -> tuple["RateLoops", ...]:
         """For each throttle its own."""
-        return dataclasses.replace(self, beside=()), *self.beside
+        return dataclasses.replace(self, others=()), *self.others
 
     def of_law(self, law: RateLoop, axis: int) -> "RateLoops":
         """The same plants under a law with other filters, as exactly as those of the flown one.
@@ -121,27 +121,29 @@ class RateLoops:
     def worst(self, gains: Gains, count: int) -> "RateLoops":
         """With those plants alone that have the greatest peaks under these gains."""
         groups, peaks = self.groups, []
-        for each in groups:
-            found = each.qualities(gains)
-            peak = np.where(found.stable, np.maximum(found.peak, found.resonance), np.inf)
+        for group in groups:
+            qualities = group.qualities(gains)
+            peak = np.where(
+                qualities.stable, np.maximum(qualities.peak, qualities.resonance), np.inf
+            )
             peaks.append(peak.max(axis=0))
         chosen = np.zeros(sum(map(len, peaks)), bool)
         chosen[np.argsort(np.concatenate(peaks), kind="stable")[-count:]] = True
         parts = np.split(chosen, np.cumsum([len(peak) for peak in peaks])[:-1])
         return grouped(
-            dataclasses.replace(each, plants=each.plants[part])
-            for each, part in zip(groups, parts, strict=True)
+            dataclasses.replace(group, plants=group.plants[part])
+            for group, part in zip(groups, parts, strict=True)
         )
 
     def joined(self, others: "RateLoops") -> "RateLoops":
         """With the plants of `others`, each at its throttle, under the laws of these."""
-        plants = [each.plants for each in others.groups]
-        groups = self.groups if self.beside else (self,)
-        if not self.beside:
+        plants = [group.plants for group in others.groups]
+        groups = self.groups if self.others else (self,)
+        if not self.others:
             plants = [np.concatenate(plants)]
         return grouped(
-            dataclasses.replace(each, plants=np.concatenate([each.plants, more]))
-            for each, more in zip(groups, plants, strict=True)
+            dataclasses.replace(group, plants=np.concatenate([group.plants, more]))
+            for group, more in zip(groups, plants, strict=True)
         )
 
     def qualities(self, gains: Gains, filters: Filters | None = None) -> LoopQualities:
@@ -149,9 +151,9 @@ class RateLoops:
 
         `filters` are the responses of other filters over those that flew.
         """
-        found = [self._own_qualities(gains, filters)]
-        found += [each.qualities(gains, filters) for each in self.beside]
-        return found[0] if len(found) == 1 else together(found)
+        qualities = [self._own_qualities(gains, filters)]
+        qualities += [loops.qualities(gains, filters) for loops in self.others]
+        return qualities[0] if len(qualities) == 1 else together(qualities)
 
     def _own_qualities(self, gains: Gains, filters: Filters | None) -> LoopQualities:
         base = self._qualities(*self.paths(gains, filters))
@@ -162,12 +164,12 @@ class RateLoops:
     def relaxed_qualities(self, gains: Gains) -> LoopQualities:
         """With the integral held where it can be held in flight, D as set and at its ceiling."""
         parts = []
-        for each in self.groups:
-            if not each.relaxed:
-                parts.append(each._own_qualities(gains, None))
+        for group in self.groups:
+            if not group.relaxed:
+                parts.append(group._own_qualities(gains, None))
                 continue
-            base = each._moved(gains, None, (1.0, 0.0, 1.0))
-            raised = each._moved(gains, None, (1.0, 0.0, each.ceiling))
+            base = group._moved(gains, None, (1.0, 0.0, 1.0))
+            raised = group._moved(gains, None, (1.0, 0.0, group.ceiling))
             parts.append(_worst_of(base, raised))
         return together(parts)
 
@@ -180,18 +182,18 @@ class RateLoops:
         self, gains: Float[np.ndarray, " gains"]
     ) -> Complex[np.ndarray, "plants frequencies"]:
         """Of the rate, of all groups."""
-        return np.concatenate([gains @ each.feedback * each.plants for each in self.groups])
+        return np.concatenate([gains @ group.feedback * group.plants for group in self.groups])
 
     def outer_loops(
         self, gains: Float[np.ndarray, " gains"], angle_gain: float
     ) -> Complex[np.ndarray, "plants frequencies"]:
         """Of the angle with a gain in 1/s, of all groups; the true rate is before the filters."""
         loops = []
-        for each in self.groups:
-            assert each.angle is not None
-            ahead = gains @ each.ahead + (0 if each.forward is None else each.forward)
-            rate = ahead * each.plants / each.passed / (1 + gains @ each.feedback * each.plants)
-            loops.append(angle_gain * each.angle * rate)
+        for group in self.groups:
+            assert group.angle is not None
+            ahead = gains @ group.ahead + (0 if group.forward is None else group.forward)
+            rate = ahead * group.plants / group.passed / (1 + gains @ group.feedback * group.plants)
+            loops.append(angle_gain * group.angle * rate)
         return np.concatenate(loops)
 
     def outer_qualities(
@@ -221,12 +223,12 @@ class RateLoops:
         above = np.multiply(gain[:, None], plants, out=product) > 1  # |L|
         last = above.shape[-1] - 1 - np.argmax(above[..., ::-1], axis=-1)
         inverse = np.divide(1.0, distance, out=real)
-        asked = np.multiply(_power(ahead)[:, None], plants, out=product)
-        asked *= inverse
+        closed = np.multiply(_power(ahead)[:, None], plants, out=product)
+        closed *= inverse
         return LoopQualities(
             stable,
             1 / np.sqrt(distance.min(axis=-1)),
-            np.sqrt(asked.max(axis=-1)),
+            np.sqrt(closed.max(axis=-1)),
             np.where(above.any(axis=-1), self.omega[last], 0.0),
             np.sqrt(np.einsum("dpf,pf->dp", inverse, plants / self.omega**2 * cells)),
             np.sqrt(np.einsum("dpf,df->dp", inverse, gain * self.noise)),
@@ -262,12 +264,12 @@ def _worst_of(one: LoopQualities, other: LoopQualities) -> LoopQualities:
 def grouped(groups: Iterable[RateLoops]) -> RateLoops:
     """The loops of several throttles as one."""
     first, *others = groups
-    return dataclasses.replace(first, beside=tuple(others))
+    return dataclasses.replace(first, others=tuple(others))
 
 
 def together(parts: Sequence[LoopQualities]) -> LoopQualities:
     """Of the plants of all parts."""
-    return LoopQualities(*(np.concatenate(each, axis=1) for each in zip(*parts, strict=True)))
+    return LoopQualities(*(np.concatenate(column, axis=1) for column in zip(*parts, strict=True)))
 
 
 def _power(response: Complex[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
@@ -293,9 +295,9 @@ def _is_stable(
     cross = x[k] * y[k + 1] - x[k + 1] * y[k]  # by which it is left or right of 0
     falls = y[k] >= 0
     turns = np.where(falls & (cross > 0), 1.0, 0.0) - np.where(~falls & (cross < 0), 1.0, 0.0)
-    whole = np.bincount(k // size, turns, minlength=x.size // size).reshape(real.shape[:2])
+    rounds_between = np.bincount(k // size, turns, minlength=x.size // size).reshape(real.shape[:2])
     ends = [np.arctan2(imaginary[..., end], real[..., end]) for end in (0, -1)]
-    rounds = np.round((ends[1] + 2 * np.pi * whole) / (2 * np.pi))
+    rounds = np.round((ends[1] + 2 * np.pi * rounds_between) / (2 * np.pi))
     return ends[0] - 2 * np.pi * rounds < 0
 
 
@@ -337,8 +339,8 @@ def forward_path(
     if law.of_sticks or not any(np.any(vars(law)[name]) for name in law.feed_forward):
         return None
     without = eqx.tree_at(
-        lambda each: [vars(each)[name] for name in FIELDS],
-        law.without_gyro_filters(), [jnp.zeros_like(law.p)] * len(FIELDS),
+        lambda x: [vars(x)[name] for name in FIELDS],
+        law.without_gyro_filters(), [jnp.zeros_like(vars(law)["p"])] * len(FIELDS),
     )  # fmt: skip
     return law_responses(without, axis, omega)[0]
 
@@ -347,7 +349,7 @@ def _alone(law: RateLoop, name: str) -> RateLoop:
     """The law with a gain of 1, none of the other two and no feed-forward."""
     fields = (*FIELDS, *law.feed_forward)
     of = lambda law: [vars(law)[field] for field in fields]
-    gains = [jnp.full_like(law.p, float(field == name)) for field in fields]
+    gains = [jnp.full_like(vars(law)["p"], float(field == name)) for field in fields]
     return eqx.tree_at(of, law, gains)  # what `replace` would check anew is known to be right
 
 
@@ -374,18 +376,18 @@ def hold_plants(
 ) -> Complex[np.ndarray, "plants frequencies"]:
     """K e^(-delay s) / ((s + damping) (lag s + 1)) behind a hold: its modified z-transform."""
     lag, delay = np.maximum(lag, 1e-6), np.maximum(delay, 0.0)
-    whole = np.floor(delay / dt)
-    ahead = dt * (whole + 1) - delay  # from the command's arrival to the next sample
+    samples = np.floor(delay / dt)
+    ahead = dt * (samples + 1) - delay  # from the command's arrival to the next sample
     q = np.exp(-1j * omega * dt)[None]
     actuator = np.exp(-ahead / lag) / (1 - np.exp(-dt / lag) * q)
     if damping is None or not np.any(damping > 0):
         steps = dt * q / (1 - q) ** 2 + (ahead - lag) / (1 - q) + lag * actuator
     else:  # the step's response is 1/damping and two exponentials
         damping = np.maximum(damping, 1e-4)
-        apart = 1 - damping * lag
+        spacing = 1 - damping * lag
         rate = np.exp(-damping * ahead) / (1 - np.exp(-damping * dt) * q)
-        steps = (1 / (1 - q) - (rate - damping * lag * actuator) / apart) / damping
-    return gain * (1 - q) * q ** (whole + 1) * steps
+        steps = (1 / (1 - q) - (rate - damping * lag * actuator) / spacing) / damping
+    return gain * (1 - q) * q ** (samples + 1) * steps
 
 
 def gains_of(law: RateLoop, axis: int) -> Float[np.ndarray, " gains"]:
@@ -409,20 +411,22 @@ def parameters_of(law: RateLoop, axis: int, gains: Float[np.ndarray, " gains"]) 
     """The parameters that stand for these gains; a ceiling of D rises with D."""
     firmware = law.firmware
     flown = gains_of(law, axis)
-    found = {
+    values = {
         gain_row(firmware, axis, name).name: float(gain)
         for name, gain, old in zip(FIELDS, gains, flown, strict=True)
         if old > 0
     }
     if (ceiling := law.d_ceiling(axis)) > 1:
-        found[_ceiling_name(law, axis)] = ceiling * float(gains[2])
-    return store_parameters(firmware, found)
+        values[_ceiling_name(law, axis)] = ceiling * float(gains[2])
+    return store_parameters(firmware, values)
 
 
 def ceiling_in(law: RateLoop, axis: int, designs: Sequence[Mapping[str, Number]]) -> float:
     """The most by which D can rise in flight under one of these stored sets of parameters."""
     flown = law.d_ceiling(axis)
-    pairs = [(each.get(_ceiling_name(law, axis)), gains_in(law, axis, each)[2]) for each in designs]
+    pairs = [
+        (design.get(_ceiling_name(law, axis)), gains_in(law, axis, design)[2]) for design in designs
+    ]
     return max([flown, *(float(top / base) for top, base in pairs if top and base > 0)])
 
 

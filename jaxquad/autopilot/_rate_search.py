@@ -64,12 +64,12 @@ def other_axes(
     law: RateLoop, noise: GyroNoise, omega: Float[np.ndarray, " frequencies"]
 ) -> tuple[OtherAxis, ...]:
     """Those whose gyro is in the log, under a law; behind the gyro's filters of that law."""
-    found = []
+    others = []
     for k, density in noise.others.items():
         gains, (back, _) = gains_of(law, k), law_paths(law, k, omega)
         power = noise.powers(density, omega)
-        found.append(OtherAxis(gains[:2] @ back[:2], gains[2] * back[2], power))
-    return tuple(found)
+        others.append(OtherAxis(gains[:2] @ back[:2], gains[2] * back[2], power))
+    return tuple(others)
 
 
 class FilterBank:
@@ -79,7 +79,7 @@ class FilterBank:
         self, choices: Sequence[FilterChoice], law: RateLoop, noise: GyroNoise,
         omega: Float[np.ndarray, " frequencies"],
     ):  # fmt: skip
-        self.choices, self.known = tuple(choices), omega / (2 * np.pi) <= noise.known_hz
+        self.choices, self.measured = tuple(choices), omega / (2 * np.pi) <= noise.known_hz
         self.others = other_axes(law, noise, omega)
         low = int(np.searchsorted(omega, _SLOW))
         self.ratios, self.delays = [], []
@@ -100,11 +100,11 @@ class FilterBank:
 
     def filters(self, picks: Picks) -> Filters:
         """The responses of each design's filters over those that flew."""
-        ones = np.ones((len(picks), self.known.size), complex)
-        found = {"gyro": ones, "derivative": ones}
+        ones = np.ones((len(picks), self.measured.size), complex)
+        responses = {"gyro": ones, "derivative": ones}
         for k, choice in enumerate(self.choices):
-            found[choice.stage] = found[choice.stage] * self.ratios[k][picks[:, k]]
-        return Filters(found["gyro"], found["derivative"])
+            responses[choice.stage] = responses[choice.stage] * self.ratios[k][picks[:, k]]
+        return Filters(responses["gyro"], responses["derivative"])
 
     def beyond(self, picks: Picks, filters: Filters) -> Float[np.ndarray, " designs"]:
         """How far the other axes get, over what is allowed: their delay may not grow."""
@@ -119,25 +119,25 @@ class FilterBank:
     def other_noise(self, filters: Filters) -> Float[np.ndarray, " designs"]:
         """Of the other axes' commands, over what flew: rms, and of each frequency not known."""
         shared = _of_shared(self, filters)
-        found = [np.zeros(len(filters.gyro))]
+        growth = [np.zeros(len(filters.gyro))]
         for axis in self.others:
             through = (axis.slow + axis.quick * shared.derivative) * shared.gyro
-            found.append(noise_growth(through, axis.slow + axis.quick, axis.noise, self.known))
-        return np.max(found, axis=0)
+            growth.append(noise_growth(through, axis.slow + axis.quick, axis.noise, self.measured))
+        return np.max(growth, axis=0)
 
     def parameters(self, picks: Int[np.ndarray, " choices"]) -> dict[str, float]:
         """The parameters of one design's filters that differ from what flew."""
-        found: dict[str, float] = {}
+        changed: dict[str, float] = {}
         for choice, pick in zip(self.choices, picks, strict=True):
             if pick != choice.flown:
-                found |= choice.options[pick].parameters
-        return found
+                changed |= choice.options[pick].parameters
+        return changed
 
 
 def _of_shared(bank: FilterBank, filters: Filters) -> Filters:
     """Without the filters of the tuned axis alone, which are of the D term."""
-    own = [choice for choice in bank.choices if not choice.shared]
-    return filters._replace(derivative=np.ones_like(filters.derivative)) if own else filters
+    alone = [choice for choice in bank.choices if not choice.shared]
+    return filters._replace(derivative=np.ones_like(filters.derivative)) if alone else filters
 
 
 def _response(
@@ -152,15 +152,15 @@ def noise_growth(
     through: Paths,
     flown: Complex[np.ndarray, " frequencies"],
     noise: Float[np.ndarray, " frequencies"],
-    known: np.ndarray,
+    measured: np.ndarray,
 ) -> Float[np.ndarray, " designs"]:
     """The command's noise over what flew: its rms, and the gain where the noise is not known."""
     before = np.abs(flown) ** 2
     power = np.abs(through) ** 2
     rms = np.sqrt(power @ noise / max(float(before @ noise), 1e-300))
-    if known.all():
+    if measured.all():
         return rms
-    unseen = np.sqrt((power / before)[:, ~known].max(axis=1))
+    unseen = np.sqrt((power / before)[:, ~measured].max(axis=1))
     return np.maximum(rms, unseen)
 
 
@@ -238,7 +238,7 @@ class Search:
         """Of free gains, and picked filters."""
         gains = np.tile(self.flown, (len(points), 1))
         gains[:, self.free] = points
-        plants = sum(len(each.plants) for each in self.loops.groups)
+        plants = sum(len(group.plants) for group in self.loops.groups)
         count = max(1, _TOGETHER // max(plants, 1))
         parts = np.array_split(np.arange(len(gains)), -(-len(gains) // count))
         return np.concatenate(
@@ -247,23 +247,23 @@ class Search:
 
     def _of(self, gains: Gains, picks: Picks | None) -> Float[np.ndarray, " designs"]:
         filters = None if picks is None or self.bank is None else self.bank.filters(picks)
-        found, targets = self.loops.qualities(gains, filters), self.targets
+        qualities, targets = self.loops.qualities(gains, filters), self.targets
         beyond = [
-            np.max(found.peak, axis=1) / (_RESERVE * targets.peak),
-            np.max(found.resonance, axis=1) / (_RESERVE * targets.resonance),
-            np.mean(found.noise / self.noise, axis=1) / targets.noise,
-            np.max(found.crossover, axis=1) / targets.crossover,
+            np.max(qualities.peak, axis=1) / (_RESERVE * targets.peak),
+            np.max(qualities.resonance, axis=1) / (_RESERVE * targets.resonance),
+            np.mean(qualities.noise / self.noise, axis=1) / targets.noise,
+            np.max(qualities.crossover, axis=1) / targets.crossover,
         ]
         if self.bank is not None and picks is not None and filters is not None:
             through, quiet = self.loops.paths(gains, filters)[0], np.zeros_like(self.loops.noise)
-            unseen = noise_growth(through, self.through[0], quiet, self.bank.known)
+            unseen = noise_growth(through, self.through[0], quiet, self.bank.measured)
             beyond += [
                 unseen / targets.noise, self.bank.other_noise(filters) / targets.noise,
                 self.bank.beyond(picks, filters),
             ]  # fmt: skip
         worst = np.stack(beyond).max(axis=0)
-        worst = np.where(np.all(found.stable, axis=1), worst, 1e6 * worst)
-        rejection = np.sqrt(np.mean(found.rejection**2, axis=1))
+        worst = np.where(np.all(qualities.stable, axis=1), worst, 1e6 * worst)
+        rejection = np.sqrt(np.mean(qualities.rejection**2, axis=1))
         return np.where(worst <= 1, rejection, 1e9 * worst)
 
     def _stored(
@@ -271,9 +271,9 @@ class Search:
     ) -> Float[np.ndarray, " gains"]:
         near = _stored_near(gains, self.rows, self.low, self.high)
         same = None if picks is None else np.tile(picks, (len(near), 1))
-        found = self.flown.copy()
-        found[self.free] = near[np.argmin(self.score(near, same))]
-        return found
+        stored = self.flown.copy()
+        stored[self.free] = near[np.argmin(self.score(near, same))]
+        return stored
 
 
 def _stored_near(
@@ -282,7 +282,7 @@ def _stored_near(
     """The whole numbers, or numbers of three digits, around some gains, from `low` to `high`."""
     around = []
     for value, row, least, most in zip(gains, rows, low, high, strict=True):
-        step = 1.0 if row.whole else 10 ** (np.floor(np.log10(value)) - 2)
+        step = 1.0 if row.integer else 10 ** (np.floor(np.log10(value)) - 2)
         pair = np.round(np.array([np.floor(value / step), np.ceil(value / step)]) * step, 12)
         inside = (pair >= least * (1 - 1e-9)) & (pair <= most * (1 + 1e-9))
         around.append(np.unique(pair[inside] if inside.any() else pair))
@@ -312,7 +312,7 @@ def shared_change(
     """By the laws as they are built, not by the ratios of a search."""
     at = np.array([_SLOW])
     phases = []
-    known = omega / (2 * np.pi) <= noise.known_hz
+    measured = omega / (2 * np.pi) <= noise.known_hz
     ratio = gyro_chain_response(changed, omega) / gyro_chain_response(law, omega)
     growth = [0.0]
     for before, after in zip(
@@ -320,10 +320,12 @@ def shared_change(
     ):
         through = (after.slow + after.quick) * ratio
         growth.append(
-            float(noise_growth(through[None], before.slow + before.quick, before.noise, known)[0])
+            float(
+                noise_growth(through[None], before.slow + before.quick, before.noise, measured)[0]
+            )
         )
-    for each in (law, changed):
-        gyro, back = gyro_chain_response(each, at), law_paths(each, (axis + 1) % 3, at)[0]
+    for one in (law, changed):
+        gyro, back = gyro_chain_response(one, at), law_paths(one, (axis + 1) % 3, at)[0]
         phases.append((np.angle(gyro)[0], np.angle(gyro * back[2])[0]))
     (gyro, slope), (later, steeper) = phases
     late = tuple(-1e3 * (b - a) / _SLOW for a, b in ((gyro, later), (slope, steeper)))

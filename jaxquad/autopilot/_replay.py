@@ -232,9 +232,9 @@ def _held_step(plant: HeldPlant, dt: float) -> _Step:
     generator[1, 0], generator[1, 1] = 1.0, -plant.damping
     late = plant.delay % dt
     over = lambda span: expm(span * generator)
-    whole, rest = over(dt), over(dt - late)
+    sample, rest = over(dt), over(dt - late)
     before = rest[:2, :2] @ over(late)[:2, 2]
-    return _Step(whole[:2, :2], before, rest[:2, 2])
+    return _Step(sample[:2, :2], before, rest[:2, 2])
 
 
 @eqx.filter_jit

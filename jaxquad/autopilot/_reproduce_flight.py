@@ -121,7 +121,7 @@ class Reproduction(eqx.Module):
 
     def to_dict(self) -> dict[str, object]:
         """All numbers as JSON holds them."""
-        found = {
+        content = {
             "kind": self.kind,
             "verdict": self.verdict,
             "misfit": self.misfit,
@@ -134,7 +134,7 @@ class Reproduction(eqx.Module):
             "measured": _parts(self.measured, self.measured_error),
             "predicted": _parts(self.predicted, self.predicted_error),
         }
-        return plain_content(found)
+        return plain_content(content)
 
     def __str__(self) -> str:
         return self.verdict
@@ -219,14 +219,11 @@ def _set_point_response(
     record: Record | Sequence[Record], band: tuple[float, float] | None
 ) -> FrequencyResponse:
     records = [record] if isinstance(record, Record) else list(record)
-    if not records or not all(each.reference_names for each in records):
+    if not records or not all(x.reference_names for x in records):
         raise ValueError(
             "the record has no reference: give the set-point of the rate loop as references="
         )
-    closed = [
-        select(each, inputs=each.reference_names[0], outputs=each.output_names[0])
-        for each in records
-    ]
+    closed = [select(x, inputs=x.reference_names[0], outputs=x.output_names[0]) for x in records]
     low, high = band or (2 * np.pi * 0.7, 2 * np.pi * min(60.0, records[0].sample_rate / 8))
     omega = np.geomspace(low, high, 50)
     return frequency_response(closed, omega, estimator=LocalPolynomial())

@@ -1,5 +1,7 @@
+"""`jaxquad batch`: all logs of a folder, with a bar that shows how far it is."""
+
 import argparse
-import contextlib
+import sys
 from collections import Counter
 from pathlib import Path
 
@@ -7,60 +9,20 @@ from jaxquad.workflows import BatchSettings
 
 from ._options import (
     add_config,
-    add_json,
-    add_out,
     add_output,
     add_settings,
-    Command,
+    command,
     print_json,
+    Run,
     settings_of,
     stdout_for_json,
 )
-from ._progress import add_quiet, ProgressBar
 
 
-SOME_FAILED = 4
+_SOME_FAILED = 4
 
 
-def _add(declared: argparse.ArgumentParser) -> None:
-    declared.add_argument("folder", type=Path, help="the folder that contains the logs")
-    add_config(declared)
-    declared.add_argument(
-        "--again", action="store_true", help="identify logs again that failed before"
-    )
-    add_settings(declared, BatchSettings)
-    output = add_output(declared)
-    add_out(output, "results/NAME of the folder")
-    add_json(output, "the rows of the table")
-    add_quiet(output)
-
-
-def _run(options: argparse.Namespace) -> int:
-    from jaxquad.workflows import batch, find_logs
-
-    settings = settings_of(options, BatchSettings)
-    out = options.out or Path("results") / options.folder.resolve().name
-    logs = find_logs(options.folder, settings, out=out)
-    bar = ProgressBar(len(logs), quiet=options.quiet)
-    with stdout_for_json(options), contextlib.closing(bar):
-        rows = batch(
-            options.folder,
-            settings,
-            out=out,
-            again=options.again,
-            listener=lambda row: bar.advance(f"{row['log']}: {row['status']}"),
-        )
-    if options.json:
-        print_json(rows)
-    else:
-        counts = Counter(row["status"] for row in rows)
-        print(f"{len(rows)} logs:", ", ".join(f"{n} {state}" for state, n in counts.items()))
-        print(f"{out / 'summary.html'}, table.csv")
-    return SOME_FAILED if any(row["status"] == "failed" for row in rows) else 0
-
-
-BATCH = Command(
-    "batch",
+@command(
     "identify all logs of a folder",
     """examples:
   jaxquad batch logs/ --config fleet.toml
@@ -85,6 +47,44 @@ A batch that was stopped or killed continues where it was: start it again.
 exit codes: 0 done, 2 unusable input, 4 some logs failed (see table.csv)
 A log that is not identifiable has not failed.
 """,
-    _add,
-    _run,
 )
+def batch(declared: argparse.ArgumentParser) -> Run:
+    declared.add_argument("folder", type=Path, help="the folder that contains the logs")
+    add_config(declared)
+    text = "identify logs again that failed before"
+    declared.add_argument("--again", action="store_true", help=text)
+    add_settings(declared, BatchSettings)
+    add_output(declared, "the rows of the table", folder="results/NAME of the folder", force="")
+
+    def run(options: argparse.Namespace) -> int:
+        from tqdm import tqdm
+
+        from jaxquad.workflows import batch, find_logs
+
+        settings = settings_of(options, BatchSettings)
+        out = options.out or Path("results") / options.folder.resolve().name
+        logs = find_logs(options.folder, settings, out=out)
+        # A bar on a terminal, plain lines elsewhere, nothing with --quiet.
+        bar = tqdm(total=len(logs), unit="log", leave=False, disable=options.quiet or None)
+        shown: list[str] = []
+
+        def show(row: dict) -> None:
+            text = f"{row['log']}: {row['status']}"
+            shown.append("".join(c if c.isprintable() else "?" for c in text))
+            if not bar.disable:
+                bar.set_postfix_str(shown[-1], refresh=False)
+                bar.update()
+            elif not options.quiet:
+                print(f"{len(shown)}/{len(logs)} {shown[-1]}", file=sys.stderr, flush=True)
+
+        with stdout_for_json(options), bar:
+            rows = batch(options.folder, settings, out=out, again=options.again, listener=show)
+        if options.json:
+            print_json(rows)
+        else:
+            counts = Counter(row["status"] for row in rows)
+            print(f"{len(rows)} logs:", ", ".join(f"{n} {state}" for state, n in counts.items()))
+            print(f"{out / 'summary.html'}, table.csv")
+        return _SOME_FAILED if any(row["status"] == "failed" for row in rows) else 0
+
+    return run

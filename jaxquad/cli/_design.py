@@ -1,130 +1,16 @@
+"""`jaxquad design`: a signal to excite the vehicle with."""
+
 import argparse
 from itertools import chain, count
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from ._options import add_json, add_output, Command, print_json
-
-
-if TYPE_CHECKING:
-    from jaxquad.excitation import Excitation
-
-BELOW_GUIDELINE = 4
+from ._options import add_output, command, print_json, Run
 
 
-def _add(declared: argparse.ArgumentParser) -> None:
-    declared.add_argument("kind", choices=("sweep", "multisine"))
-    add = declared.add_argument_group("the signal").add_argument
-    text = "in Hz; 1 Hz is 6.28 rad/s"
-    add("--band", type=float, nargs=2, required=True, metavar=("LOW", "HIGH"), help=text)
-    add("--rate", type=float, required=True, metavar="HZ", help="samples per second")
-    add("--amplitude", type=float, required=True, help="peak, in the unit of the command")
-    text = (
-        "of the excitation, without the 3 s of rest around a sweep; by default five of a sweep's "
-    )
-    text += "longest periods, ten of a multisine's"
-    add("--duration", type=float, metavar="S", help=text)
-    add("--lines", type=int, metavar="N", help="frequencies of a multisine; by default all")
-    text = "expected bandwidth of the response, for the guideline on the lower end of the band"
-    add("--bandwidth", type=float, metavar="HZ", help=text)
-    text = "where the phase is expected to be -180 degrees, for the guideline on the upper end"
-    add("--phase-crossover", type=float, metavar="HZ", help=text)
-    output = add_output(declared)
-    output.add_argument(
-        "--out", type=Path, metavar="CSV", help="by default sweep.csv or multisine.csv"
-    )
-    text = "overwrite another signal; without it, that is kept, and CSV-2 written"
-    output.add_argument("--force", action="store_true", help=text)
-    add_json(output, "the guidelines")
+_BELOW_GUIDELINE = 4
 
 
-def _run(options: argparse.Namespace) -> int:
-    import numpy as np
-
-    from jaxquad._core import write_file
-    from jaxquad.excitation import check_guidelines
-
-    signal = _sweep(options) if options.kind == "sweep" else _multisine(options)
-    radian = lambda hertz: None if hertz is None else 2 * np.pi * hertz
-    found = check_guidelines(
-        signal,
-        omega_bandwidth=radian(options.bandwidth),
-        omega_180=radian(options.phase_crossover),
-    )
-    rows = (f"{t:.9g},{u:.9g}\n" for t, u in zip(signal.time, signal.signal, strict=True))
-    content = f"time,signal\n{''.join(rows)}"
-    out = _free_file(options, options.out or Path(f"{options.kind}.csv"), content)
-    write_file(out, content)
-    if options.json:
-        rules = [rule._asdict() for rule in found]
-        print_json({"file": str(out), "samples": signal.time.size, "ok": found.ok, "rules": rules})
-    else:
-        low, high = options.band
-        band = f"{low:g} to {high:g} Hz ({2 * np.pi * low:.3g} to {2 * np.pi * high:.3g} rad/s)"
-        print(f"{signal.time.size} samples, {signal.time[-1]:.4g} s, {band}\n{found}\n{out}")
-    return 0 if found.ok else BELOW_GUIDELINE
-
-
-def _free_file(options: argparse.Namespace, wanted: Path, content: str) -> Path:
-    """The file that is wanted, or one beside it where that holds something else."""
-    numbered = (wanted.with_stem(f"{wanted.stem}-{number}") for number in count(2))
-    files = (
-        path
-        for path in chain([wanted], numbered)
-        if options.force or not path.exists() or path.read_bytes() == content.encode()
-    )
-    return next(files)
-
-
-def _sweep(options: argparse.Namespace) -> "Excitation":
-    import numpy as np
-
-    from jaxquad.excitation import sweep
-
-    if options.lines is not None:
-        raise ValueError("--lines is for a multisine: leave it out, or design a multisine")
-    low, high = _band(options)
-    return sweep(
-        2 * np.pi * low,
-        2 * np.pi * high,
-        duration=5 / low if options.duration is None else options.duration,
-        sample_rate=options.rate,
-        amplitude=options.amplitude,
-    )
-
-
-def _multisine(options: argparse.Namespace) -> "Excitation":
-    import numpy as np
-
-    from jaxquad.excitation import harmonics, multisine
-
-    low, high = _band(options)
-    period = np.ceil(options.rate / low - 1e-9) / options.rate
-    duration = 10 * period if options.duration is None else options.duration
-    if not duration > 0:
-        raise ValueError(f"--duration is {duration:g}: give a time above 0 s")
-    periods = max(1, round(duration / period))
-    lines = harmonics(2 * np.pi * low, 2 * np.pi * high, period=period, lines=options.lines)
-    return multisine(
-        lines,
-        period=period,
-        periods=periods,
-        sample_rate=options.rate,
-        amplitude=options.amplitude,
-    )
-
-
-def _band(options: argparse.Namespace) -> tuple[float, float]:
-    low, high = options.band
-    if not 0 < low < high:
-        raise ValueError(f"--band is {low:g} {high:g}: give two frequencies above 0, rising")
-    if not options.rate > 0:
-        raise ValueError(f"--rate is {options.rate:g}: give a rate above 0 Hz")
-    return low, high
-
-
-DESIGN = Command(
-    "design",
+@command(
     "make a signal to excite the vehicle with, and check it against published guidelines",
     """examples:
   jaxquad design sweep --band 0.3 12 --rate 500 --amplitude 0.2 --out sweep.csv
@@ -132,6 +18,76 @@ DESIGN = Command(
 
 exit codes: 0 done, 2 unusable input, 4 a guideline is not met (the signal is written all the same)
 """,
-    _add,
-    _run,
 )
+def design(declared: argparse.ArgumentParser) -> Run:
+    declared.add_argument("kind", choices=("sweep", "multisine"))
+    add = declared.add_argument_group("the signal").add_argument
+    text = "in Hz; 1 Hz is 6.28 rad/s"
+    add("--band", type=float, nargs=2, required=True, metavar=("LOW", "HIGH"), help=text)
+    add("--rate", type=float, required=True, metavar="HZ", help="samples per second")
+    add("--amplitude", type=float, required=True, help="peak, in the unit of the command")
+    text = "of the excitation, without the 3 s of rest around a sweep; by default five of a "
+    text += "sweep's longest periods, ten of a multisine's"
+    add("--duration", type=float, metavar="S", help=text)
+    add("--lines", type=int, metavar="N", help="frequencies of a multisine; by default all")
+    text = "expected bandwidth of the response, for the guideline on the lower end of the band"
+    add("--bandwidth", type=float, metavar="HZ", help=text)
+    text = "where the phase is expected to be -180 degrees, for the guideline on the upper end"
+    add("--phase-crossover", type=float, metavar="HZ", help=text)
+    force = "overwrite another signal; without it, that is kept, and CSV-2 written"
+    file = ("CSV", "by default sweep.csv or multisine.csv")
+    add_output(declared, "the guidelines", file=file, force=force, quiet=False)
+    return _design
+
+
+def _design(options: argparse.Namespace) -> int:
+    import numpy as np
+
+    from jaxquad._core import write_file
+    from jaxquad.excitation import check_guidelines, harmonics, multisine, sweep
+
+    (low, high), rate, duration = options.band, options.rate, options.duration
+    is_sweep = options.kind == "sweep"
+    if is_sweep and options.lines is not None:
+        raise ValueError("--lines is for a multisine: leave it out, or design a multisine")
+    if not 0 < low < high:
+        raise ValueError(f"--band is {low:g} {high:g}: give two frequencies above 0, rising")
+    if not rate > 0:
+        raise ValueError(f"--rate is {rate:g}: give a rate above 0 Hz")
+    band = 2 * np.pi * low, 2 * np.pi * high
+    if is_sweep:
+        duration = 5 / low if duration is None else duration
+        signal = sweep(*band, duration=duration, sample_rate=rate, amplitude=options.amplitude)
+    else:
+        period = np.ceil(rate / low - 1e-9) / rate
+        duration = 10 * period if duration is None else duration
+        if not duration > 0:
+            raise ValueError(f"--duration is {duration:g}: give a time above 0 s")
+        signal = multisine(
+            harmonics(*band, period=period, lines=options.lines), period=period,
+            periods=max(1, round(duration / period)), sample_rate=rate,
+            amplitude=options.amplitude,
+        )  # fmt: skip
+    radian = lambda hertz: None if hertz is None else 2 * np.pi * hertz
+    check = check_guidelines(
+        signal,
+        omega_bandwidth=radian(options.bandwidth),
+        omega_180=radian(options.phase_crossover),
+    )
+    rows = (f"{t:.9g},{u:.9g}\n" for t, u in zip(signal.time, signal.signal, strict=True))
+    content = f"time,signal\n{''.join(rows)}"
+    wanted = options.out or Path(f"{options.kind}.csv")
+    numbered = (wanted.with_stem(f"{wanted.stem}-{number}") for number in count(2))
+    out = next(  # another signal is kept
+        path
+        for path in chain([wanted], numbered)
+        if options.force or not path.exists() or path.read_bytes() == content.encode()
+    )
+    write_file(out, content)
+    if options.json:
+        rules = [rule._asdict() for rule in check]
+        print_json({"file": str(out), "samples": signal.time.size, "ok": check.ok, "rules": rules})
+    else:
+        hertz = f"{low:g} to {high:g} Hz ({band[0]:.3g} to {band[1]:.3g} rad/s)"
+        print(f"{signal.time.size} samples, {signal.time[-1]:.4g} s, {hertz}\n{check}\n{out}")
+    return 0 if check.ok else _BELOW_GUIDELINE

@@ -14,18 +14,16 @@ from jaxquad.records import RecordWarning
 from jaxquad.report import PageWarning
 from jaxquad.workflows import in_options
 
-from ._autopilot import AUTOPILOT
-from ._batch import BATCH
-from ._demo import DEMO
-from ._design import DESIGN
-from ._identify import CHANNELS, IDENTIFY, NOT_IDENTIFIABLE, REPORT, VERIFY
-from ._options import check_out
-from ._progress import shown_stages
-from ._tune import TUNE
+from ._batch import batch
+from ._demo import demo
+from ._design import design
+from ._identify import channels, identify, NOT_IDENTIFIABLE, report, verify
+from ._options import check_out, shown_stages
+from ._tune import autopilot, tune
 
 
 # In order of use.
-_COMMANDS = (DEMO, DESIGN, CHANNELS, IDENTIFY, VERIFY, TUNE, AUTOPILOT, REPORT, BATCH)
+_COMMANDS = (demo, design, channels, identify, verify, tune, autopilot, report, batch)
 _WAY = """jaxquad demo                   a simulated flight, identified: results/demo/report.html
 jaxquad identify YOUR.LOG      a model of your own flight, with error bars
 jaxquad tune results/YOUR ...  gains from it, with a certificate; jaxquad --help lists all commands
@@ -62,49 +60,34 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     words = sys.argv[1:] if argv is None else list(argv)
     try:
-        return _run(words)
+        if not words:
+            print(_WAY, end="")
+            return 0
+        options, unknown = make_parser().parse_known_args(words)
+        if unknown:
+            return _fail(_describe_unknown(options, unknown), _UNUSABLE)
+        with warnings.catch_warnings(), shown_stages(options):
+            for kind in (RecordWarning, PageWarning):
+                warnings.simplefilter("always", kind)
+            warnings.showwarning = printer_of_warnings()
+            check_out(options)
+            return options.run(options)
     except BrokenPipeError:  # `jaxquad ... | head` has read enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return _CLOSED
-    except OSError as error:
-        return _fail(_in_words(error), _UNUSABLE)
+    except OSError as error:  # what the system could not do: `out/a.png: no space left on device`
+        place, why = error.filename or "what is printed", error.strerror
+        return _fail(f"{place}: {why.lower()}" if why else str(error), _UNUSABLE)
     except ValueError as error:
-        code = NOT_IDENTIFIABLE if _is_undetermined(error) else _UNUSABLE
+        code = _UNUSABLE
+        if "jaxquad.identify" in sys.modules:  # else nothing was fitted, and JAX is not needed
+            from jaxquad.identify import UndeterminedError
+
+            code = NOT_IDENTIFIABLE if isinstance(error, UndeterminedError) else _UNUSABLE
         return _fail(in_options(error), code)
     except KeyboardInterrupt:
         print("jaxquad: interrupted", file=sys.stderr)
         return _INTERRUPTED
-
-
-def _run(words: Sequence[str]) -> int:
-    if not words:
-        print(_WAY, end="")
-        return 0
-    options, unknown = make_parser().parse_known_args(words)
-    if unknown:
-        return _fail(_describe_unknown(options, unknown), _UNUSABLE)
-    with warnings.catch_warnings(), shown_stages(options):
-        for kind in (RecordWarning, PageWarning):
-            warnings.simplefilter("always", kind)
-        warnings.showwarning = _printer_of_warnings()
-        check_out(options)
-        return options.run(options)
-
-
-def _in_words(error: OSError) -> str:
-    """What the system could not do: `out/a.png: no space left on device`."""
-    if not error.strerror:
-        return str(error)
-    return f"{error.filename or 'what is printed'}: {error.strerror.lower()}"
-
-
-def _is_undetermined(error: Exception) -> bool:
-    """Without asking for the room of fits, and thereby JAX, where nothing was fitted."""
-    if "jaxquad.identify" not in sys.modules:
-        return False
-    from jaxquad.identify import UndeterminedError
-
-    return isinstance(error, UndeterminedError)
 
 
 def _describe_unknown(options: argparse.Namespace, words: Sequence[str]) -> str:
@@ -124,7 +107,7 @@ def _fail(message: str, code: int) -> int:
     return code
 
 
-def _printer_of_warnings() -> Callable[..., None]:
+def printer_of_warnings() -> Callable[..., None]:
     """Prints each text of the package once: a log is read for the estimate and for the page.
 
     What NumPy or JAX warn of is no word to a user.
@@ -142,7 +125,7 @@ def _printer_of_warnings() -> Callable[..., None]:
 
 def make_parser() -> argparse.ArgumentParser:
     """The parser of the whole command line."""
-    listed = (f"  {each.name:<9} {each.help}\n  {'':<9} {each.example}" for each in _COMMANDS)
+    listed = (f"  {x.name:<9} {x.help}\n  {'':<9} {x.example}" for x in _COMMANDS)
     parser = argparse.ArgumentParser(
         prog="jaxquad",
         usage="jaxquad COMMAND ...",
@@ -154,11 +137,11 @@ def make_parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(
         required=True, metavar="COMMAND", dest="command", help=argparse.SUPPRESS
     )
-    for each in _COMMANDS:
-        each.declare(commands)
-    for name, each in commands.choices.items():
-        each.set_defaults(usage=each.format_usage())
-        each.usage = f"jaxquad {name} {_PLACES[name]}[options]"
+    for command in _COMMANDS:
+        command.add_to(commands)
+    for name, declared in commands.choices.items():
+        declared.set_defaults(usage=declared.format_usage())
+        declared.usage = f"jaxquad {name} {_PLACES[name]}[options]"
     return parser
 
 

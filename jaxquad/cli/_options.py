@@ -5,12 +5,15 @@ import atexit
 import contextlib
 import gc
 import json
+import logging
 import os
 import sys
+import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
+from jaxquad._core import STAGES
 from jaxquad.workflows import (
     AutopilotSettings,
     BatchSettings,
@@ -26,24 +29,22 @@ Settings = (
     type[AutopilotSettings] | type[IdentifySettings] | type[TuneSettings] | type[BatchSettings]
 )
 S = TypeVar("S", AutopilotSettings, IdentifySettings, TuneSettings, BatchSettings)
-Group = argparse._ArgumentGroup
-Commands = Any  # argparse names the type of its subparsers nowhere public
+Declare = Callable[[argparse.ArgumentParser], Run]  # declares options; what it returns runs
 
 
 class Command(NamedTuple):
-    """A command of `jaxquad`: its name, what its help says, its options, and what it does."""
+    """A command of `jaxquad`: what its help says, and what declares its options."""
 
     name: str
     help: str
     examples: str  # the first line of commands is the one that `jaxquad --help` shows
-    add: Callable[[argparse.ArgumentParser], None]
-    run: Run
+    declare: Declare
 
     @property
     def example(self) -> str:
         return self.examples.splitlines()[1].strip()
 
-    def declare(self, commands: Commands) -> None:
+    def add_to(self, commands: Any) -> None:  # argparse names the type of its subparsers nowhere
         declared = commands.add_parser(
             self.name,
             prog=f"jaxquad {self.name}",
@@ -51,8 +52,12 @@ class Command(NamedTuple):
             epilog=self.examples,
             formatter_class=argparse.RawDescriptionHelpFormatter,
         )
-        declared.set_defaults(run=self.run)
-        self.add(declared)
+        declared.set_defaults(run=self.declare(declared))
+
+
+def command(help: str, examples: str) -> Callable[[Declare], Command]:
+    """Makes the command of this help and these examples of the function that declares it."""
+    return lambda declare: Command(declare.__name__, help, examples, declare)
 
 
 def add_log(declared: argparse.ArgumentParser) -> None:
@@ -68,10 +73,41 @@ def add_log_option(declared: argparse.ArgumentParser) -> None:
     declared.add_argument("--log", type=Path, metavar="FILE", help=text)
 
 
-def add_out(declared: Group, default: str) -> None:
-    text = f"where to write; by default {default}"
-    declared.add_argument("--out", type=Path, metavar="FOLDER", help=text)
-    declared.set_defaults(out_is_folder=True)
+def add_config(declared: argparse.ArgumentParser) -> None:
+    text = "a file of settings; options take precedence"
+    declared.add_argument("--config", type=Path, metavar="TOML", help=text)
+
+
+_FORCE = "overwrite the result of other settings; without it, that is kept, and FOLDER-2 written"
+
+
+def add_output(
+    declared: argparse.ArgumentParser,
+    content: str,
+    *,
+    folder: str = "",
+    file: tuple[str, str] | None = None,
+    force: str = _FORCE,
+    quiet: bool = True,
+) -> None:
+    """Options on output, last in the help of a command; `content` is what --json prints.
+
+    `folder` says where the command writes by default; a command that writes a `file` has the
+    placeholder and the help of it instead.
+    """
+    add = declared.add_argument_group("output").add_argument
+    if folder:
+        text = f"where to write; by default {folder}"
+        add("--out", type=Path, metavar="FOLDER", help=text)
+        declared.set_defaults(out_is_folder=True)
+    elif file is not None:
+        add("--out", type=Path, metavar=file[0], help=file[1])
+    if force:
+        add("--force", action="store_true", help=force)
+    text = f"print {content} as JSON to stdout, everything else to stderr"
+    add("--json", action="store_true", help=text)
+    if quiet:
+        add("--quiet", action="store_true", help="do not show on stderr what is being done")
 
 
 def check_out(options: argparse.Namespace) -> None:
@@ -84,17 +120,12 @@ def check_out(options: argparse.Namespace) -> None:
         raise ValueError(f"--out is {out}, which is a folder: name a file in it")
     if out.exists() and not (out.is_dir() or out.is_file() and not folder):
         raise ValueError(f"--out is {out}, which is no {'folder' if folder else 'regular file'}")
-    beside = [out, *out.parents] if folder else out.absolute().parents
-    place = next((each for each in beside if each.exists()), Path())
+    parents = [out, *out.parents] if folder else out.absolute().parents
+    place = next((parent for parent in parents if parent.exists()), Path())
     if not place.is_dir():
         raise ValueError(f"--out is {out}, but {place} is a file: name another folder")
     if not os.access(place, os.W_OK | os.X_OK):
         raise ValueError(f"--out is {out}, but nothing may be written to {place}")
-
-
-def add_force(declared: Group) -> None:
-    text = "overwrite the result of other settings; without it, that is kept, and FOLDER-2 written"
-    declared.add_argument("--force", action="store_true", help=text)
 
 
 def folder_to_write(
@@ -117,19 +148,13 @@ def folder_to_write(
     return folder
 
 
-def add_output(declared: argparse.ArgumentParser) -> Group:
-    """Where the options on output go, last in the help of a command."""
-    return declared.add_argument_group("output")
+class _NamedOnce(argparse.Action):
+    """A channel that is named twice would silently be the second one."""
 
-
-def add_json(declared: Group, what: str) -> None:
-    text = f"print {what} as JSON to stdout, everything else to stderr"
-    declared.add_argument("--json", action="store_true", help=text)
-
-
-def add_config(declared: argparse.ArgumentParser) -> None:
-    text = "a file of settings; options take precedence"
-    declared.add_argument("--config", type=Path, metavar="TOML", help=text)
+    def __call__(self, parser, namespace, values, option_string=None):
+        if self.dest in namespace:
+            raise argparse.ArgumentError(self, "given twice: one input moves one output at a time")
+        setattr(namespace, self.dest, values)
 
 
 def add_settings(
@@ -157,31 +182,22 @@ def add_settings(
         how |= {"type": kind.read, "metavar": kind.metavar, "choices": kind.choices}
         how |= {"nargs": kind.words} if kind.words > 1 else {}
         how |= {"action": "append"} if kind.repeated else {}
-        how |= {"action": _Once} if key in ("input", "output", "reference") else {}
+        how |= {"action": _NamedOnce} if key in ("input", "output", "reference") else {}
         group.add_argument(option.flag, **how)
 
 
-class _Once(argparse.Action):
-    """A channel that is named twice would silently be the second one."""
-
-    def __call__(self, parser, namespace, values, option_string=None):
-        if self.dest in namespace:
-            raise argparse.ArgumentError(self, "given twice: one input moves one output at a time")
-        setattr(namespace, self.dest, values)
-
-
-def given_settings(options: argparse.Namespace, settings: Settings) -> dict[str, object]:
-    """Those that were given on the command line."""
+def typed_settings(options: argparse.Namespace, settings: Settings) -> dict[str, object]:
+    """Those that were typed on the command line."""
     keys = settings.options()
     return {key: value for key, value in vars(options).items() if key in keys}
 
 
 def settings_of(options: argparse.Namespace, settings: type[S]) -> S:
     """The settings of a TOML file, if there is one, changed by the options."""
-    given = given_settings(options, settings)
+    typed = typed_settings(options, settings)
     if options.config is None:
-        return settings.from_mapping(given)
-    return settings.from_toml(options.config).changed(given)
+        return settings.from_mapping(typed)
+    return settings.from_toml(options.config).changed(typed)
 
 
 def start_computing() -> None:
@@ -210,9 +226,36 @@ def print_json(content: object) -> None:
     print(json.dumps(plain_content(content), indent=2, allow_nan=False))
 
 
-def print_table(rows: Sequence[Sequence[str]]) -> None:
-    """The first row is the heading; the first column is of words, the others of numbers."""
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    for name, *cells in rows:
-        padded = (f"{cell:>{width}}" for cell, width in zip(cells, widths[1:], strict=True))
-        print("  ".join((f"{name:<{widths[0]}}", *padded)).rstrip())
+@contextlib.contextmanager
+def shown_stages(options: argparse.Namespace) -> Iterator[None]:
+    """Within it, each stage that takes longer than 1 s is a line on stderr, without --quiet."""
+    if vars(options).get("quiet", True):
+        yield
+        return
+    shown, level = _Stages(), STAGES.level
+    STAGES.addHandler(shown)
+    STAGES.setLevel(logging.INFO)
+    try:
+        yield
+    finally:
+        STAGES.removeHandler(shown)
+        STAGES.setLevel(level)
+        shown.forget()
+
+
+class _Stages(logging.Handler):
+    """Prints the stage that runs once it has run for a second."""
+
+    waiting: threading.Timer | None = None
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self.forget()
+        text = f"{record.getMessage()} ..."
+        self.waiting = threading.Timer(1.0, print, [text], {"file": sys.stderr})
+        self.waiting.daemon = True
+        self.waiting.start()
+
+    def forget(self) -> None:
+        """The stage has ended."""
+        if self.waiting is not None:
+            self.waiting.cancel()

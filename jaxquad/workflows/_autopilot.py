@@ -71,15 +71,20 @@ def autopilot(
         ```
     """
     path, settings = Path(path), settings or AutopilotSettings()
-    asked, proposal = _channels_of(path, settings)
+    record, proposal = _channels_of(path, settings)
     adrc = flew_adrc(path, proposal)
     if adrc and settings.law == "pid":
         raise SettingsError(f"`law` is pid, but the ADRC flew {path} (pid_type): leave it out")
     if adrc or settings.law == "adrc":
-        return tune_adrc(path, asked, proposal, settings)
-    if settings.axis == "all":
-        return _tune_axes(path, _of_one_flight(settings, proposal))
-    return _tune_axis(_read_axis(path, settings), {})
+        return tune_adrc(path, record, proposal, settings)
+    if settings.axis != "all":
+        return _tune_axis(_read_axis(path, settings), {})
+    number = re.match(r"log(\d+)\.", proposal.setup.rate)
+    if (
+        number is not None and settings.flight is None
+    ):  # all axes are of the flight that is proposed
+        settings = dataclasses.replace(settings, flight=int(number[1]))
+    return _tune_axes(path, settings)
 
 
 def _tune_axes(path: Path, settings: AutopilotSettings) -> AxesProposal:
@@ -96,10 +101,10 @@ def _tune_axes(path: Path, settings: AutopilotSettings) -> AxesProposal:
             errors[axis] = error
     axes: dict[str, AutopilotProposal] = {}
     filters: Mapping[str, float] = {}
-    for axis, each in read.items():
+    for axis, axis_read in read.items():
         announce(f"{axis}:")
         try:
-            axes[axis] = _tune_axis(each, filters)
+            axes[axis] = _tune_axis(axis_read, filters)
         except ValueError as error:  # it costs no other axis
             errors[axis] = error
             continue
@@ -109,38 +114,38 @@ def _tune_axes(path: Path, settings: AutopilotSettings) -> AxesProposal:
     return AxesProposal(settings, axes, {axis: in_options(error) for axis, error in errors.items()})
 
 
-def _of_one_flight(settings: AutopilotSettings, proposal: Proposal) -> AutopilotSettings:
-    """All axes of a file with several flights are of the one that is proposed."""
-    number = re.match(r"log(\d+)\.", proposal.setup.rate)
-    if number is None or settings.flight is not None:
-        return settings
-    return dataclasses.replace(settings, flight=int(number[1]))
-
-
 class _ReadAxis(NamedTuple):
     """What a log holds of one axis."""
 
     path: Path
     settings: AutopilotSettings
-    asked: IdentifySettings
+    record: IdentifySettings
     proposal: Proposal
     flown: FlownAutopilot
     flight: FlightChannels | None
 
 
 def _read_axis(path: Path, settings: AutopilotSettings) -> _ReadAxis:
+    """The loop that flew, at the throttle of the log, and the channels beside the record's."""
     announce("gains and filters that flew")
-    asked, proposal = _channels_of(path, settings)
-    flown, flight = _read_flight(path, asked, proposal, settings)
-    return _ReadAxis(path, settings, asked, proposal, flown, flight)
+    record, proposal = _channels_of(path, settings)
+    flight = read_channels_if_any(path, proposal, record, settings_of(path, proposal).values)
+    throttle = settings.throttle
+    if throttle is None and flight is not None:
+        throttle = flight.middle
+    flown = read_flown(path, proposal, throttle, {} if flight is None else flight.tracked_hz)
+    chains = tuple(chain for chain in flown.law.gyro_chains() if chain.filters)
+    filters, text = best_filters(chains, flown.unmodelled, flight, flown.axis)
+    flown = dataclasses.replace(flown, filters=filters, filters_text=text)
+    return _ReadAxis(path, settings, record, proposal, flown, flight)
 
 
 def _tune_axis(axis: _ReadAxis, filters: Mapping[str, float]) -> AutopilotProposal:
     """The gains of one axis, with `filters` that are changed already."""
-    path, settings, asked, proposal, flown, flight = axis
-    plant = identify_plant(path, asked, proposal, flown.filters)
-    known = (settings, plant, flown)
-    unsure = lambda why, again: AutopilotProposal("cannot tell", why, *known, again, flight=flight)
+    path, settings, record, proposal, flown, flight = axis
+    plant = identify_plant(path, record, proposal, flown.filters)
+    result = (settings, plant, flown)
+    unsure = lambda why, again: AutopilotProposal("cannot tell", why, *result, again, flight=flight)
     recipe = firmware_named(flown.firmware).what_to_fly(AXES[flown.axis])
     if not plant.fit.identifiable:
         summary = plant.fit.verdict.summary
@@ -154,12 +159,13 @@ def _tune_axis(axis: _ReadAxis, filters: Mapping[str, float]) -> AutopilotPropos
         return unsure(f"this log cannot tell: {again.verdict}. {recipe}", again)
     if again.kind != "flown":
         return unsure(f"this log cannot tell: {again.verdict}", again)
-    read = lambda inputs: read_records(path, plant.settings, beside=inputs)
+    read = lambda inputs: read_records(path, plant.settings, further_inputs=inputs)
     throttle = study_throttle(plant, proposal, flown, read)
-    made = design_gains(settings, plant, flown, flight, throttle, filters)
+    design = design_gains(settings, plant, flown, flight, throttle, filters)
     return AutopilotProposal(
-        made.kind, made.verdict, *known, again, made.stages,
-        made.new if made.kind == "proposed" else {}, made.filters, made.noise, flight, throttle,
+        design.kind, design.verdict, *result, again, design.stages,
+        design.new if design.kind == "proposed" else {}, design.filters, design.noise, flight,
+        throttle,
     )  # fmt: skip
 
 
@@ -171,26 +177,11 @@ _NO_SETPOINT = (
 
 def _channels_of(path: Path, settings: AutopilotSettings) -> tuple[IdentifySettings, Proposal]:
     """What the log itself says is command, rate and reference."""
-    asked = IdentifySettings(
+    record = IdentifySettings(
         axis=None if settings.axis == "all" else settings.axis, chirp=settings.chirp,
         flight=settings.flight, start=settings.start, stop=settings.stop, band=settings.band,
     )  # fmt: skip
-    found, proposal = propose_settings(path, asked)
+    complete, proposal = propose_settings(path, record)
     if proposal is None:
         raise SettingsError(f"{path} proposes no channels: give the log of an autopilot")
-    return found, proposal
-
-
-def _read_flight(
-    path: Path, asked: IdentifySettings, proposal: Proposal, settings: AutopilotSettings
-) -> tuple[FlownAutopilot, FlightChannels | None]:
-    """The loop that flew, at the throttle of the log, and the channels beside the record's."""
-    values = settings_of(path, proposal).values
-    flight = read_channels_if_any(path, proposal, asked, values)
-    if settings.throttle is None and flight is not None:
-        settings = dataclasses.replace(settings, throttle=flight.middle)
-    tracked = {} if flight is None else flight.tracked_hz
-    flown = read_flown(path, proposal, settings, tracked)
-    chains = tuple(chain for chain in flown.law.gyro_chains() if chain.filters)
-    filters, text = best_filters(chains, flown.unmodelled, flight, flown.axis)
-    return dataclasses.replace(flown, filters=filters, filters_text=text), flight
+    return complete, proposal

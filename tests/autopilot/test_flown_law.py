@@ -9,22 +9,28 @@ from html_pages import read_page
 from scipy.signal import lfilter
 from sweep_logs import write_sweep
 
-from jaxquad.autopilot import Butterworth, FilterChain, Notch, PT1
-from jaxquad.autopilot._flight_channels import FlightChannels
-from jaxquad.autopilot._flown_law import best_filters, FlownLaw, StoredFilters
-from jaxquad.autopilot._loop_of_law import loop_of_law
+from jaxquad._core import Message
+from jaxquad.autopilot import (
+    best_filters,
+    Butterworth,
+    FilterChain,
+    FlightChannels,
+    FlownLaw,
+    loop_of_law,
+    Notch,
+    PT1,
+    StoredFilters,
+)
 from jaxquad.cli import main
 from jaxquad.workflows import (
     identify,
     identify_again,
     IdentifySettings,
     load_result,
-    open_logs,
     tune,
     TuneSettings,
     verify_result,
 )
-from jaxquad.workflows._identify import identify_fit
 
 
 CHAIN = FilterChain((Butterworth(20.0), PT1(60.0)), 400.0)
@@ -117,9 +123,7 @@ def test_betaflights_page_has_a_step_and_the_margins_of_its_law(log, tmp_path, n
 def test_a_loop_of_ones_own_is_tuned_behind_the_filters(tmp_path):
     path = write_sweep(tmp_path / "sweep.csv")
     asked = IdentifySettings(input="M=right-left", output="q", units={"q": "rad/s"}, band=(0.5, 6))
-    opened = open_logs(path, asked)
-    assert identify_fit(opened).settings.keep_gyro_filters
-    found = dataclasses.replace(identify_fit(opened), settings=opened.settings)
+    found = identify(path, asked)
     ahead = dataclasses.replace(found, flown=FlownLaw((CHAIN,), "as the parameters say"))
     assert ahead.filters and not found.filters
     with pytest.raises(ValueError, match="keep_gyro_filters=True"):
@@ -136,7 +140,10 @@ def test_notches_that_follow_the_motors_are_divided_out_as_measured():
     for section in whole.sections():
         b0, b1, a1, b2, a2 = (0.0 if x is None else float(x) for x in section)
         rate = np.asarray(lfilter([b0, b1, b2], [1.0, a1, a2], rate))
-    names, hidden = ("gyroADC[0]", "gyroUnfilt[0]"), ("3 RPM notches per motor on the gyro: x",)
+    names, hidden = (
+        ("gyroADC[0]", "gyroUnfilt[0]"),
+        (Message("3 RPM notches per motor on the gyro: x", "notch"),),
+    )
     flight = FlightChannels(
         (rate,), 1e-3, 0 * rate, unfiltered=(raw,), unfiltered_dt=1e-3, names=names
     )

@@ -95,7 +95,7 @@ def test_every_option_of_a_filter_can_be_stored_and_gives_the_loop_it_describes(
         for option in (choice.options[0], choice.options[choice.flown], choice.options[-1]):
             for name, value in option.parameters.items():
                 row = find_parameter(firmware, name)
-                assert row.low <= value <= row.high and (not row.whole or value == round(value))
+                assert row.low <= value <= row.high and (not row.integer or value == round(value))
             changed = change_filters(firmware, values, option.parameters)
             after = flown_loop(firmware, changed, version).law
             if choice.stage == "derivative" or option.filter is None:

@@ -1,6 +1,6 @@
 """A firmware that is no part of the package: its log leads to its own parameter file."""
 
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -65,7 +65,7 @@ def setup(log, wanted):
 
 def load(path):
     with np.load(path) as file:
-        columns = dict(file)
+        columns: dict[str, Any] = dict(file)
     time, gains = columns.pop("time"), columns.pop("gains")
     settings = {f"K{'PI'[k]}_{x.upper()}": str(gain) for k, gain in enumerate(gains) for x in AXES}
     units = {f"{name}_{x}": "rad/s" for name in ("rate", "target") for x in AXES}
@@ -91,7 +91,7 @@ class Kestrel(Firmware):
     def flown_loop(self, values, version, *, throttle, tracked_hz):
         read = Numbers(values)
         p, i = (jnp.array([read.number(f"K{x}_{axis.upper()}") for axis in AXES]) for x in "PI")
-        return FlownLoop(KestrelRate(p, i, jnp.zeros(3)))
+        return FlownLoop(KestrelRate(p=p, i=i, d=jnp.zeros(3)))
 
     def channels(self, prefix, axis):
         x = AXES[axis]
@@ -118,9 +118,9 @@ def flight(tmp_path):
     target = np.repeat(max_len_seq(10)[0] - 0.5, 12)[:count]
     target = lfilter([0.2], [1, -0.8], np.pad(target, (0, count - target.size)))
     gust = lfilter([1], [1, -0.99], 0.03 * random.standard_normal(count))
-    A, B, *_ = cont2discrete(
-        (np.array([[-1 / LAG, 0], [1, 0]]), np.array([[GAIN / LAG, 0], [0, 1]]), np.eye(2), 0), DT
-    )
+    rates, inputs = np.array([[-1 / LAG, 0], [1, 0]]), np.array([[GAIN / LAG, 0], [0, 1]])
+    discrete: Any = cont2discrete((rates, inputs, np.eye(2), 0), DT)
+    A, B, *_ = discrete
     state, queue, integral, rows = np.zeros(2), [0.0] * LATE, 0.0, []
     for k in range(count):
         rate = state[1] + 0.002 * random.standard_normal()
@@ -129,7 +129,7 @@ def flight(tmp_path):
         queue.append(P * error + integral)
         rows.append((rate, P * error, integral, queue[-1]))
         state = A @ state + B @ [queue.pop(0), gust[k]]
-    rate, p, i, u = np.array(rows).T
+    rate, p, i, u = np.transpose(rows)
     flown = {"rate": rate, "target": target, "p": p, "i": i, "u": u}
     columns = {f"{name}_roll": x for name, x in flown.items()}
     columns |= {f"{name}_{x}": np.zeros(count) for name in flown for x in AXES[1:]}
@@ -144,7 +144,7 @@ def test_its_log_is_understood_and_its_gains_are_tuned_into_its_own_file(kestrel
     proposal = jq.propose(flight)
     assert proposal.vehicle == "kestrel" and proposal.setup.hold == DT
     settings = AutopilotSettings(axis="roll", members=8, fresh=32, keep_filters=True)
-    found = autopilot(flight, settings)
+    found: Any = autopilot(flight, settings)
     fit = found.identification.fit
     assert abs(fit["gain"] - GAIN) < 3 * fit.standard_errors[fit.names.index("gain")]
     assert found.reproduction.kind == "flown" and found.kind == "proposed", str(found)

@@ -6,7 +6,7 @@ import pytest
 from conftest import ROOT
 from package_messages import messages
 
-from jaxquad.cli._main import _printer_of_warnings
+from jaxquad.cli._main import printer_of_warnings
 from jaxquad.records import RecordWarning
 
 
@@ -48,7 +48,7 @@ def test_a_term_that_messages_use_is_defined(found, word):
 
 
 def test_a_warning_is_printed_once_however_often_a_log_is_read(capsys):
-    show = _printer_of_warnings()
-    for text in ("gaps filled (max_gap=).", "another", "gaps filled (max_gap=)."):
-        show(text, RecordWarning, "a.py", 1)
+    show = printer_of_warnings()
+    for text in ("gaps filled («max_gap=»).", "another", "gaps filled («max_gap=»)."):
+        show(RecordWarning(text), RecordWarning, "a.py", 1)
     assert capsys.readouterr().err == "! gaps filled (--max-gap).\n! another\n"

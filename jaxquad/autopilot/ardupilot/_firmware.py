@@ -10,13 +10,13 @@ import numpy as np
 from jaxtyping import ArrayLike, Float
 
 from jaxquad._core import Message
+from jaxquad.identify import CurveFirmware
 from jaxquad.records import AXES
 
 from .._filters import Butterworth, FilterChain, PT1
 from .._firmware import Channels, Firmware, LowPass, Numbers, OuterLoop, Parameter, rows_of_axes
 from .._law import FlownLoop
-from ._harmonic_notch import HarmonicNotch, read_harmonic_notches, Tracking
-from ._law import ArduPilotRate
+from ._law import ArduPilotRate, HarmonicNotch, read_harmonic_notches, Tracking
 from ._log import LOG
 
 
@@ -33,10 +33,12 @@ class FlownArduPilot(FlownLoop[ArduPilotRate]):
     def at(self, throttle: Float[ArrayLike, "..."]) -> ArduPilotRate:
         """The law at a throttle of 0 to 1: where its notches are."""
         filters = list(self.law.gyro.filters)
-        for each in self.tracking:
-            notch = filters[each.place]
+        for notch_tracking in self.tracking:
+            notch = filters[notch_tracking.place]
             assert isinstance(notch, HarmonicNotch)
-            filters[each.place] = dataclasses.replace(notch, centre_hz=each.centre_hz(throttle))
+            filters[notch_tracking.place] = dataclasses.replace(
+                notch, centre_hz=notch_tracking.centre_hz(throttle)
+            )
         chain = FilterChain(tuple(filters), self.law.gyro.rate_hz)
         return dataclasses.replace(self.law, gyro=chain)
 
@@ -208,6 +210,9 @@ class ArduPilot(Firmware):
         if slope > 0 and of_axis(law.d) > 0:
             flown = {f"ATC_RAT_{_SHORT[axis]}_FLTD": slope}
             yield LowPass("derivative", flown, PT1(slope), 1 / law.dt, shared=False)
+
+    def curve_kind(self, version: Sequence[int]) -> CurveFirmware:
+        return "ardupilot"
 
     def angle_parameters(self, axis: str, p: float) -> dict[str, float]:
         return {f"ATC_ANG_{_SHORT[AXES.index(axis)]}_P": p}

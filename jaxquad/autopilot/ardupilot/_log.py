@@ -65,7 +65,7 @@ _FLY = "fly the SystemID mode with SID_AXIS 10 (roll), 11 (pitch) or 12 (yaw)"
 def ardupilot_setup(log: Log, wanted: Selection) -> Setup:
     """The set-up for the chirps that are wanted; else for the loop without one."""
     signals = flattened(log)
-    rates = {each: first_logged(signals, [f"RATE.{_LETTERS[each]}"]) for each in AXES}
+    rates = {x: first_logged(signals, [f"RATE.{_LETTERS[x]}"]) for x in AXES}
     if not any(rates.values()):
         raise RecordError(_without_rates(log))
     chirps = _chirps(log)

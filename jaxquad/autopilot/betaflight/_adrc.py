@@ -217,12 +217,12 @@ def adrc_parameters(values: Mapping[str, str]) -> dict[str, float]:
 
     **Returns:** values by the names of `PARAMETERS`; empty for a firmware without the ADRC.
     """
-    found = {
+    parameters = {
         f"{name}_{axis}": value
         for name, line in _OF_AXES.items() if line in values
         for axis, value in zip(AXES, _three(values, line), strict=True)
     }  # fmt: skip
-    return found | {name: float(values[name]) for name in _OF_ALL if name in values}
+    return parameters | {name: float(values[name]) for name in _OF_ALL if name in values}
 
 
 def flies_adrc(values: Mapping[str, str]) -> bool:
@@ -302,7 +302,7 @@ def _schedule(values: Mapping[str, str]) -> B0Schedule:
 
 def _unmodelled(values: Mapping[str, str], pid: FlownBetaflight) -> tuple[Message, ...]:
     # What concerns P, I and D did not fly.
-    common: list[str] = [each for each in pid.unmodelled if each.kind in ("notch", "feedforward")]
+    common: list[str] = [text for text in pid.unmodelled if text.kind in ("notch", "feedforward")]
     common.append("the gate before liftoff, and wc on the ground")
     if _number(values, "adrc_sat_z3_inhibit", 0.0) > 0:
         common.append("adrc_sat_z3_inhibit: the observer's integrator rests at the mixer's limits")

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxquad._core import Number
+from jaxquad.identify import CurveFirmware
 from jaxquad.records import AXES
 
 from .._filters import betaflight_quality, Filter, FilterChain, Notch, PT3
@@ -49,17 +50,17 @@ def _table() -> list[Parameter]:
         ("adrc_sigma_decay", "0.1/s", 3, (0, 100)),
     )
     return [
-        *rows_of_axes(of("p"), "", (45, 47, 45), byte, "p", whole=True),
-        *rows_of_axes(of("i"), "", (80, 84, 80), byte, "i", whole=True),
-        *rows_of_axes(of("d"), "", (30, 34, 0), byte, "d", whole=True),
-        *rows_of_axes(of("f"), "", (120, 125, 120), wide, "f", whole=True),
-        *rows_of_axes(of("d_max"), "", (40, 46, 0), byte, "d_max.ceiling", whole=True),
+        *rows_of_axes(of("p"), "", (45, 47, 45), byte, "p", integer=True),
+        *rows_of_axes(of("i"), "", (80, 84, 80), byte, "i", integer=True),
+        *rows_of_axes(of("d"), "", (30, 34, 0), byte, "d", integer=True),
+        *rows_of_axes(of("f"), "", (120, 125, 120), wide, "f", integer=True),
+        *rows_of_axes(of("d_max"), "", (40, 46, 0), byte, "d_max.ceiling", integer=True),
         Parameter("angle_p_gain", "0.1/s", 50, 0, 200, True, "angle.level"),
         Parameter("thrust_linear", "%", 0, 0, 150, True),
         *(Parameter(name, "Hz", default, *wide, True) for name, default in _FILTERS),
-        *rows_of_axes(of("adrc_wc"), "rad/s", (60, 60, 60), (5, 300), "wc", whole=True),
-        *rows_of_axes(of("adrc_wo"), "rad/s", (100, 100, 80), (10, 600), "wo", whole=True),
-        *rows_of_axes(of("adrc_b0"), "deg/s^3", (2000, 2000, 2000), (100, 65535), "b0", whole=True),
+        *rows_of_axes(of("adrc_wc"), "rad/s", (60, 60, 60), (5, 300), "wc", integer=True),
+        *rows_of_axes(of("adrc_wo"), "rad/s", (100, 100, 80), (10, 600), "wo", integer=True),
+        *rows_of_axes(of("adrc_b0"), "deg/s^3", (2000,) * 3, (100, 65535), "b0", integer=True),
         *(Parameter(name, unit, default, *bound, True) for name, unit, default, bound in adrc),
     ]  # fmt: skip
 
@@ -200,7 +201,7 @@ class Betaflight(Firmware):
             changed[line] = ",".join(parts)
         return changed
 
-    def curve_kind(self, version: Sequence[int]) -> str:
+    def curve_kind(self, version: Sequence[int]) -> CurveFirmware:
         """Until 2025.12 `thrust_linear` is of another family than the others' parameters."""
         return "betaflight 2025.12" if tuple(version) < (2026, 6) else "betaflight"
 
@@ -234,8 +235,8 @@ class Betaflight(Firmware):
                 if any(row.name.startswith(f"{part}_lpf") for row, *_ in values):
                     rows.append(f"set simplified_{part}_filter = OFF")
         for name, (row, value, other) in zip(names, values, strict=True):
-            rows += [f"# {name} was {number_text(other, row.whole)}"]
-            rows += [f"set {name} = {number_text(value, row.whole)}"]
+            rows += [f"# {name} was {number_text(other, row.integer)}"]
+            rows += [f"set {name} = {number_text(value, row.integer)}"]
         for name, word, other in words:
             rows += [f"# {name} was {other}", f"set {name} = {word}"]
         return joined_lines([*rows, "save"])

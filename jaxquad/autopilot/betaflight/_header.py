@@ -65,7 +65,8 @@ class FlownBetaflight(FlownLoop[BetaflightPID]):
         )  # fmt: skip
 
     def without_gyro_filters(self) -> "FlownBetaflight":
-        return dataclasses.replace(super().without_gyro_filters(), gyro_dynamic=None)
+        law = self.law.without_gyro_filters()
+        return dataclasses.replace(self, law=law, gyro_dynamic=None)
 
     def at_sample(self, throttle: Array, surge: Array, integral_share: Array) -> BetaflightPID:
         return self.at(throttle, surge=surge, integral_share=integral_share)

@@ -101,14 +101,14 @@ class DMax(eqx.Module):
         delta: Signal, speed: Signal, d: Array,
     ) -> tuple[tuple[PyTree, PyTree], Signal]:  # fmt: skip
         """Of the D gain, 1 or above."""
-        held, quick = chains[0].step(memory[0], delta)
+        state, quick = chains[0].step(memory[0], delta)
         base = broadcast_gain(d, delta)
         most = broadcast_gain(self.ceiling, delta) / jnp.where(base > 0, base, 1.0)
         most = jnp.where(base > 0, jnp.maximum(most, 1.0), 1.0)
         of_gyro = jnp.abs(quick) * broadcast_gain(self.gyro_gain, delta)
         of_setpoint = jnp.abs(speed) * broadcast_gain(self.setpoint_gain, delta)
         smooth, share = chains[1].step(memory[1], jnp.maximum(of_gyro, of_setpoint))
-        return (held, smooth), jnp.minimum(1 + (most - 1) * share, most)
+        return (state, smooth), jnp.minimum(1 + (most - 1) * share, most)
 
 
 class BetaflightPID(RateLoop):
@@ -261,8 +261,8 @@ class BetaflightPID(RateLoop):
         if self.d_max is None:
             return {}, jnp.ones_like(delta)
         chains = self.d_max.chains(1 / self.dt)
-        held, factor = self.d_max.factor(chains, memory["d_max"], delta, speed, self.d)
-        return {"d_max": held}, factor
+        state, factor = self.d_max.factor(chains, memory["d_max"], delta, speed, self.d)
+        return {"d_max": state}, factor
 
 
 def tpa_factor(

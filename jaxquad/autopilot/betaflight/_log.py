@@ -35,11 +35,13 @@ def betaflight_setup(log: Log, wanted: Selection) -> Setup:
     """
     prefix, table = _main_table(log)
     signals, axis = flattened(log), wanted.axis
-    rates = {each: first_logged(signals, [f"{prefix}gyroADC[{i}]"]) for i, each in enumerate(AXES)}
+    rates = {
+        sweep: first_logged(signals, [f"{prefix}gyroADC[{i}]"]) for i, sweep in enumerate(AXES)
+    }
     if not any(rates.values()):
         raise RecordError("the log has no gyroADC.")
-    sweeps = [each for each in chirps(table) if axis in (None, AXES[each.axis])]
-    best = max(sweeps, key=lambda each: each.stop - each.start, default=None)
+    sweeps = [sweep for sweep in chirps(table) if axis in (None, AXES[sweep.axis])]
+    best = max(sweeps, key=lambda sweep: sweep.stop - sweep.start, default=None)
     axis = axis or (most_active_axis(signals, rates) if best is None else AXES[best.axis])
     i = AXES.index(axis)
     command = first_logged(signals, [f"{prefix}axisMixed[{i}]", f"{prefix}axisSum[{i}]"])
@@ -51,13 +53,13 @@ def betaflight_setup(log: Log, wanted: Selection) -> Setup:
         "log has their parameters"
     ]
     if best is not None:
-        others = [each for each in sweeps if each.axis != best.axis]
+        others = [sweep for sweep in sweeps if sweep.axis != best.axis]
         remarks += [
-            f"another chirp on the set-point of {AXES[each.axis]}, "
-            f"t = {each.start:.6g} .. {each.stop:.6g} s"
-            for each in others
+            f"another chirp on the set-point of {AXES[sweep.axis]}, "
+            f"t = {sweep.start:.6g} .. {sweep.stop:.6g} s"
+            for sweep in others
         ]
-        alike = [Injection(*each[1:5]) for each in sweeps if each.axis == best.axis]
+        alike = [Injection(*sweep[1:5]) for sweep in sweeps if sweep.axis == best.axis]
         setup = Setup(
             axis, {command: 1.0}, rates[axis], f"{prefix}{best.channel}", remarks=tuple(remarks),
             injected_at="rate", levelled=bool(levelled),
@@ -115,8 +117,8 @@ def saturation(log: Log, setup: Setup, spans: Sequence[tuple[float, float]]) -> 
     prefix, table = _main_table(log)
     if not (text.isdecimal() and len(text) < 9) or table.time is None:
         return ()
-    asked = f"{prefix}axisSum[{AXES.index(setup.axis)}]"
-    command = values_of(flattened(log), asked)
+    channel = f"{prefix}axisSum[{AXES.index(setup.axis)}]"
+    command = values_of(flattened(log), channel)
     used = np.zeros(command.size, bool)
     for start, stop in spans:
         used |= (table.time >= start) & (table.time <= stop)
@@ -154,9 +156,9 @@ def chirps(table: Table) -> list[Chirp]:
         return []
     if "chirp" in table.columns:
         return _chirps_of_phase(table, table.time)
-    if any(each is None for each in debug):
+    if any(x is None for x in debug):
         return []
-    _, axis, tenths, excitation = (np.asarray(each, np.float64) for each in debug)
+    _, axis, tenths, excitation = (np.asarray(x, np.float64) for x in debug)
     active = np.where(tenths > 0, axis, -1)
     edges = np.flatnonzero(np.diff(active)) + 1
     if not np.isin(axis, (-1, *_AXES)).all() or edges.size > _MOST_EDGES:

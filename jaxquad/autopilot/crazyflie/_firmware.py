@@ -210,7 +210,7 @@ class Crazyflie(Firmware):
         return f"Fly this: strong and quick {axis} stick for 20 s"
 
     def si_scales(self, axis: str) -> tuple[float, float, float]:
-        return (65535 / DEGREES,) * 3
+        return 65535 / DEGREES, 65535 / DEGREES, 65535 / DEGREES
 
     def angle_parameters(self, axis: str, p: float) -> dict[str, float]:
         return {f"pid_attitude.{axis}_kp": p, f"pid_attitude.{axis}_ki": 0.0}
@@ -223,9 +223,9 @@ class Crazyflie(Firmware):
         for row, value, _ in values:
             rows += [
                 f"  {row.name}:",
-                f"    default_value: {number_text(row.default, row.whole)}",
+                f"    default_value: {number_text(row.default, row.integer)}",
                 "    is_stored: true",
-                f"    stored_value: {number_text(value, row.whole)}",
+                f"    stored_value: {number_text(value, row.integer)}",
             ]
         head = [f"# {title}"] if title else []
         return joined_lines([*head, *rows, "type: persistent_param_state", "version: '1'"])

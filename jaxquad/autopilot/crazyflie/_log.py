@@ -23,15 +23,14 @@ def crazyflie_setup(log: Log, wanted: Selection) -> Setup:
     """Of a Crazyflie, for the axis that moves most; its firmware has no chirp and no reference."""
     signals = flattened(log)
     prefixes = [f"{name}." if name else "" for name in log.tables]
-    found = {
-        each: next(filter(None, (_rate(signals, prefix, each) for prefix in prefixes)), "")
-        for each in AXES
+    rates = {
+        x: next(filter(None, (_rate(signals, prefix, x) for prefix in prefixes)), "") for x in AXES
     }
-    if not any(found.values()):
+    if not any(rates.values()):
         raise RecordError("the log has no gyro.x, gyro.y, gyro.z or controller.r_roll, ...")
-    axis = wanted.axis or most_active_axis(signals, found)
+    axis = wanted.axis or most_active_axis(signals, rates)
     command = next(filter(None, (_command(signals, prefix, axis) for prefix in prefixes)), None)
-    if not found[axis] or command is None:
+    if not rates[axis] or command is None:
         raise RecordError(
             f"the log has no command (controller.cmd_{axis}, or motor.m1 .. m4) or no rate for "
             f"{axis}."
@@ -42,7 +41,7 @@ def crazyflie_setup(log: Log, wanted: Selection) -> Setup:
         "for an external reference, log a signal that your own code injects, and name it with "
         "--reference",
     ]
-    remarks += _slow_stamps(signals, found[axis])
+    remarks += _slow_stamps(signals, rates[axis])
     target = next(
         (f"{p}ctrltarget.{axis}" for p in prefixes if moves(signals, f"{p}ctrltarget.{axis}")), ""
     )
@@ -56,7 +55,7 @@ def crazyflie_setup(log: Log, wanted: Selection) -> Setup:
             "the motor commands are not linear in thrust: where the thrust curve is known, use "
             "powers (--input 'NAME=0.1*a^2')"
         )
-    return Setup(axis, command, found[axis], remarks=tuple(remarks))
+    return Setup(axis, command, rates[axis], remarks=tuple(remarks))
 
 
 _SLOW_STAMPS = 85 / 84  # by which rates of the micro-SD deck's stamps are too high

@@ -11,6 +11,7 @@ from jaxtyping import Array, Float, PyTree
 
 from jaxquad._core import as_float, broadcast_gain, Message, per_member, require_positive
 from jaxquad.control import Reference, Setpoint
+from jaxquad.identify import CurveFirmware
 from jaxquad.records import AXES
 
 from .._filters import BandwidthNotch, Butterworth, Filter, FilterChain, PT1, Section
@@ -344,6 +345,9 @@ class PX4(Firmware):
     def notch_width(self, centre_hz: float, half_width: float) -> float:
         return float(np.rint(2 * half_width * centre_hz))
 
+    def curve_kind(self, version: Sequence[int]) -> CurveFirmware:
+        return "px4"
+
     def angle_parameters(self, axis: str, p: float) -> dict[str, float]:
         return {f"MC_{axis.upper()}_P": p}
 
@@ -354,9 +358,9 @@ class PX4(Firmware):
         rows = [f"# {title}"] if title else []
         rows += ["#", "# Vehicle-Id Component-Id Name Value Type"]
         for row, value, other in values:
-            rows.append(f"# {row.name} was {number_text(other, row.whole)}")
-            kind = 6 if row.whole else 9  # int32, float
-            rows.append(f"1\t1\t{row.name}\t{number_text(value, row.whole)}\t{kind}")
+            rows.append(f"# {row.name} was {number_text(other, row.integer)}")
+            kind = 6 if row.integer else 9  # int32, float
+            rows.append(f"1\t1\t{row.name}\t{number_text(value, row.integer)}\t{kind}")
         return joined_lines(rows)
 
 

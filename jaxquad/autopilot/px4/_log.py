@@ -34,14 +34,14 @@ _STICKS = {
 def px4_setup(log: Log, wanted: Selection) -> Setup:
     """The set-up for autotune's excitation; without it, with the set-point if flown in acro."""
     signals, axis = flattened(log), wanted.axis
-    rates = {each: _rate(signals, i) for i, each in enumerate(AXES)}
+    rates = {x: _rate(signals, i) for i, x in enumerate(AXES)}
     if not any(rates.values()):
         raise RecordError(
             "the log has no vehicle_angular_velocity. Choose a logging profile that has it."
         )
-    tuned = {each: span for each, span in _autotuned(log).items() if axis in (None, each)}
+    tuned = {x: span for x, span in _autotuned(log).items() if axis in (None, x)}
     if tuned:
-        axis = max(tuned, key=lambda each: max(run.stop - run.start for run in tuned[each]))
+        axis = max(tuned, key=lambda x: max(run.stop - run.start for run in tuned[x]))
     axis = axis or most_active_axis(signals, rates)
     i = AXES.index(axis)
     command = first_logged(
@@ -71,15 +71,15 @@ def _autotuned(log: Log) -> dict[str, list[Injection]]:
         return {}
     if table.columns["state"].ndim != 1:
         return {}
-    found = {}
+    runs = {}
     for state, axis in _STATES.items():
         rows = np.flatnonzero(table.columns["state"] == state)
         cuts = np.flatnonzero((np.diff(rows) > 1) & (np.diff(table.time[rows]) > _BREAK)) + 1
         parts = [part for part in np.split(rows, cuts) if part.size > 1]
         if parts:
             ends = (table.time[part[[0, -1]]].tolist() for part in parts)
-            found[axis] = [Injection(start, stop) for start, stop in ends]
-    return found
+            runs[axis] = [Injection(start, stop) for start, stop in ends]
+    return runs
 
 
 def _untuned(log: Log, signals: Signals, axis: str, command: str, rate: str) -> Setup:

@@ -1,3 +1,5 @@
+"""Fits of one model to many responses, in one compiled call."""
+
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
@@ -15,9 +17,6 @@ from jaxquad._core import (
     begin,
     CONVERGED,
     decrement,
-    Descent,
-    Message,
-    Normal,
     require_x64,
     RUNNING,
     settle,
@@ -37,11 +36,11 @@ from ..frequency_domain._cost import (
     usable,
 )
 from ..frequency_domain._fit import check_options
-from ..frequency_domain._held import held, hold_of
 from ..frequency_domain._mixing import Mixing, mixings_of
 from ..frequency_domain._parameters import Free, Numbers, Parameters, select_parameters, Tie
 from ..frequency_domain._problem import make_problem
 from ..frequency_domain._result import Fit
+from ..frequency_domain._sampled import behind_hold, hold_of
 from ..frequency_domain._solve import solution_at, stopped_early
 from ..uncertainty._assess import assess
 from ..uncertainty._error_budget import weighting_at
@@ -108,7 +107,7 @@ def solve_batch(
 
 
 def _members(measured: np.ndarray, weights: np.ndarray, mixings: Mixings) -> Member:
-    """What the members are fitted to, each on the first axis."""
+    """What the members are fitted to, which are on the first axis."""
     used = np.any(weights > 0, axis=-1)
     # Points that do not count may hold anything, NaN included.
     with np.errstate(invalid="ignore"):
@@ -116,42 +115,23 @@ def _members(measured: np.ndarray, weights: np.ndarray, mixings: Mixings) -> Mem
     weights = _pad(weights, 1)
     if weights.shape[1] > measured.shape[1]:
         weights[:, measured.shape[1] :] = 0
-    shared = any(each is not None for each in mixings)
     parts = np.real(inverse), np.imag(inverse)
-    if not shared:
+    if all(mixing is None for mixing in mixings):
         return Member(parts, weights, None)
-    given = measured.shape, inverse.shape[1]
-    return Member(parts, weights, _factors(mixings, *given), _across(mixings, *given))
-
-
-def _factors(
-    mixings: Mixings, shape: tuple[int, ...], length: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """Real and imaginary parts; the identity for members whose points share no noise."""
-    batch, count, outputs, inputs = shape
-    real = np.zeros((batch, length, length, outputs, inputs))
-    imag = np.zeros_like(real)
-    for k, mixing in enumerate(mixings):
-        factor = np.eye(count)[:, :, None, None]
-        factor = factor if mixing is None else np.moveaxis(mixing.factor, (0, 1), (2, 3))
-        real[k, :count, :count], imag[k, :count, :count] = np.real(factor), np.imag(factor)
-    return real, imag
-
-
-def _across(
-    mixings: Mixings, shape: tuple[int, ...], length: int
-) -> tuple[np.ndarray, np.ndarray] | None:
-    """Likewise of the pairs at each frequency, where there are several."""
-    batch, count, outputs, inputs = shape
+    (batch, count, outputs, inputs), length = measured.shape, inverse.shape[1]
+    # The identity for members whose points, and pairs at a frequency, share no noise.
+    factors = np.zeros((batch, length, length, outputs, inputs), complex)
     pairs = outputs * inputs
-    if pairs == 1:
-        return None
-    whole = np.zeros((batch, length, pairs, pairs), complex)
-    whole[:] = np.eye(pairs)
-    for row, mixing in zip(whole, mixings, strict=True):
-        if mixing is not None and mixing.across is not None:
-            row[:count] = mixing.across
-    return np.real(whole), np.imag(whole)
+    across = np.zeros((batch, length, pairs, pairs), complex)
+    across[:] = np.eye(pairs)
+    for factor, row, mixing in zip(factors, across, mixings, strict=True):
+        factor[:count, :count] = np.eye(count)[:, :, None, None]
+        if mixing is not None:
+            factor[:count, :count] = np.moveaxis(mixing.factor, (0, 1), (2, 3))
+            if mixing.across is not None:
+                row[:count] = mixing.across
+    split = lambda x: (np.real(x), np.imag(x))
+    return Member(parts, weights, split(factors), split(across) if pairs > 1 else None)
 
 
 def _padded(size: int) -> int:
@@ -168,66 +148,59 @@ def _pad(array: np.ndarray, axis: int = 0) -> np.ndarray:
     return np.take(array, np.minimum(np.arange(_padded(size)), size - 1), axis)
 
 
-def _check_pointwise(where: Batch, shape: tuple[int, ...]) -> None:
-    whole, single = (np.asarray(part) for part in _both_ways(where.model, where.omega))
-    if whole.shape != (*where.omega.shape, *shape):
-        raise ValueError(
-            Message(
-                f"the model's response has shape {whole.shape[1:]}, the measured ones {shape} "
-                "(outputs, inputs): «pick channels with jq.records.select», or extend the model"
-            )
-        )
-    if not np.allclose(whole, single, rtol=1e-9, atol=1e-12 * np.max(np.abs(whole))):
-        raise ValueError(
-            "the model's response at one frequency depends on the other frequencies that are asked "
-            "for: a batch evaluates it frequency by frequency; fit the responses with jq.fit"
-        )
-
-
 @eqx.filter_jit
 def _both_ways(model, omega):
     single = jax.vmap(lambda w: evaluate_response(model, w[None])[0])(omega)
     return evaluate_response(model, omega), single
 
 
-def _calls(batch: int, chunk: int, chunks: int) -> list[Int[np.ndarray, "chunks chunk"]]:
-    """The members that each call solves, by chunks; the last are filled up with the last member."""
-    places = _places(batch, chunk)
-    calls = max(-(-len(places) // chunks), min(len(places), available_cores()))
-    return np.array_split(places, calls)
+def _check_pointwise(where: Batch, shape: tuple[int, ...]) -> None:
+    together, single = (np.asarray(part) for part in _both_ways(where.model, where.omega))
+    if together.shape != (*where.omega.shape, *shape):
+        raise ValueError(
+            f"the model's response has shape {together.shape[1:]}, the measured ones {shape} "
+            "(outputs, inputs): pick channels with jq.records.select, or extend the model"
+        )
+    if not np.allclose(together, single, rtol=1e-9, atol=1e-12 * np.max(np.abs(together))):
+        raise ValueError(
+            "the model's response at one frequency depends on the other frequencies that are asked "
+            "for: a batch evaluates it frequency by frequency; fit the responses with jq.fit"
+        )
 
 
 def _places(batch: int, chunk: int) -> Int[np.ndarray, "chunks chunk"]:
+    """Members by chunks; the last is filled up with the last member."""
     return np.minimum(np.arange(batch + -batch % chunk), batch - 1).reshape(-1, chunk)
 
 
 def _solve_calls(
     where: Batch, members: Member, start: np.ndarray, max_steps: int, tolerance: float
 ) -> BatchSolution:
-    batch = len(start)
     chunks = _CHUNKS if members.factor is None else 1  # factors are large
 
     def solve(places: Int[np.ndarray, "chunks chunk"]) -> BatchSolution:
-        mine, z0 = jax.tree.map(lambda x: _arrange(x, places, chunks), (members, start))
-        options = np.asarray(len(places)), np.asarray(max_steps), tolerance
-        found = _solve_call(where, mine, z0, *options)
-        return BatchSolution(*(np.asarray(part)[: places.size] for part in found))
+        # Chunks first and members last; all calls have one size: few programs are compiled.
+        def arrange(array: np.ndarray) -> np.ndarray:
+            mine = np.moveaxis(array[places], 1, -1)
+            filled = np.zeros((chunks, *mine.shape[1:]), mine.dtype)
+            filled[: len(places)] = mine
+            return filled
 
-    calls = _calls(batch, _CHUNK_OF_SINGLES if evaluates_singly(where) else _CHUNK, chunks)
+        mine, z0 = jax.tree.map(arrange, (members, start))
+        options = np.asarray(len(places)), np.asarray(max_steps), tolerance
+        parts = _solve_call(where, mine, z0, *options)
+        return BatchSolution(*(np.asarray(part)[: places.size] for part in parts))
+
+    places = _places(len(start), _CHUNK_OF_SINGLES if evaluates_singly(where) else _CHUNK)
+    count = max(-(-len(places) // chunks), min(len(places), available_cores()))
+    calls = np.array_split(places, count)
     if len(calls) > 1:
         solve(calls[0][:0])  # of no chunk: compiled here, once for all threads
     # A program runs on one core.
     with ThreadPoolExecutor(max_workers=min(len(calls), available_cores())) as pool:
-        found = list(pool.map(solve, calls))
-    return BatchSolution(*(np.concatenate(each)[:batch] for each in zip(*found, strict=True)))
-
-
-def _arrange(array: np.ndarray, places: Int[np.ndarray, "chunks chunk"], chunks: int) -> np.ndarray:
-    """Chunks first and members last; all calls have one size, so that few programs are compiled."""
-    mine = np.moveaxis(array[places], 1, -1)
-    filled = np.zeros((chunks, *mine.shape[1:]), mine.dtype)
-    filled[: len(places)] = mine
-    return filled
+        solutions = list(pool.map(solve, calls))
+    parts = zip(*solutions, strict=True)
+    return BatchSolution(*(np.concatenate(part)[: len(start)] for part in parts))
 
 
 @Jit
@@ -250,31 +223,23 @@ def _solve_call(where, members, z0, chunks, max_steps, tolerance) -> BatchSoluti
     return BatchSolution(z, jax.vmap(where.parameters.values)(z), *facts)
 
 
-class _Walk(NamedTuple):
-    """A descent, and the normal equations at the last point that was evaluated."""
-
-    state: Descent
-    normal: Normal
-    ended: Bool[Array, ""]
-
-
 def _descend(evaluate: Evaluate, z0: Array, max_steps: Array, tolerance: float) -> tuple:
     """Where members stop, with the cost, what is left to save, steps, and whether they converged.
 
     As `minimise` does, and with one evaluation at the end, in the same loop: it compiles once.
     """
 
-    def step(walk: _Walk) -> _Walk:
-        state = walk.state
+    def step(walk):
+        state, _, _ = walk
         active = (state.status == RUNNING) & (state.steps < max_steps)
         ended = ~jnp.any(active)
         state = state._replace(change=jnp.where(ended, 0.0, state.change))
         normal = evaluate(state.z + state.change, active | ended)
-        return _Walk(advance(lambda _: normal, state, max_steps, tolerance), normal, ended)
+        return advance(lambda _: normal, state, max_steps, tolerance), normal, ended
 
     start = begin(z0)
-    walk = _Walk(start, start.normal, jnp.asarray(False))
-    state, normal, _ = jax.lax.while_loop(lambda walk: ~walk.ended, step, walk)
+    walk = start, start.normal, jnp.asarray(False)
+    state, normal, _ = jax.lax.while_loop(lambda walk: ~walk[2], step, walk)
     left = decrement(normal)
     converged = (settle(state).status == CONVERGED) & (left <= 1e-6 * normal.cost + 1e-12)
     return state.z, 2 * normal.cost, left, state.steps, converged
@@ -322,15 +287,6 @@ class BatchFit(eqx.Module):
         return "\n".join(lines)
 
 
-class _Data(NamedTuple):
-    """The responses on common arrays."""
-
-    omega: Float[np.ndarray, " frequencies"]
-    measured: np.ndarray
-    points: list[Points]
-    hold: float  # s
-
-
 def fit_batch(
     model: PyTree,
     frfs: Sequence[FrequencyResponse],
@@ -371,27 +327,6 @@ def fit_batch(
     model = with_arrays(model)
     parameters = select_parameters(model, free, tied)
     least = least_coherence(min_coherence, cost, frfs[0])
-    data = _stack_responses(frfs, band, least)
-    ones = [np.ones(each.used.shape) for each in data.points]
-    weights, mixed = _weights(cost, data, ones), isinstance(cost, MaximumLikelihood)
-    # Without a floor on the errors, they do not depend on the weights.
-    mixings = mixings_of(data.points, list(weights)) if mixed else ()
-    arrays, options = (data.omega, data.measured), {"hold": data.hold, "max_steps": max_steps}
-    found = solve_batch(model, parameters, *arrays, weights, mixings=mixings, **options)
-    again = _weights(cost, data, _ratios(model, parameters, data, found))
-    if not np.allclose(weights, again, rtol=1e-4):
-        weights, start = again, np.where(np.isfinite(found.z), found.z, 0.0)
-        found = solve_batch(
-            model, parameters, *arrays, weights, mixings=mixings, start=start, **options
-        )
-    return BatchFit(
-        parameters.names, *(np.asarray(part) for part in found[1:]),
-        model=model, parameters=parameters, points=tuple(data.points), weights=weights,
-        mixed=mixed, z=np.asarray(found.z),
-    )  # fmt: skip
-
-
-def _stack_responses(frfs: Sequence[FrequencyResponse], band: Range | None, least: float) -> _Data:
     omega, shape = np.asarray(frfs[0].omega), frfs[0].response.shape
     for k, frf in enumerate(frfs):
         if frf.response.shape != shape or not np.allclose(np.asarray(frf.omega), omega):
@@ -406,42 +341,50 @@ def _stack_responses(frfs: Sequence[FrequencyResponse], band: Range | None, leas
             f"{len(poor)} of {len(frfs)} responses have no usable frequency, the first is number "
             f"{poor[0]}: leave them out, or lower min_coherence"
         )
-    measured = [np.asarray(frf.response) for frf in frfs]
-    kept = [np.where(mask, each, 1.0) for mask, each in zip(used, measured, strict=True)]
-    return _Data(omega, np.stack(kept), points_of(frfs, used), _shared_hold(frfs))
-
-
-def _shared_hold(frfs: Sequence[FrequencyResponse]) -> float:
+    pairs = zip(used, frfs, strict=True)
+    measured = np.stack([np.where(mask, np.asarray(frf.response), 1.0) for mask, frf in pairs])
     holds = sorted({hold_of(frf) for frf in frfs})
     if len(holds) > 1:
         raise ValueError(
             f"the inputs of the responses are held for {holds} s: fit those of one hold together"
         )
-    return holds[0]
+    points = points_of(frfs, used)
 
+    def weights_at(ratios) -> np.ndarray:
+        rows = zip(points, ratios, strict=True)
+        return np.stack([cost.weights(*row) for row in rows])
 
-def _weights(cost: Cost, data: _Data, ratios) -> np.ndarray:
-    rows = zip(data.points, ratios, strict=True)
-    return np.stack([cost.weights(*row) for row in rows])
+    weights, mixed = weights_at(np.ones(measured.shape)), isinstance(cost, MaximumLikelihood)
+    # Without a floor on the errors, they do not depend on the weights.
+    mixings = mixings_of(points, list(weights)) if mixed else ()
+    options = {"mixings": mixings, "hold": holds[0], "max_steps": max_steps}
+    solution = solve_batch(model, parameters, omega, measured, weights, **options)
+    again = weights_at(_ratios(Batch(model, parameters, holds[0], _pad(omega)), measured, solution))
+    if not np.allclose(weights, again, rtol=1e-4):
+        weights, start = again, np.where(np.isfinite(solution.z), solution.z, 0.0)
+        solution = solve_batch(model, parameters, omega, measured, weights, start=start, **options)
+    return BatchFit(
+        parameters.names, *(np.asarray(part) for part in solution[1:]),
+        model=model, parameters=parameters, points=tuple(points), weights=weights,
+        mixed=mixed, z=np.asarray(solution.z),
+    )  # fmt: skip
 
 
 @eqx.filter_jit
 def _sizes(where, z) -> Float[Array, "batch frequencies outputs inputs"]:
     def one(z):
-        model = held(where.parameters.insert(where.model, z), where.hold)
+        model = behind_hold(where.parameters.insert(where.model, z), where.hold)
         return jnp.abs(evaluate_response(model, where.omega))
 
     return jax.vmap(one)(z)
 
 
 def _ratios(
-    model: PyTree, parameters: Parameters, data: _Data, found: BatchSolution
+    where: Batch, measured: np.ndarray, solution: BatchSolution
 ) -> Float[np.ndarray, "batch frequencies outputs inputs"]:
     """|model / measurement| of every member; 1 where a fit ran away."""
-    batch, count = len(found.z), data.omega.size
-    where = Batch(model, parameters, data.hold, _pad(data.omega))
-    parts = [_sizes(where, found.z[each]) for each in _places(batch, _CHUNK)]
+    parts = [_sizes(where, solution.z[chunk]) for chunk in _places(len(solution.z), _CHUNK)]
     sizes = np.concatenate([np.asarray(part) for part in parts])
     with np.errstate(invalid="ignore"):
-        ratios = sizes[:batch, :count] / np.abs(data.measured)
+        ratios = sizes[: len(measured), : measured.shape[1]] / np.abs(measured)
     return np.where(np.isfinite(ratios) & (ratios > 0), ratios, 1.0)

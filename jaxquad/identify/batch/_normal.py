@@ -1,8 +1,7 @@
 """Normal equations of many fits side by side: members on the last axis."""
 
 import functools as ft
-import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import NamedTuple
 
 import equinox as eqx
@@ -15,11 +14,10 @@ from jaxquad._compile import evaluate_once
 from jaxquad._core import Normal
 from jaxquad.models import evaluate_response, StateSpace
 
-from ..frequency_domain._condition import UNCHANGED
-from ..frequency_domain._held import held
 from ..frequency_domain._mixing import Mixing
-from ..frequency_domain._parameters import Numbers, Parameters, Place
+from ..frequency_domain._parameters import Numbers, Parameters, Place, UNCHANGED
 from ..frequency_domain._problem import Problem, problem_normal
+from ..frequency_domain._sampled import behind_hold
 
 
 class Member(NamedTuple):
@@ -43,7 +41,6 @@ class Batch(NamedTuple):
     omega: Float[Numbers, " frequencies"]
 
 
-Column = tuple[Array, Array]  # of slopes or misfits: magnitudes and phases, weighted
 Active = Bool[Array, " members"]
 Evaluate = Callable[[Float[Array, "parameters members"], Active], Normal]
 
@@ -66,74 +63,55 @@ def evaluates_singly(batch: Batch) -> bool:
 
 
 def _one_by_one(batch: Batch, member: Member) -> Evaluate:
-    members = _lay_out(member)
-
-    def one(given):
-        active, z, mine = given
-        normal = lambda z, mine: problem_normal(z, _problem_of_one(batch, mine))
-        shapes = jax.eval_shape(normal, z, mine)
-        skip = lambda *_: jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
-        return jax.lax.cond(active, normal, skip, z, mine)
-
-    def evaluate(z: Float[Array, "parameters members"], active: Active) -> Normal:
-        found = jax.lax.map(one, (active, z.T, members))
-        return jax.tree.map(lambda x: jnp.moveaxis(x, 0, -1), found)
-
-    return evaluate
-
-
-class _Single(NamedTuple):
-    """What one member is fitted to, in the order in which normal equations take it."""
-
-    measured: tuple[Array, Array]  # outputs inputs frequencies: real, imaginary
-    weights: Array  # parts outputs inputs frequencies
-    factor: tuple[Array, Array] | None  # outputs inputs frequencies frequencies
-    across: tuple[Array, Array] | None  # frequencies pairs pairs
-
-
-def _lay_out(member: Member) -> _Single:
-    """With the members first: transposed once, not at each evaluation."""
+    # With the members first: transposed once, not at each evaluation.
     measured = jnp.moveaxis(1 / jax.lax.complex(*member.inverse), (3, 0), (0, 3))
     weights = jnp.moveaxis(member.weights, (4, 3, 0), (0, 1, 4))
     factor = across = None
     if member.factor is not None:
-        real, imag = (jnp.moveaxis(x, (4, 0, 1), (0, 3, 4)) for x in member.factor)
-        factor = real, imag
+        factor = tuple(jnp.moveaxis(x, (4, 0, 1), (0, 3, 4)) for x in member.factor)
     if member.across is not None:
-        real, imag = (jnp.moveaxis(x, -1, 0) for x in member.across)
-        across = real, imag
-    return _Single((jnp.real(measured), jnp.imag(measured)), weights, factor, across)
+        across = tuple(jnp.moveaxis(x, -1, 0) for x in member.across)
+    members = (jnp.real(measured), jnp.imag(measured)), weights, factor, across
 
+    def normal(z, member):
+        measured, weights, factor, across = member
+        mixing = None
+        if factor is not None:
+            factor = jax.lax.complex(*factor)
+            across = None if across is None else jax.lax.complex(*across)
+            # Traced, in the place of NumPy's arrays; correlations matter to nothing here.
+            mixing = Mixing(factor, factor, across, across)  # pyright: ignore[reportArgumentType]
+        problem = Problem(
+            model=batch.model,
+            parameters=batch.parameters,
+            conditions=(UNCHANGED,),
+            quantities=(),
+            omega=(batch.omega,),
+            measured=(jnp.moveaxis(jax.lax.complex(*measured), -1, 0),),
+            weights=(jnp.moveaxis(weights, (3, 0), (0, 3)),),
+            prior=np.zeros((0, 2)),
+            aliases=(None,),
+            silent=((),),
+            mixings=(mixing,),
+        )
+        return problem_normal(z, problem)
 
-def _problem_of_one(batch: Batch, member: _Single) -> Problem:
-    mixing = None
-    if member.factor is not None:
-        factor = jax.lax.complex(*member.factor)
-        across = None if member.across is None else jax.lax.complex(*member.across)
-        # Traced, in the place of NumPy's arrays; correlations matter to nothing here.
-        mixing = Mixing(factor, factor, across, across)  # pyright: ignore[reportArgumentType]
-    return Problem(
-        model=batch.model,
-        parameters=batch.parameters,
-        conditions=(UNCHANGED,),
-        quantities=(),
-        omega=(batch.omega,),
-        measured=(jnp.moveaxis(jax.lax.complex(*member.measured), -1, 0),),
-        weights=(jnp.moveaxis(member.weights, (3, 0), (0, 3)),),
-        known=np.zeros((0, 2)),
-        aliases=(None,),
-        silent=((),),
-        mixings=(mixing,),
-    )
+    def one(parts):
+        active, z, member = parts
+        shapes = jax.eval_shape(normal, z, member)
+        skip = lambda *_: jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
+        return jax.lax.cond(active, normal, skip, z, member)
 
+    def evaluate(z: Float[Array, "parameters members"], active: Active) -> Normal:
+        normals = jax.lax.map(one, (active, z.T, members))
+        return jax.tree.map(lambda x: jnp.moveaxis(x, 0, -1), normals)
 
-def _lower(columns: int) -> list[tuple[int, int]]:
-    return [(i, j) for i in range(columns) for j in range(i + 1)]
+    return evaluate
 
 
 def _at_all_frequencies(batch: Batch, z: Array, member: Member) -> Normal:
     """Frequencies outside and members inside."""
-    members = jax.vmap(ft.partial(_point, batch), in_axes=(0, None, -1, -1, -1), out_axes=-1)
+    members = jax.vmap(ft.partial(_columns, batch), in_axes=(0, None, -1, -1, -1), out_axes=-1)
     everywhere = evaluate_once(jax.vmap(members, in_axes=(None, 0, 0, 0, 0)))
     columns = everywhere(list(z), batch.omega, *member.inverse, member.weights)
     real, imag = map(jnp.stack, zip(*columns, strict=True))
@@ -146,38 +124,32 @@ def _at_all_frequencies(batch: Batch, z: Array, member: Member) -> Normal:
             mixed = turned.reshape(mixed.shape)
         real, imag = jnp.real(mixed), jnp.imag(mixed)
     points = [part.reshape(len(columns), -1, z.shape[1]) for part in (real, imag)]
-    return _assemble(_products(jnp.concatenate(points, axis=1)))
-
-
-def _products(columns: Float[Array, "columns points members"]) -> Float[Array, "pairs members"]:
-    """All scalar products of the columns in one pass over the points."""
-    first, second = np.array(_lower(len(columns))).T
+    points = jnp.concatenate(points, axis=1)
+    # All scalar products of the columns in one pass over the points.
+    first, second = np.tril_indices(len(points))
 
     def add(k, total):
-        point = columns[:, k]
+        point = points[:, k]
         return total + point[first] * point[second]
 
-    start = jnp.zeros((first.size, columns.shape[-1]), columns.dtype)
-    return jax.lax.fori_loop(0, columns.shape[1], add, start)
-
-
-def _assemble(products: Sequence[Array] | Array) -> Normal:
-    n = (math.isqrt(8 * len(products) + 1) - 1) // 2 - 1  # pairs of n + 1 columns
-    place = np.zeros((n + 1, n + 1), int)
-    for k, (i, j) in enumerate(_lower(n + 1)):
-        place[i, j] = place[j, i] = k
-    matrix = jnp.stack([products[k] for k in place.reshape(-1)])
-    matrix = matrix.reshape(n + 1, n + 1, -1)
+    start = jnp.zeros((first.size, points.shape[-1]), points.dtype)
+    products = jax.lax.fori_loop(0, points.shape[1], add, start)
+    n, place = len(points) - 1, np.zeros((len(points), len(points)), int)
+    place[first, second] = place[second, first] = np.arange(first.size)
+    matrix = jnp.stack([products[k] for k in place.reshape(-1)]).reshape(n + 1, n + 1, -1)
     return Normal(0.5 * matrix[n, n], matrix[n, :n], matrix[:n, :n])
 
 
-def _point(
+def _columns(
     batch: Batch, z: list[Array], omega: Array, real: Array, imag: Array, weights: Array
-) -> list[Column]:
-    """Weighted slopes by each parameter, and then the weighted misfit, at one frequency."""
+) -> list[tuple[Array, Array]]:
+    """Weighted slopes by each parameter, and then the weighted misfit, at one frequency.
+
+    Each in magnitude and in phase.
+    """
 
     def response(z):
-        model = held(_insert(batch.model, batch.parameters, z), batch.hold)
+        model = behind_hold(_insert(batch.model, batch.parameters, z), batch.hold)
         return evaluate_response(model, omega[None])[0]
 
     here, columns = response(z), []

@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from ._mixing import mix
 from ._problem import Problem
-from ._solve import Solution, solution_at, solve
+from ._solve import Solution, solution_at, solve, weighted_residuals
 
 
 _NEAR = 1e-2  # of the change that shows: a parameter below it is at zero
@@ -44,18 +44,14 @@ class Linearised(NamedTuple):
 
 def linearise(problem: Problem, solution: Solution) -> Linearised:
     """The weighted residuals at a solution, those of the priors last."""
-    residual, jacobian = [], []
-    parts, count = solution.sensitivity, problem.parameters.count
-    terms = zip(problem.weights, problem.mixings, parts.misfits, parts.slopes, strict=True)
-    for weights, mixing, misfit, slopes in terms:
+    jacobian, parts, count = [], solution.sensitivity, problem.parameters.count
+    for weights, mixing, slopes in zip(problem.weights, problem.mixings, parts.slopes, strict=True):
         weights = np.asarray(weights)
-        used = weights > 0
         with np.errstate(invalid="ignore", over="ignore"):  # a model that is not finite there
-            residual.append(mix(mixing, weights * np.asarray(misfit))[used])
             scaled = weights[..., None] * np.asarray(slopes)[..., :count]
-            jacobian.append(mix(mixing, scaled)[used])
-    r = np.concatenate([*residual, np.asarray(parts.prior_misfits)])
-    return Linearised(r, np.concatenate([*jacobian, np.asarray(parts.prior_slopes)[:, :count]]))
+            jacobian.append(mix(mixing, scaled)[weights > 0])
+    jacobian = np.concatenate([*jacobian, np.asarray(parts.prior_slopes)[:, :count]])
+    return Linearised(weighted_residuals(problem, parts), jacobian)
 
 
 def solve_within_bounds(

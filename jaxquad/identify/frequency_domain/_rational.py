@@ -1,25 +1,32 @@
-"""Rational functions with a delay on a frequency grid, and their linear least squares."""
+"""Rational functions with a delay on a frequency grid: linear starts, descents, lowest minimum."""
 
 import functools as ft
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Complex, Float
-from numpy.polynomial.polynomial import polyval
+from numpy.polynomial.polynomial import polyfromroots, polyroots, polyval
 
 from jaxquad._core import minimise_on_host
 
 
 Grid = Complex[np.ndarray, " frequencies"]
 Coefficients = Float[np.ndarray, " _"]
+Vector = Float[np.ndarray, " unknowns"]
 _SK_STEPS = 12
+_CONVERGED = 1e-11  # largest relative change of the response that a step still makes
+_DELAY_STEP = 0.7  # rad at the highest frequency
+_MOST_DELAYS = 60
+_PLACES = 5  # frequencies at which an idle pair is tried
+_TRIED = 8  # linear starts that are refined
+_BRIEF, _LONG = 12, 200  # steps of a descent: to compare starts, and to finish
 
 
 class Samples(NamedTuple):
     """A measured response where it is coherent, in frequencies over `unit`."""
 
     s: Grid
-    response: Grid  # without the integrators that are taken as given
+    response: Grid  # without the integrators
     weights: Float[np.ndarray, "frequencies 2"]  # of the misfit of ln-magnitude and phase
     unit: float  # rad/s
 
@@ -82,9 +89,9 @@ def basis(
 
 
 def sanathanan_koerner(samples: Samples, zeros: int, poles: int, delay: float) -> Rational:
-    """The best of a sequence of weighted linear fits, each weighed by the last denominator.
+    """The best of a sequence of linear fits, weighed by the denominator of the one before.
 
-    Each minimises |above - response below| / |response below_last|. Poles and zeros may lie on
+    They minimise |above - response below| / |response below_last|. Poles and zeros may lie on
     either side. Source: Sanathanan and Koerner, IEEE Trans. Automatic Control 8 (1963), p. 56.
     """
     target = samples.response * np.exp(delay * samples.s)
@@ -93,32 +100,23 @@ def sanathanan_koerner(samples: Samples, zeros: int, poles: int, delay: float) -
     best = Rational(np.zeros(zeros + 1), np.eye(poles + 1)[-1], delay)
     for _ in range(_SK_STEPS):
         with np.errstate(all="ignore"):
-            above, below = _linear_fit(samples, target, last, zeros, poles)
+            over, from_over = basis(samples.s, samples.trust / (target * last), zeros)
+            under, from_under = basis(samples.s, samples.trust / last, poles)
+            shared = np.real(over.conj().T @ under)
+            rest = under - over @ shared
+            parts = np.concatenate([np.real(rest), np.imag(rest)])
+            if not np.all(np.isfinite(parts)):
+                break
+            # No coefficient can be set to 1 beforehand: any of them may be the one that is 0.
+            choice = np.linalg.svd(parts, full_matrices=False)[2][-1]
+            above, below = from_over @ (shared @ choice), from_under @ choice
+            above, below = above / below[-1], below / below[-1]
         if not (np.all(np.isfinite(above)) and np.all(np.isfinite(below))):
             break
-        found = with_cost(samples, Rational(above, below, delay))
-        best = min(best, found, key=lambda model: model.cost)
+        candidate = with_cost(samples, Rational(above, below, delay))
+        best = min(best, candidate, key=lambda model: model.cost)
         last = polyval(samples.s, below)
     return best
-
-
-def _linear_fit(
-    samples: Samples, target: Grid, last: Grid, zeros: int, poles: int
-) -> tuple[Coefficients, Coefficients]:
-    over, from_over = basis(samples.s, samples.trust / (target * last), zeros)
-    under, from_under = basis(samples.s, samples.trust / last, poles)
-    shared = np.real(over.conj().T @ under)
-    rest = under - over @ shared
-    parts = np.concatenate([np.real(rest), np.imag(rest)])
-    if not np.all(np.isfinite(parts)):
-        return np.full(zeros + 1, np.nan), np.full(poles + 1, np.nan)
-    # No coefficient can be set to 1 beforehand: any of them may be the one that is 0.
-    choice = np.linalg.svd(parts, full_matrices=False)[2][-1]
-    above, below = from_over @ (shared @ choice), from_under @ choice
-    return above / below[-1], below / below[-1]
-
-
-_CONVERGED = 1e-11  # largest relative change of the response that a step still makes
 
 
 class _Tangent(NamedTuple):
@@ -126,7 +124,7 @@ class _Tangent(NamedTuple):
 
     over: Float[np.ndarray, "terms terms"]
     under: Float[np.ndarray, "terms terms"]
-    jacobian: Float[np.ndarray, "residuals unknowns"]
+    jacobian: Float[np.ndarray, "residuals unknowns"]  # of numerator, denominator and delay
 
 
 class _Point:
@@ -143,17 +141,33 @@ class _Point:
 
     @ft.cached_property
     def tangent(self) -> _Tangent:
-        return _tangent(self.samples, self.model, self.free_delay)
+        samples, model, s = self.samples, self.model, self.samples.s
+        poles = model.below.size - 1
+        with np.errstate(all="ignore"):
+            over, from_over = basis(s, 1 / polyval(s, model.above), model.above.size - 1)
+            under, from_under = basis(s, 1 / polyval(s, model.below), max(poles - 1, 0))
+        under, from_under = under[:, :poles], from_under[:, :poles]
+        late = np.reshape(s / samples.omega[-1], (-1, 1))[:, : int(self.free_delay)]
+        columns = np.concatenate([over, -under, -late], axis=1)
+        parts = np.stack([np.real(columns), np.imag(columns)], axis=1) * samples.weights[:, :, None]
+        return _Tangent(from_over, from_under, parts.reshape(2 * s.size, -1))
 
     def slopes(self) -> tuple[np.ndarray, np.ndarray]:
         jacobian = np.nan_to_num(self.tangent.jacobian)
-        gradient = jacobian.T @ misfit(self.samples, self.model).reshape(-1)
-        if self.free_delay and self.model.delay == 0 and gradient[-1] > 0:
-            jacobian = jacobian * (np.arange(gradient.size) < gradient.size - 1)  # held at 0
-        return jacobian.T @ misfit(self.samples, self.model).reshape(-1), jacobian.T @ jacobian
+        residual = misfit(self.samples, self.model).reshape(-1)
+        if self.free_delay and self.model.delay == 0 and (jacobian.T @ residual)[-1] > 0:
+            last = jacobian.shape[1] - 1
+            jacobian = jacobian * (np.arange(last + 1) < last)  # the delay stays at 0
+        return jacobian.T @ residual, jacobian.T @ jacobian
 
-    def moved(self, change: Float[np.ndarray, " unknowns"]) -> "_Point":
-        model = _apply_step(self.samples, self.model, self.tangent, change)
+    def moved(self, change: Vector) -> "_Point":
+        model, tangent = self.model, self.tangent
+        ends = [tangent.over.shape[1], tangent.over.shape[1] + tangent.under.shape[1]]
+        over, under, late = np.split(change, ends)
+        below = model.below.copy()
+        below[:-1] += (tangent.under @ under)[: below.size - 1]
+        delay = model.delay + float(late.sum()) / float(self.samples.omega[-1])
+        model = Rational(model.above + tangent.over @ over, below, max(delay, 0.0))
         return _Point(self.samples, with_cost(self.samples, model), self.free_delay)
 
 
@@ -165,25 +179,83 @@ def descend(samples: Samples, start: Rational, *, steps: int, free_delay: bool) 
     return minimise_on_host(point, _Point.moved, steps, tolerance=_CONVERGED, saving=1e-14)[0].model
 
 
-def _tangent(samples: Samples, model: Rational, free_delay: bool) -> _Tangent:
-    """The derivative of the misfit; columns of numerator, denominator and delay."""
-    s, poles = samples.s, model.below.size - 1
-    with np.errstate(all="ignore"):
-        over, from_over = basis(s, 1 / polyval(s, model.above), model.above.size - 1)
-        under, from_under = basis(s, 1 / polyval(s, model.below), max(poles - 1, 0))
-    under, from_under = under[:, :poles], from_under[:, :poles]
-    late = np.reshape(s / samples.omega[-1], (-1, 1))[:, : int(free_delay)]
-    columns = np.concatenate([over, -under, -late], axis=1)
-    parts = np.stack([np.real(columns), np.imag(columns)], axis=1) * samples.weights[:, :, None]
-    return _Tangent(from_over, from_under, parts.reshape(2 * s.size, -1))
-
-
-def _apply_step(
-    samples: Samples, model: Rational, tangent: _Tangent, step: Float[np.ndarray, " unknowns"]
+def lowest_minimum(
+    samples: Samples, zeros: int, poles: int, delay: float | None, extra: tuple[Rational, ...] = ()
 ) -> Rational:
-    parts = [tangent.over.shape[1], tangent.over.shape[1] + tangent.under.shape[1]]
-    over, under, late = np.split(step, parts)
-    below = model.below.copy()
-    below[:-1] += (tangent.under @ under)[: below.size - 1]
-    delay = model.delay + float(late.sum()) / float(samples.omega[-1])
-    return Rational(model.above + tangent.over @ over, below, max(delay, 0.0))
+    """The best minimum found; `delay` is free where it is None.
+
+    Starts are linear fits at delays from 0 to beyond what the phase's slope allows, further ones in
+    `extra`, and the best of them with one root (or pair) reflected to the other half plane, or with
+    its outermost zero and pole, which may be idle beyond the band, placed within it.
+    """
+    free, omega = delay is None, samples.omega
+    delays = np.array([0.0 if delay is None else delay])
+    if delay is None:  # from 0 to 4 rad at the highest frequency, or beyond the phase's slope
+        phase = np.unwrap(np.angle(samples.response))
+        slope = -np.diff(phase)[omega.size // 2 :] / np.diff(omega)[omega.size // 2 :]
+        limit = 4.0 / omega[-1] + 1.2 * max(float(np.median(slope)), 0.0)
+        count = int(np.clip(limit * omega[-1] / _DELAY_STEP + 1, 2, _MOST_DELAYS))
+        delays = np.linspace(0.0, limit, count)
+    cost = lambda model: model.cost
+    starts = [sanathanan_koerner(samples, zeros, poles, float(late)) for late in delays]
+    starts = sorted(starts, key=cost)[:_TRIED] + list(extra)
+    descend_from = lambda start, steps: descend(samples, start, steps=steps, free_delay=free)
+    best = min((descend_from(start, _BRIEF) for start in starts), key=cost)
+    for _ in range(2):
+        best = descend_from(best, _LONG)
+        if not np.isfinite(best.cost):
+            return best
+        others = _with_reflected_roots(best) + _with_moved_pair(samples, best)
+        better = min((descend_from(other, _BRIEF) for other in others), key=cost, default=best)
+        if not better.cost < 0.999 * best.cost:
+            return best
+        best = better
+    return descend_from(best, _LONG)
+
+
+def _with_reflected_roots(model: Rational) -> list[Rational]:
+    """One zero or pole, or a pair, mirrored in the imaginary axis."""
+    models = []
+    for above, odd in _mirrored(model.above):
+        side = model._replace(above=-above if odd else above)
+        models += [side, side._replace(above=-side.above)] if odd else [side]
+    for below, odd in _mirrored(model.below):
+        side = model._replace(below=below)
+        models += [side, side._replace(above=-side.above)] if odd else [side]
+    return models
+
+
+def _mirrored(coefficients: Coefficients) -> list[tuple[Coefficients, bool]]:
+    """The polynomials with one root, or pair, mirrored, and whether it was a single root."""
+    roots, polynomials = polyroots(coefficients), []
+    for root in roots[roots.imag >= 0]:
+        mine = (roots == root) | (roots == root.conj())
+        mirrored = np.where(mine, -roots.conj(), roots)
+        polynomial = coefficients[-1] * np.real(polyfromroots(mirrored))
+        polynomials.append((polynomial, bool(np.sum(mine) % 2)))
+    return polynomials
+
+
+def _with_moved_pair(samples: Samples, model: Rational) -> list[Rational]:
+    """The outermost real zero and pole as a near-cancelling pair within the band."""
+    zeros, poles = polyroots(model.above), polyroots(model.below)
+    if not (np.any(zeros.imag == 0) and np.any(poles.imag == 0)):
+        return []
+    zero, pole = (max(roots[roots.imag == 0], key=abs) for roots in (zeros, poles))
+    models, lead = [], model.above[-1] * np.real((1j - zero) / (1j - pole))
+    for place in np.geomspace(samples.omega[0], samples.omega[-1], _PLACES):
+        for ratio in (0.8, 1.25):
+            moved = np.where(zeros == zero, -place * ratio, zeros)
+            above = lead * np.real(polyfromroots(moved))
+            below = np.real(polyfromroots(np.where(poles == pole, -place, poles)))
+            models.append(model._replace(above=above, below=below))
+    return models
+
+
+def without_nearest_pair(model: Rational) -> Rational:
+    """The model without the zero and the real pole nearest to each other."""
+    zeros, poles = polyroots(model.above), polyroots(model.below)
+    distance = np.abs(zeros[:, None].real - poles[None, :].real)
+    z, p = np.unravel_index(np.argmin(distance), distance.shape)
+    above = model.above[-1] * np.real(polyfromroots(np.delete(zeros, z)))
+    return Rational(above, np.real(polyfromroots(np.delete(poles, p))), model.delay)

@@ -1,4 +1,4 @@
-"""The least-squares solvers of fits, and all derivatives where they stop."""
+"""Damped Gauss-Newton descents of fits, derivatives where they stop, and the test for saddles."""
 
 import functools as ft
 from collections.abc import Callable
@@ -11,9 +11,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from jaxquad._compile import hasty_options, KeptPrograms
-from jaxquad._core import Normal, RUNNING, STALLED, TOLERANCE
+from jaxquad._core import Normal, RUNNING, solve_definite, STALLED, TOLERANCE
 
-from ._aside import costs_aside
 from ._evaluate import (
     evaluate,
     Evaluation,
@@ -22,11 +21,16 @@ from ._evaluate import (
     misfits_and_slopes,
     take_apart,
 )
-from ._parameters import Numbers
-from ._problem import Problem, problem_normal, residuals
+from ._mixing import mix
+from ._parameters import namespace_of, Numbers
+from ._problem import Problem, problem_normal, residuals, weigh_parts
 
 
 _SHORT = 3e4  # residuals times parameters squared: a few ms for a whole descent
+_LONGEST = 0.05  # relative step to either side of a stop
+_RIDGE = 1e-12  # of a matrix with ones on its diagonal, so that it has an inverse
+
+Vector = Float[np.ndarray, " parameters"]
 
 
 class Sensitivity(NamedTuple):
@@ -51,7 +55,7 @@ class Solution(NamedTuple):
     sensitivity: Sensitivity
     at_zero: tuple[int, ...] = ()  # parameters at their bound, where z stands for next to nothing
     units_at_zero: tuple[float, ...] = ()  # changes of them that show
-    aside: Float[np.ndarray, " sides"] | None = None  # costs to either side, if they are known
+    aside: Float[np.ndarray, " sides"] | None = None  # costs to either side, if it has them
 
 
 class Stop(NamedTuple):
@@ -72,26 +76,33 @@ _MESSAGES = {
 }
 
 
-def solve(
-    problem: Problem,
-    z0: Float[np.ndarray, " parameters"],
-    solver: eqx.Module | None,
-    max_steps: int,
-) -> Solution:
+def solve(problem: Problem, z0: Vector, solver: eqx.Module | None, max_steps: int) -> Solution:
     """Lower the sum of squares from `z0`: damped Gauss-Newton (Levenberg-Marquardt) by default."""
-    if sum(each.size for each in problem.weights) * z0.size**2 < _SHORT:
-        if solver is None and problem.is_single and has_few_slopes(problem):
-            return _solve_at_once(problem.mixed(), z0, max_steps)
-        stop = _descend_from(problem.mixed(), z0, solver, max_steps, short=True)
+    # A short descent takes less time than the optimisation of its program would.
+    short = sum(weights.size for weights in problem.weights) * z0.size**2 < _SHORT
+    if short and solver is None and problem.is_single and has_few_slopes(problem):
+        return _solve_at_once(problem.mixed(), z0, max_steps)
+    mixed = problem.mixed() if short else problem
+    if solver is None:
+        # `eqx.filter_jit` sorts the problem into arrays and others for half the descent's time.
+        frame, arrays = take_apart(mixed)
+        stop = _program(frame, max_steps, "short" if short else "long")([z0, *arrays])
     else:
-        stop = _descend_from(problem, z0, solver, max_steps, short=False)
+        stop = _descent_by_solver(short)(mixed, jax.device_put(z0), solver, max_steps)
     return solution_at(problem, np.asarray(stop.z), *_message_and_steps(stop))
 
 
 def _message_and_steps(stop: Stop) -> tuple[str, int]:
     """Why the solver stopped before a minimum, if it did, and after how many steps."""
     converged, steps = bool(np.asarray(stop.converged)), int(np.asarray(stop.steps))
-    return "" if converged else f"{_reason(stop.reason)} (after {steps} steps)", steps
+    if converged:
+        return "", steps
+    if isinstance(stop.reason, jax.Array):
+        return stopped_early(int(stop.reason), steps), steps
+    import optimistix as optx
+
+    reason = str(optx.RESULTS[stop.reason]).strip().split(".")[0].rstrip()
+    return f"{reason} (after {steps} steps)", steps
 
 
 def stopped_early(status: int, steps: int) -> str:
@@ -99,120 +110,99 @@ def stopped_early(status: int, steps: int) -> str:
     return f"{_MESSAGES[status]} (after {steps} steps)"
 
 
-def solution_at(
-    problem: Problem, z: Float[np.ndarray, " parameters"], message: str = "", steps: int = 0
-) -> Solution:
+def solution_at(problem: Problem, z: Vector, message: str = "", steps: int = 0) -> Solution:
     """The model and all derivatives at `z`; the `message` says why it is no minimum."""
-    found, parameters = evaluate(problem, np.asarray(z)), problem.parameters
+    [evaluation], parameters = evaluate(problem, np.asarray(z)), problem.parameters
     z_all = np.array(parameters.start)
     z_all[: z.size] = z
     values, slopes = np.asarray(parameters.values(z_all)), np.asarray(parameters.slopes(z_all))
     model = parameters.replace(problem.model, values[: z.size])
-    derivatives = _sensitivity(problem, found)
+    derivatives = _sensitivity(problem, evaluation)
     return Solution(z, model, values, slopes, message, not message, steps, derivatives)
 
 
-def _sensitivity(problem: Problem, found: Evaluation) -> Sensitivity:
+def _sensitivity(problem: Problem, evaluation: Evaluation) -> Sensitivity:
     misfits, slopes, start = [], [], 0
     for measured in problem.measured:
         shape, size = (2, *measured.shape[1:], len(measured)), 2 * measured.size
         mine = slice(start, start + size)
-        misfits.append(found.misfits[mine].reshape(shape).transpose(3, 1, 2, 0))
-        slopes.append(found.slopes[:, mine].reshape(-1, *shape).transpose(4, 2, 3, 1, 0))
+        misfits.append(evaluation.misfits[mine].reshape(shape).transpose(3, 1, 2, 0))
+        slopes.append(evaluation.slopes[:, mine].reshape(-1, *shape).transpose(4, 2, 3, 1, 0))
         start += size
-    return Sensitivity(misfits, slopes, found.misfits[start:], found.slopes[:, start:].T)
+    priors = evaluation.misfits[start:], evaluation.slopes[:, start:].T
+    return Sensitivity(misfits, slopes, *priors)
+
+
+def weighted_residuals(
+    problem: Problem, sensitivity: Sensitivity
+) -> Float[np.ndarray, " residuals"]:
+    """Of the points in use, and then of the priors."""
+    rows, parts = [], zip(problem.weights, problem.mixings, sensitivity.misfits, strict=True)
+    with np.errstate(invalid="ignore", over="ignore"):  # a model that is not finite there
+        for weights, mixing, misfit in parts:
+            weights = np.asarray(weights)
+            rows.append(mix(mixing, weights * np.asarray(misfit))[weights > 0])
+    return np.concatenate([*rows, np.asarray(sensitivity.prior_misfits)])
 
 
 def _descend(
-    problem: Problem,
-    z0: Float[Array, " parameters"],
-    solver: eqx.Module | None,
-    max_steps: int,
+    problem: Problem, z0: Float[Array, " parameters"], solver: eqx.Module | None, max_steps: int
 ) -> Stop:
-    return least_squares(
-        residuals, z0, problem, solver=solver, max_steps=max_steps, normal=problem_normal
-    )
+    options: dict[str, Any] = {"solver": solver, "max_steps": max_steps}
+    return least_squares(residuals, z0, problem, normal=problem_normal, **options)
 
 
 @ft.cache
-def _descend_by_solver(*, short: bool) -> Callable[..., Stop]:
-    given: dict[str, Any] = {"compiler_options": hasty_options()} if short else {}
-    return eqx.filter_jit(_descend, **given)
-
-
-def _descend_from(
-    problem: Problem,
-    z0: Float[np.ndarray, " parameters"],
-    solver: eqx.Module | None,
-    max_steps: int,
-    *,
-    short: bool,
-) -> Stop:
-    """A `short` descent takes less time than the optimisation of its program would."""
-    if solver is not None:
-        return _descend_by_solver(short=short)(problem, jax.device_put(z0), solver, max_steps)
-    # `eqx.filter_jit` sorts the problem into arrays and others for half the time of the descent.
-    frame, arrays = take_apart(problem)
-    return _descent(frame, max_steps, short)([z0, *arrays])
-
-
-@ft.lru_cache(maxsize=128)
-def _descent(frame: Frame, max_steps: int, short: bool) -> Callable[[list[Numbers]], Stop]:
-    kept = _SHORT_DESCENTS if short else _LONG_DESCENTS
-    return kept.of_arrays(lambda arrays: (arrays[0], frame.filled(arrays[1:]), max_steps))
+def _descent_by_solver(short: bool) -> Callable[..., Stop]:
+    options: dict[str, Any] = {"compiler_options": hasty_options()} if short else {}
+    return eqx.filter_jit(_descend, **options)
 
 
 def _descend_by_default(z0: Float[Array, " parameters"], problem: Problem, max_steps: int) -> Stop:
     return _descend(problem, z0, None, max_steps)
 
 
-_SHORT_DESCENTS = KeptPrograms(_descend_by_default, hasty_options)
-_LONG_DESCENTS = KeptPrograms(_descend_by_default, dict)
-
-
-class _Found(NamedTuple):
-    """Where a descent stopped, and what a `Solution` says of that point."""
-
-    stop: Stop
-    model: list[Numbers]  # its arrays
-    values: Float[Numbers, " all"]
-    slopes: Float[Numbers, " all"]  # of the values
-    misfits: Float[Numbers, " residuals"]
-    sensitivity: Float[Numbers, "all residuals"]
-    aside: Float[Numbers, " sides"]  # costs
-
-
-def _solve_at_once(
-    problem: Problem, z0: Float[np.ndarray, " parameters"], max_steps: int
-) -> Solution:
-    """All of a solution by one program: to run one more takes as long as what it computes."""
-    frame, arrays = take_apart(problem)
-    stop, leaves, *rest = _whole_program(frame, max_steps)([z0, *arrays])
-    model = take_apart(problem.model)[0].filled(leaves)  # while the program runs
-    message, steps = _message_and_steps(stop)
-    z, values, slopes, *found, aside = map(np.asarray, (stop.z, *rest))
-    derivatives = _sensitivity(problem, Evaluation(*found))
-    solution = Solution(z, model, values, slopes, message, not message, steps, derivatives)
-    return solution._replace(aside=aside)
-
-
-@ft.lru_cache(maxsize=128)
-def _whole_program(frame: Frame, max_steps: int) -> Callable[[list[Numbers]], _Found]:
-    return _SOLUTIONS.of_arrays(lambda arrays: (arrays[0], frame.filled(arrays[1:]), max_steps))
-
-
-def _find_by_default(z0: Float[Array, " parameters"], problem: Problem, max_steps: int) -> _Found:
-    """For problems of a single record."""
+def _solve_by_default(z0: Float[Array, " parameters"], problem: Problem, max_steps: int) -> tuple:
+    """The stop, and what a `Solution` says of that point; for problems of a single record."""
     stop, parameters = _descend(problem, z0, None, max_steps), problem.parameters
     z = jnp.concatenate([stop.z, parameters.start[z0.size :]])
     values = parameters.values(z)
     model = parameters.replace(problem.model, values[: z0.size])
-    found = misfits_and_slopes(z, problem)
-    aside = costs_aside(stop.z, problem, *found)
-    return _Found(stop, take_apart(model)[1], values, parameters.slopes(z), *found, aside)
+    lined_up, slopes = misfits_and_slopes(z, problem)
+    # The costs to either side, from misfits and slopes.
+    both = jnp.concatenate([lined_up[None], slopes[: z0.size]])
+    parts = both.reshape(len(both), 2, *jnp.moveaxis(problem.measured[0], 0, -1).shape)
+    weighed = jax.vmap(ft.partial(weigh_parts, problem, 0))(parts[:, 0], parts[:, 1])
+    rows = jnp.concatenate([part.reshape(len(both), -1) for part in weighed], axis=1)
+    sides = _sides(stop.z, rows[1:] @ rows[1:].T, rows[0] @ rows[0])
+    costs = jax.vmap(lambda z: jnp.sum(residuals(z, problem) ** 2))(sides)
+    arrays = take_apart(model)[1]
+    return stop, arrays, values, parameters.slopes(z), lined_up, slopes, costs
 
 
-_SOLUTIONS = KeptPrograms(_find_by_default, hasty_options)
+_KEPT = {
+    "short": KeptPrograms(_descend_by_default, hasty_options),
+    "long": KeptPrograms(_descend_by_default, dict),
+    "at once": KeptPrograms(_solve_by_default, hasty_options),
+}
+
+
+@ft.lru_cache(maxsize=256)
+def _program(frame: Frame, max_steps: int, kind: str) -> Callable[[list[Numbers]], Any]:
+    fill = lambda arrays: (arrays[0], frame.filled(arrays[1:]), max_steps)
+    return _KEPT[kind].of_arrays(fill)
+
+
+def _solve_at_once(problem: Problem, z0: Vector, max_steps: int) -> Solution:
+    """All of a solution by one program: to run one more takes as long as what it computes."""
+    frame, arrays = take_apart(problem)
+    stop, leaves, *rest = _program(frame, max_steps, "at once")([z0, *arrays])
+    model = take_apart(problem.model)[0].filled(leaves)  # while the program runs
+    message, steps = _message_and_steps(stop)
+    z, values, slopes, *evaluation, costs = map(np.asarray, (stop.z, *rest))
+    derivatives = _sensitivity(problem, Evaluation(*evaluation))
+    solution = Solution(z, model, values, slopes, message, not message, steps, derivatives)
+    return solution._replace(aside=costs)
 
 
 def least_squares(
@@ -255,29 +245,64 @@ def least_squares(
             f"solver is a {type(chosen).__name__}: give an optimistix least-squares solver, for "
             "instance optx.LevenbergMarquardt(rtol=1e-8, atol=1e-8)"
         )
-    function = residual if ours else _without_nan(residual)
-    found = optx.least_squares(function, chosen, z0, args=args, max_steps=max_steps, throw=False)
-    converged = found.result == optx.RESULTS.successful
-    reason = found.state.status if ours else found.result
-    return Stop(found.value, converged, reason, found.stats["num_steps"])
 
-
-def _without_nan(residual: Residual) -> Residual:
     def finite(z, args):
         # A wall of NaN would look like a minimum to the solver: make it a high one instead.
         r = residual(z, args)
         return jnp.where(jnp.isfinite(r), r, 1e6)
 
-    return finite
+    function = residual if ours else finite
+    end = optx.least_squares(function, chosen, z0, args=args, max_steps=max_steps, throw=False)
+    reason = end.state.status if ours else end.result
+    return Stop(end.value, end.result == optx.RESULTS.successful, reason, end.stats["num_steps"])
 
 
-def _reason(reason: PyTree) -> str:
-    """The first sentence of why a solver stopped."""
-    if isinstance(reason, jax.Array):
-        return _MESSAGES[int(reason)]
-    import optimistix as optx
+def is_saddle(problem: Problem, solution: Solution, here: float, bread: np.ndarray) -> bool:
+    """Whether the cost is lower than `here`, at the solution, a small step to either side of it.
 
-    return str(optx.RESULTS[reason]).strip().split(".")[0].rstrip()
+    `bread` is J'J of its weighted residuals.
+    """
+    costs = solution.aside
+    if costs is None:
+        sides = evaluate(problem, *_sides(solution.z, bread, np.asarray(here)))
+        rows = [weighted_residuals(problem, _sensitivity(problem, side)) for side in sides]
+        costs = np.array([row @ row for row in rows])
+    return bool(np.min(costs) < here * (1 - 1e-6) - 1e-12)
+
+
+def _sides(
+    z: Float[Numbers, " parameters"],
+    bread: Float[Numbers, "parameters parameters"],
+    here: Float[Numbers, ""],
+) -> Float[Numbers, "sides parameters"]:
+    """A small step from `z` to either side along the weakest direction of `bread`."""
+    xp = namespace_of(z)
+    size = xp.sqrt(xp.maximum(xp.diagonal(bread), 1e-300))
+    weakest, curvature = _weakest(bread / (size[:, None] * size[None]))
+    weakest = weakest / size
+    step = xp.sqrt(1e-2 * xp.maximum(here, 1e-12) / xp.maximum(curvature, 1e-12))
+    step = xp.minimum(step, _LONGEST / xp.maximum(xp.max(xp.abs(weakest)), 1e-300))
+    return xp.stack([z + step * weakest, z - step * weakest])
+
+
+def _weakest(
+    matrix: Float[Numbers, "parameters parameters"],
+) -> tuple[Float[Numbers, " parameters"], Float[Numbers, ""]]:
+    """The eigenvector of the smallest eigenvalue, and that value."""
+    if isinstance(matrix, np.ndarray):
+        values, vectors = np.linalg.eigh(matrix)
+        return vectors[:, 0], np.asarray(values[0])
+    # A kept program that calls LAPACK crashes in a process that has not traced it. So: the 32nd
+    # power of the inverse, in whose columns nothing is left but the weakest direction.
+    unit = jnp.eye(len(matrix), dtype=matrix.dtype)
+    ridged = jnp.broadcast_to((matrix + _RIDGE * unit)[..., None], (*matrix.shape, len(matrix)))
+    inverse = solve_definite(ridged, unit)[0]
+    power = inverse / jnp.trace(inverse)
+    for _ in range(5):
+        power = power @ power
+    column = power[:, jnp.argmax(jnp.diagonal(power))]
+    vector = column / jnp.sqrt(column @ column)
+    return vector, vector @ matrix @ vector
 
 
 def same_responses(problem: Problem, solution: Solution, values: np.ndarray) -> bool:
@@ -288,11 +313,6 @@ def same_responses(problem: Problem, solution: Solution, values: np.ndarray) -> 
     if np.any(logarithmic & (ratio < 0)):
         return False
     z = np.where(logarithmic, np.log(np.where(logarithmic, np.maximum(ratio, 1e-300), 1.0)), ratio)
-    moved, start = evaluate(problem, z).misfits, 0
-    for old in solution.sensitivity.misfits:
-        new = moved[start : start + old.size]
-        lined_up = np.moveaxis(old, (3, 0), (0, 3)).reshape(-1)
-        if not np.allclose(new, lined_up, atol=1e-6, rtol=0, equal_nan=True):
-            return False
-        start += old.size
-    return True
+    moved = solution_at(problem, z).sensitivity.misfits
+    pairs = zip(moved, solution.sensitivity.misfits, strict=True)
+    return all(np.allclose(*pair, atol=1e-6, rtol=0, equal_nan=True) for pair in pairs)

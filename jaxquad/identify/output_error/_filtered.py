@@ -240,7 +240,7 @@ def _point(problem: OutputError, programs: list[Program], z: np.ndarray) -> Filt
     records = [_simulated(term, sample(z)) for term, sample in parts]
     misfits, slopes = np.zeros(0), np.zeros((0, z.size))
     if problem.base.quantities:
-        priors = evaluate(problem.base, z)
+        [priors] = evaluate(problem.base, z)
         misfits, slopes = priors.misfits, priors.slopes.T[:, : z.size]
     return FilteredPoint(problem, programs, z, records, misfits, slopes)
 

@@ -11,14 +11,13 @@ from jaxquad._core import as_messages
 from jaxquad.models import LaggedIntegrator, StateSpace, TransferFunction
 from jaxquad.spectra import FrequencyResponse
 
-from ..frequency_domain._aside import look_aside
 from ..frequency_domain._cost import widen_band
-from ..frequency_domain._held import remarks_on_hold
 from ..frequency_domain._parameters import Parameters, Place
 from ..frequency_domain._problem import on_device, Problem
 from ..frequency_domain._refits import Origin
 from ..frequency_domain._result import Fit
-from ..frequency_domain._solve import same_responses, Solution
+from ..frequency_domain._sampled import remarks_on_hold
+from ..frequency_domain._solve import is_saddle, same_responses, Solution
 from ..frequency_domain._starts import Minimum, remarks_on_minima
 from ..output_error._noise import NoiseModel
 from ..output_error._simulated import HasStateSpace, HasTransferFunction, linear_model
@@ -107,8 +106,6 @@ def assess(
             units = mixed
             budget = budget_up_to_limits()
     step = step * (start / units)[: step.size]
-    here = total_cost(budget.blocks, budget.prior)
-    falls_aside = look_aside(problem, solution.z, here, bread, solution.aside)
     cost, average, information, misfit = _costs_by_noise(
         problem, weighting, solution, budget, units
     )
@@ -146,6 +143,8 @@ def assess(
     remarks = list(dict.fromkeys(remark for part in parts for remark in part))
     remarks += remarks_on_hold(frfs, used)
     if not is_fed_back(verdict):
+        here = total_cost(budget.blocks, budget.prior)
+        saddle = solution.converged and is_saddle(problem, solution, here, bread)
         # Few points of independent noise reach a large misfit by chance: the discrepancy has to
         # say so, too.
         doubted = misfit if budget.discrepancy.none < DOUBT else min(misfit, 1.0)
@@ -153,7 +152,7 @@ def assess(
             *remarks_on_fit(problem, solution, cost, decrement, doubted, verdict),
             *remarks_on_bounds(pulled_beyond(budget, names, bounds), verdict),
             *_remarks_on_growth(solution.model, frfs, used),
-            *remarks_on_minima(problem, solution.converged and falls_aside(), minima),
+            *remarks_on_minima(problem, saddle, minima),
             *remarks_on_priors(budget.prior.misfit, verdict, by_data, chi_squared=doubted),
             *remarks_on_discrepancy(budget.discrepancy),
         ]

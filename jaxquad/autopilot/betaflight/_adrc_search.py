@@ -15,21 +15,26 @@ from jaxquad._core import announce, plain_content
 from jaxquad.identify import B0Law, B0Schedule, GainOverThrottle, ScaledB0, UndeterminedError
 from jaxquad.records import AXES
 
-from ._adrc_loops import ADRCFrame, ADRCLoop, Designs, draw_at, Flown, make_adrc_loop
-from ._adrc_stages import (
+from .._parameters import store_parameters
+from .._rate_design import Kind
+from .._rate_gains import LoopQualities
+from ._adrc import FlownADRC
+from ._adrc_loops import (
     a_third,
+    ADRCFrame,
+    ADRCLoop,
     ADRCStage,
     ADRCTargets,
     beyond_targets,
     Design,
+    Designs,
+    draw_at,
+    Flown,
     judge,
+    make_adrc_loop,
     rows_of,
     stages_of,
 )
-from ._parameters import store_parameters
-from ._rate_design import Kind
-from ._rate_gains import LoopQualities
-from .betaflight._adrc import FlownADRC
 
 
 _LAW: B0Law = "SQRT"  # of the firmware by default
@@ -105,12 +110,12 @@ class ADRCProposal:
             f"{'on fresh plants':<18} {'wc':>4} {'wo':>4} {'b0':>6}   stable   worst Ms   resonance"
             "   crossover   torque   noise"
         ]
-        for name, each in self.stages.items():
-            numbers = f"{each.wc:4.0f} {each.wo:4.0f} {each.b0:6.0f}"
+        for name, x in self.stages.items():
+            numbers = f"{x.wc:4.0f} {x.wo:4.0f} {x.b0:6.0f}"
             rows.append(
-                f"{name:<18} {numbers.replace('nan', '  -')} {100 * each.stable:6.1f} % "
-                f"{each.peak:10.2f} {each.resonance:11.2f} {each.crossover / (2 * np.pi):8.1f} Hz "
-                f"{each.rejection:8.2f} {each.noise:7.2f}"
+                f"{name:<18} {numbers.replace('nan', '  -')} {100 * x.stable:6.1f} % "
+                f"{x.peak:10.2f} {x.resonance:11.2f} {x.crossover / (2 * np.pi):8.1f} Hz "
+                f"{x.rejection:8.2f} {x.noise:7.2f}"
             )
         return "\n".join(rows)
 
@@ -121,7 +126,7 @@ class ADRCProposal:
 
 
 def propose_adrc(
-    found: GainOverThrottle,
+    plant: GainOverThrottle,
     flown: Flown,
     axis: str,
     *,
@@ -179,14 +184,14 @@ def propose_adrc(
     """
     if axis not in AXES:
         raise ValueError(f"axis is {axis!r}: give one of {', '.join(AXES)}")
-    targets, one = targets or ADRCTargets(), found.throttle.size == 1
-    grid = found.throttle if one else np.linspace(found.low.min(), found.high.max(), bins)
-    frame, scaled, middle = _frame(found, flown, hover)
+    targets, one = targets or ADRCTargets(), plant.throttle.size == 1
+    grid = plant.throttle if one else np.linspace(plant.low.min(), plant.high.max(), bins)
+    frame, scaled, middle = _frame(plant, flown, hover)
     make = lambda plants, seed: [
-        make_adrc_loop(found, flown, AXES.index(axis), float(x), frame, plants, seed) for x in grid
+        make_adrc_loop(plant, flown, AXES.index(axis), float(x), frame, plants, seed) for x in grid
     ]
-    _require_gains(found, grid, fresh, seed)
-    edge = np.inf if found.fit.origin is None else found.fit.origin.band[1]
+    _require_gains(plant, grid, fresh, seed)
+    edge = np.inf if plant.fit.origin is None else plant.fit.origin.band[1]
     before, bounds = _flown_design(flown, axis), _bounds(flown, axis, middle, targets.change)
     loops = make(max(1, members // len(grid)), seed)
     attempt = 1
@@ -198,7 +203,7 @@ def propose_adrc(
         stages = stages_of(new, axis, before, best)
         if attempt == _CERTIFICATES or not beyond_targets(stages, targets, edge):
             break
-        loops = [old.joined(each, best) for old, each in zip(loops, new, strict=True)]
+        loops = [old.joined(fresh_loop, best) for old, fresh_loop in zip(loops, new, strict=True)]
         attempt += 1
     kind, verdict = judge(stages, targets, edge, fresh, grid)
     values = _parameters(axis, best, frame) if kind == "proposed" else {}
@@ -209,7 +214,7 @@ def propose_adrc(
 
 
 def _frame(
-    found: GainOverThrottle, flown: Flown, hover: float | None
+    plant: GainOverThrottle, flown: Flown, hover: float | None
 ) -> tuple[ADRCFrame, ScaledB0 | None, float]:
     """What is not tuned, b0 of the log where it shows it, and b0 at the hover throttle."""
     if hover is not None and not 0 < hover <= 1:
@@ -226,23 +231,23 @@ def _frame(
             schedule, flown.lowpass_hz, float(law.setpoint_lowpass_hz), float(law.forgetting)
         )
     else:
-        lowest = float(found.throttle[0]) if hover is None else hover
+        lowest = float(plant.throttle[0]) if hover is None else hover
         frame = ADRCFrame(B0Schedule(_LAW, max(0.05, round(lowest, 2))))
     at = frame.schedule.hover
-    if found.throttle.size == 1:
-        degrees = 1.0 if found.output_unit == "deg/s" else 180 / np.pi
-        scale = float(frame.schedule.scale(found.throttle[0]))
-        return frame, None, degrees * found.b0(0).value / scale
-    scaled = found.adrc_b0(at, largest=frame.schedule.high)
+    if plant.throttle.size == 1:
+        degrees = 1.0 if plant.output_unit == "deg/s" else 180 / np.pi
+        scale = float(frame.schedule.scale(plant.throttle[0]))
+        return frame, None, degrees * plant.b0(0).value / scale
+    scaled = plant.adrc_b0(at, largest=frame.schedule.high)
     if not isinstance(flown, FlownADRC):
         frame = frame._replace(schedule=frame.schedule._replace(law=scaled.law))
     return frame, scaled, scaled.b0.value
 
 
-def _require_gains(found: GainOverThrottle, grid: np.ndarray, plants: int, seed: int) -> None:
+def _require_gains(plant: GainOverThrottle, grid: np.ndarray, plants: int, seed: int) -> None:
     """Raise UndeterminedError where the log leaves gains of 0 or below possible."""
-    drawn = [draw_at(found, float(x), plants, seed)[0] for x in grid]
-    if min(float(each.min()) for each in drawn) <= 0:
+    drawn = [draw_at(plant, float(x), plants, seed)[0] for x in grid]
+    if min(float(gains.min()) for gains in drawn) <= 0:
         raise UndeterminedError(
             "the log does not tell the gain from the command to the rate: 0 is within what it "
             "leaves possible. Fly a chirp of the rate set-point, or stronger and quicker stick"
@@ -287,7 +292,7 @@ def _search(
     """The whole numbers with the least effect of torque; where none keep the targets: nearest."""
     low, high = bounds
     score = _Score(loops, targets, edge, before)
-    rough = _Score([each.first() for each in loops], targets, edge, before)
+    rough = _Score([loop.first() for loop in loops], targets, edge, before)
     middle, half = np.log(low * high) / 2, np.log(high / low) / 2
     for level in range(_LEVELS):
         axes = [
@@ -310,7 +315,7 @@ class _Score:
         self, loops: Sequence[ADRCLoop], targets: ADRCTargets, edge: float, before: Design | None
     ):
         self.loops, self.targets, self.edge, self.before = loops, targets, edge, before
-        self.flown = [each.flown() for each in loops]
+        self.flown = [loop.flown() for loop in loops]
 
     def __call__(self, designs: Designs) -> Float[np.ndarray, " designs"]:
         parts = np.array_split(designs, max(1, len(designs) // 64))
@@ -320,16 +325,18 @@ class _Score:
         worst, rejected = designs[:, 0] / designs[:, 1], np.zeros(len(designs))  # wc at most wo
         targets = self.targets
         for loop, flown in zip(self.loops, self.flown, strict=True):
-            each = loop.qualities(designs)
+            qualities = loop.qualities(designs)
             beyond = np.stack([
-                np.max(each.peak, axis=1) / (_RESERVE * targets.sensitivity),
-                np.max(each.resonance, axis=1) / (_RESERVE * targets.resonance),
-                np.mean(each.noise / flown.noise, axis=1) / (_RESERVE * targets.noise),
-                np.max(each.crossover, axis=1) / self.edge,
+                np.max(qualities.peak, axis=1) / (_RESERVE * targets.sensitivity),
+                np.max(qualities.resonance, axis=1) / (_RESERVE * targets.resonance),
+                np.mean(qualities.noise / flown.noise, axis=1) / (_RESERVE * targets.noise),
+                np.max(qualities.crossover, axis=1) / self.edge,
             ]).max(axis=0)  # fmt: skip
-            worst = np.maximum(worst, np.where(np.all(each.stable, axis=1), beyond, 1e6 * beyond))
+            worst = np.maximum(
+                worst, np.where(np.all(qualities.stable, axis=1), beyond, 1e6 * beyond)
+            )
             worst = np.maximum(worst, self._on_the_way(loop, flown, designs))
-            rejected += np.mean((each.rejection / flown.rejection) ** 2, axis=1)
+            rejected += np.mean((qualities.rejection / flown.rejection) ** 2, axis=1)
         return np.where(worst <= 1, np.sqrt(rejected / len(self.loops)), 1e9 * worst)
 
     def _on_the_way(
@@ -338,7 +345,7 @@ class _Score:
         """Ms a third of the way, over the greatest that is allowed there."""
         if self.before is None:
             return np.zeros(len(designs))
-        each = loop.qualities(a_third(self.before, designs))
+        qualities = loop.qualities(a_third(self.before, designs))
         allowed = max(_RESERVE * self.targets.sensitivity, float(np.max(flown.peak)))
-        beyond = np.max(each.peak, axis=1) / allowed
-        return np.where(np.all(each.stable, axis=1), beyond, 1e6 * beyond)
+        beyond = np.max(qualities.peak, axis=1) / allowed
+        return np.where(np.all(qualities.stable, axis=1), beyond, 1e6 * beyond)

@@ -5,22 +5,26 @@ import shlex
 from collections.abc import Mapping
 from pathlib import Path
 
-from jaxquad._core import announce, plain_content, write_file
-from jaxquad.identify import GainOverThrottle
-from jaxquad.records import AXES
-from jaxquad.report import provenance, write_json
+import numpy as np
 
-from ._adrc import ADRCProposal
-from ._adrc_loops import Flown
-from ._adrc_page import adrc_page
-from ._files import change_table, parameter_file, ParameterChange, propose_changes, WordChange
-from ._flight_channels import FlightChannels
-from ._identified import DesignSettings
-from ._page import write_pilot_page
-from ._parameters import find_parameter
-from ._rate_design import Kind
-from ._reproduce_flight import Reproduction
-from .betaflight._adrc import adrc_parameters, b0_law, FlownADRC
+from jaxquad._core import announce, plain_content, write_file
+from jaxquad.identify import GainBand, GainOverThrottle
+from jaxquad.plot import StepBand, ThrottleCurve
+from jaxquad.records import AXES
+from jaxquad.report import Headline, Provenance, provenance, Table, write_json
+
+from .._files import change_table, parameter_file, ParameterChange, propose_changes, WordChange
+from .._filters import FilterChain, PT2
+from .._flight_channels import FlightChannels
+from .._identified import DesignSettings
+from .._page import B0Section, Chains, PilotPage, write_pilot_page
+from .._parameters import find_parameter
+from .._pilot_page import chains_of, change_rows, logged_terms, motor_rows, StepGrid, VERDICTS
+from .._rate_design import Kind
+from .._reproduce_flight import Reproduction
+from ._adrc import adrc_parameters, b0_law, FlownADRC
+from ._adrc_loops import ADRCFrame, Flown, make_adrc_loop
+from ._adrc_search import ADRCProposal
 
 
 _BUILD = (2026, 6)  # whose names a file of the ADRC has
@@ -65,9 +69,9 @@ class ADRCAutopilot:
     def old(self) -> dict[str, float]:
         """What the firmware held of the parameters that are proposed; its defaults where the log
         does not say."""
-        known = adrc_parameters(self.values)
+        flown = adrc_parameters(self.values)
         default = lambda name: float(find_parameter("betaflight", name).default)
-        return {name: known.get(name, default(name)) for name in self.new}
+        return {name: flown.get(name, default(name)) for name in self.new}
 
     @property
     def new(self) -> dict[str, float]:
@@ -115,7 +119,7 @@ class ADRCAutopilot:
 
     def content(self) -> dict[str, object]:
         """All of it, for JSON."""
-        found = {
+        content = {
             "kind": self.kind,
             "verdict": self.verdict,
             "firmware": "betaflight",
@@ -127,53 +131,51 @@ class ADRCAutopilot:
             "unmodelled": self.flown.unmodelled,
             "old": self.old,
             "new": self.new,
-            "words": [each._asdict() for each in self.words],
+            "words": [x._asdict() for x in self.words],
             "proposal": None if self.proposal is None else self.proposal.content(),
-            "reproduction": [
-                {"throttle": x} | each.to_dict() for x, each in self.reproductions.items()
-            ],
+            "reproduction": [{"throttle": x} | x.to_dict() for x, x in self.reproductions.items()],
             "plant": None if self.plant is None else self.plant.to_dict(),
             "remarks": self.remarks,
             "settings": self.settings.content(),
         }
-        return {key: plain_content(value) for key, value in found.items()}
+        return {key: plain_content(value) for key, value in content.items()}
 
     @property
     def remarks(self) -> tuple[str, ...]:
         """What a pilot has to know before the file is loaded."""
-        found = []
+        remarks = []
         if self.words and "pid_type" not in self.values:
             version = ".".join(map(str, self.version))
-            found.append(
+            remarks.append(
                 f"the firmware of the log, Betaflight {version}, has no ADRC: only a build of "
                 "Betaflight's pull request 15400 with adrc_b0_law understands the file"
             )
         elif self.words and b0_law(self.values) is None:
-            found.append(
+            remarks.append(
                 "the build of the log has no adrc_b0_law, and b0 follows the square of the "
                 "throttle there: load the file into one that has it"
             )
         if self.words:
             others = " and ".join(axis for axis in AXES if axis != self.axis)
-            found.append(
+            remarks.append(
                 "pid_type, adrc_hover_throttle and adrc_b0_law are those of all three axes: before "
                 f"a flight tune {others}, too, from logs of their own with the same hover throttle "
                 f"({self.new['adrc_hover_throttle']:.0f} %), and load all three files"
             )
-            found.append(
+            remarks.append(
                 "there is no file for a third of the way, because between PID and ADRC there is "
                 "none; the file that reverts it switches back to the PID"
             )
         if self.words and not adrc_parameters(self.values):
-            found.append("the log does not hold the old values: they are the firmware's defaults")
+            remarks.append("the log does not hold the old values: they are the firmware's defaults")
         if (linear := float(self.values.get("thrust_linear", 0.0))) > 0:
-            found.append(
+            remarks.append(
                 f"thrust_linear {linear:g} flew and stays: the gain over the throttle is that with "
                 "it, taken as a straight line"
             )
         if self.proposal is not None and self.plant is not None:
-            found += _remarks_on_b0(self.plant, self.proposal, self.flew_adrc)
-        return tuple(found)
+            remarks += _remarks_on_b0(self.plant, self.proposal, self.flew_adrc)
+        return tuple(remarks)
 
     def write(self, folder: str | Path) -> list[Path]:
         """Write the page, `autopilot.json`, and parameter files: without a proposal what flew.
@@ -182,9 +184,9 @@ class ADRCAutopilot:
         """
         announce("parameter files")
         folder = Path(folder)
-        known = {k: v for k, v in self.settings.content().items() if v is not None}
+        stated = {k: v for k, v in self.settings.content().items() if v is not None}
         words = ["jaxquad", "autopilot", str(self.path), *self.settings.words()]
-        origin = provenance(self.path, command=shlex.join(words), settings=known)
+        origin = provenance(self.path, command=shlex.join(words), settings=stated)
         content = self.content() | {"provenance": origin.content()}
         stored = write_json(folder / "autopilot.json", content)
         announce("the page")
@@ -220,7 +222,7 @@ class ADRCAutopilot:
         flown, version = self.flown.parameters(), self.version or (2025, 12)
         same = [
             ParameterChange(find_parameter("betaflight", name), flown[name], flown[name])
-            for name in (f"{each}_{self.axis}" for each in start)
+            for name in (f"{name_start}_{self.axis}" for name_start in start)
         ]
         return parameter_file(
             "betaflight", same, revert=True, version=version, profile=None, title="what flew",
@@ -234,37 +236,36 @@ class ADRCAutopilot:
         if doubted is None:
             return self.reproductions
         said = self.reproductions[doubted].verdict
-        return {x: each for x, each in self.reproductions.items() if each.verdict != said}
+        return {x: again for x, again in self.reproductions.items() if again.verdict != said}
 
     def __str__(self) -> str:
         version, law = ".".join(map(str, self.version)), "ADRC" if self.flew_adrc else "PID"
         lines = [
             f"betaflight {version}, rate loop of {self.axis}: the {law} flew".replace(" ,", ",")
         ]
-        own = {k: x for k, x in self.flown.parameters().items() if k.endswith(f"_{self.axis}")}
-        lines += [f"  {name} = {value:.6g}" for name, value in own.items()]
+        of_axis = {k: x for k, x in self.flown.parameters().items() if k.endswith(f"_{self.axis}")}
+        lines += [f"  {name} = {value:.6g}" for name, value in of_axis.items()]
         if isinstance(self.flown, FlownADRC):
             schedule = self.flown.schedule
             lines.append(f"  adrc_b0_law = {schedule.law}, hover {100 * schedule.hover:.0f} %")
-        lines += [f"  not modelled: {each}" for each in self.flown.unmodelled]
+        lines += [f"  not modelled: {x}" for x in self.flown.unmodelled]
         lines += ["", str(self.plant)] if self.plant is not None else []
         again = [
-            f"flown loop at {x:.2f} throttle: {each.verdict}"
-            for x, each in self.shown_again.items()
+            f"flown loop at {x:.2f} throttle: {x.verdict}" for x, x in self.shown_again.items()
         ]
         lines += ["", *again] if again else []
         if self.proposal is not None:
             lines += ["", self.proposal.table()]
         if self.new:
             lines += ["", change_table(self.changes, self.words).rstrip()]
-        lines += ["", *(f"! {each}" for each in self.remarks)] if self.remarks else []
+        lines += ["", *(f"! {x}" for x in self.remarks)] if self.remarks else []
         return "\n".join([*lines, "", self.verdict])
 
 
 def doubted_throttle(again: Mapping[float, Reproduction]) -> float | None:
     """Where the flown loop is not reproduced; None where it is at one level, and off at none."""
-    off = [throttle for throttle, each in again.items() if each.kind == "not flown"]
-    blind = all(each.kind == "unknown" for each in again.values())
+    off = [throttle for throttle, check in again.items() if check.kind == "not flown"]
+    blind = all(check.kind == "unknown" for check in again.values())
     return next(iter(off or (again if blind else ())), None)
 
 
@@ -276,20 +277,143 @@ def _remarks_on_b0(plant: GainOverThrottle, proposal: ADRCProposal, flew: bool) 
             f"{'what flew' if flew else 'the default'}: the certificate is of "
             f"{proposal.throttle[0]:.2f} throttle alone; {plant.what_to_fly()}"
         ]
-    found, most = [], float(schedule.scale(proposal.throttle[-1]))
+    remarks, most = [], float(schedule.scale(proposal.throttle[-1]))
     if most >= schedule.high > 1:
-        found.append(
+        remarks.append(
             f"at {proposal.throttle[-1]:.2f} throttle b0 is at adrc_b0_scale_max, {schedule.high:g}"
         )
     if flew and scaled.law != schedule.law:
         off = scaled.deviations
-        found.append(
+        remarks.append(
             f"adrc_b0_law {schedule.law} stays as it flew: it is off by up to "
             f"{100 * off[schedule.law]:.0f} %, and {scaled.law} by {100 * off[scaled.law]:.0f} %"
         )
     if scaled.extrapolated:
-        found.append(
+        remarks.append(
             f"the hover throttle of {scaled.hover:.2f} lies outside of what was flown, "
             f"{float(plant.low.min()):.2f} to {float(plant.high.max()):.2f}"
         )
-    return found
+    return remarks
+
+
+_PLANTS, _SEED = 100, 77  # of the steps' bands
+_POINTS = 60  # of a curve over the throttle
+
+
+def adrc_page(result: "ADRCAutopilot", origin: Provenance) -> PilotPage:
+    """All that the page shows."""
+    version, proposal, plant = ".".join(map(str, result.version)), result.proposal, result.plant
+    flight = result.flight
+    return PilotPage(
+        title=f"betaflight {version}, ADRC for {result.axis}".replace(" ,", ","),
+        headlines=_headlines(result),
+        remarks=[*result.remarks, *(f"not modelled: {text}" for text in result.flown.unmodelled)],
+        filters=_filters(result),
+        steps={} if proposal is None or plant is None else _steps(result, proposal, plant),
+        b0=None if proposal is None or plant is None else _b0(result, proposal, plant),
+        terms={} if flight is None or not flight.terms else logged_terms(flight),
+        terms_are="as logged",
+        motors=[] if flight is None else motor_rows(flight),
+        stages=None if proposal is None else _stage_rows(proposal, result.settings.fresh),
+        changes=change_rows(result.changes, result.words) if result.new else None,
+        text=str(result),
+        unit="pidsum",
+        provenance=origin,
+    )
+
+
+def _headlines(result: "ADRCAutopilot") -> list[Headline]:
+    headlines = [Headline(*VERDICTS[result.kind], result.verdict)]
+    for throttle, again in result.shown_again.items():
+        flew = again.kind == "flown"
+        word = "THE FLOWN LOOP AGAIN" if flew else "THE FLOWN LOOP IS NOT REPRODUCED"
+        level = "good" if flew else "warn" if again.kind == "unknown" else "bad"
+        headlines.append(Headline(level, word, f"at {throttle:.2f} throttle: {again.verdict}"))
+    return headlines
+
+
+def _frame(result: "ADRCAutopilot", proposal: ADRCProposal) -> ADRCFrame:
+    values = result.new or result.flown.parameters()
+    return ADRCFrame(
+        proposal.schedule, values.get("adrc_gyro_lpf_hz", 150.0), values.get("adrc_td_hz", 0.0),
+        values.get("adrc_sigma_decay", 3.0) / 10,
+    )  # fmt: skip
+
+
+def _filters(result: "ADRCAutopilot") -> dict[str, Chains]:
+    """Those that flew, and those of the ADRC where the PID flew."""
+    flown, axis = result.flown, AXES.index(result.axis)
+    pid = flown.pid.law if isinstance(flown, FlownADRC) else flown.law
+    chains = chains_of(pid, axis)
+    if isinstance(flown, FlownADRC):
+        return {"flown": _with_observer(chains, flown.lowpass_hz, pid.dt)}
+    if result.proposal is None or not result.new:
+        return {"flown": chains}
+    cutoff = result.new["adrc_gyro_lpf_hz"]
+    return {"flown": chains, "proposed": _with_observer(chains, cutoff, pid.dt)}
+
+
+def _with_observer(chains: Chains, cutoff: float, dt: float) -> Chains:
+    observer = (FilterChain((PT2(cutoff),), 1 / dt),) if cutoff > 0 else ()
+    return {"gyro": chains["gyro"], "observer": observer}
+
+
+def _steps(
+    result: "ADRCAutopilot", proposal: ADRCProposal, plant: GainOverThrottle
+) -> dict[str, StepBand]:
+    """At the middle one of the throttles that were certified."""
+    middle = proposal.throttle[len(proposal.throttle) // 2]
+    grid = StepGrid.of(result.flown.law.dt)
+    loop = make_adrc_loop(
+        plant, result.flown, AXES.index(result.axis), middle, _frame(result, proposal), _PLANTS,
+        result.settings.seed + _SEED, grid.omega,
+    )  # fmt: skip
+    name = lambda law: f"{law}, {middle:.2f} throttle"
+    flown = name(f"{'ADRC' if result.flew_adrc else 'PID'} flown")
+    steps = {flown: grid.band(loop.closed(None))}
+    if result.new:
+        design = np.array(proposal.stage[:3])
+        steps[name("ADRC proposed")] = grid.band(loop.closed(design))
+    return steps
+
+
+def _b0(result: "ADRCAutopilot", proposal: ADRCProposal, plant: GainOverThrottle) -> B0Section:
+    levels = [plant.b0(k) for k in range(plant.throttle.size)]
+    low, high = np.array([level.interval for level in levels]).T
+    measured = GainBand(plant.throttle, np.array([level.value for level in levels]), low, high)
+    ends = float(plant.low.min()), float(plant.high.max())
+    grid, scale = np.linspace(*ends, _POINTS), proposal.schedule.scale
+    taken = {}
+    if isinstance(result.flown, FlownADRC):
+        b0 = proposal.stages["what flew"].b0
+        taken["b0 that flew"] = ThrottleCurve(grid, b0 * result.flown.schedule.scale(grid))
+    if result.new:
+        name = f"b0 proposed, {proposal.law}"
+        taken[name] = ThrottleCurve(grid, proposal.stage.b0 * scale(grid))
+    curve = None if proposal.scaled is None else plant.b0_over(grid)
+    text = plant.what_to_fly() if proposal.scaled is None else f"gain / lag: {proposal.scaled}"
+    text = f"{text[0].upper()}{text[1:]}"
+    more = (
+        " The best b0 is not gain / lag: the motors' own pole 1 / lag is a part of what the "
+        "observer has to follow."
+    )
+    return B0Section(measured, taken, curve, f"{text}.{more}")
+
+
+def _stage_rows(proposal: ADRCProposal, fresh: int) -> Table:
+    number = lambda x: "-" if np.isnan(x) else f"{x:.0f}"
+    rows = [
+        [
+            name, number(x.wc), number(x.wo), number(x.b0), f"{100 * x.stable:.1f}",
+            f"{x.peak:.2f}", f"{x.resonance:.2f}", f"{x.crossover / (2 * np.pi):.1f}",
+            f"{x.rejection:.2f}", f"{x.noise:.2f}",
+        ]
+        for name, x in proposal.stages.items()
+    ]  # fmt: skip
+    heads = (
+        "parameters", "wc", "wo", "b0", "stable, %", "worst Ms", "worst peak", "crossover, Hz",
+        "torque", "noise",
+    )  # fmt: skip
+    first, last = proposal.throttle[0], proposal.throttle[-1]
+    where = f"at {first:.2f}" if first == last else f"from {first:.2f} to {last:.2f}"
+    return Table(f"On {fresh} fresh plants, {where} throttle", heads, rows)
