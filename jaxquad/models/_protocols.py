@@ -3,7 +3,7 @@
 import dataclasses
 import re
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import equinox as eqx
 import jax
@@ -70,14 +70,12 @@ def with_arrays(model: PyTree) -> PyTree:
     index or a count, belongs into a field of `eqx.field(static=True)`.
     """
 
-    def convert(x: Any) -> Any:
+    def is_number(x: object) -> bool:  # which JAX would not take for a parameter
         if isinstance(x, np.ndarray | np.generic | jax.Array):
-            number = x.dtype.kind in "iu"  # which JAX would not take for a parameter
-        else:
-            number = isinstance(x, int | float) and not isinstance(x, bool)
-        return as_float(x) if number else x
+            return x.dtype.kind in "iu"
+        return isinstance(x, int | float) and not isinstance(x, bool)
 
-    return jax.tree.map(convert, model)
+    return jax.tree.map(lambda x: as_float(x) if is_number(x) else x, model)
 
 
 def as_frequencies(omega: Frequencies) -> Float[Array, " frequencies"]:

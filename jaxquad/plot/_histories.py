@@ -1,4 +1,4 @@
-"""Curves over time: a record, a simulation on it, any others."""
+"""Curves and records over time; spectra over time, or over another channel."""
 
 from collections.abc import Mapping, Sequence
 
@@ -7,9 +7,21 @@ from jaxtyping import ArrayLike, Float, Int
 
 from jaxquad.records import clock_start, Record
 
-from ._labels import few_ticks, LINES, Style
-from ._names import short_names, unit_label, visible
-from ._panels import arrange, Given, legend_of, Panels, stacked
+from ._panels import (
+    add_hertz,
+    arrange,
+    AxesLike,
+    few_ticks,
+    legend_of,
+    LINES,
+    Panels,
+    raise_powers,
+    short_names,
+    stacked,
+    Style,
+    unit_label,
+    visible,
+)
 
 
 Places = Int[np.ndarray, " kept"]
@@ -33,13 +45,13 @@ def extremes(values: Float[np.ndarray, " samples"], columns: int = _COLUMNS) -> 
     size = -(-values.size // columns)
     if size <= 2:
         return np.arange(values.size)
-    whole = values.size // size
-    blocks = values[: whole * size].reshape(whole, size)
+    full = values.size // size
+    blocks = values[: full * size].reshape(full, size)
     places = np.stack([blocks.argmin(axis=1), blocks.argmax(axis=1)], axis=1)
-    kept = (np.sort(places, axis=1) + size * np.arange(whole)[:, None]).reshape(-1)
-    rest = values[whole * size :]
+    kept = (np.sort(places, axis=1) + size * np.arange(full)[:, None]).reshape(-1)
+    rest = values[full * size :]
     ends = [rest.argmin(), rest.argmax()] if rest.size else []
-    return np.unique([*kept, *(whole * size + k for k in ends)])
+    return np.unique([*kept, *(full * size + k for k in ends)])
 
 
 def channels_of(record: Record) -> list[tuple[str, str]]:
@@ -56,7 +68,7 @@ def record_figure(
     record: Record,
     channels: Sequence[tuple[str, str]] | None = None,
     *,
-    ax: Given = None,
+    ax: AxesLike = None,
     title: str = "",
 ) -> Panels:
     """Draw the channels of a record over time, stacked; angles in degrees.
@@ -92,7 +104,7 @@ def record_figure(
     return arrange(panels, [1.0] * len(panels), above=0.2, gap=0.35, title=title)
 
 
-_TARGET = {"color": "0.75", "ls": "-", "lw": 4.0, "zorder": 1}
+_TARGET: Style = {"color": "0.75", "ls": "-", "lw": 4.0, "zorder": 1}
 
 
 def histories(
@@ -101,7 +113,7 @@ def histories(
     *,
     target: str | None = None,
     limits: Mapping[str, tuple[float, float]] | None = None,
-    ax: Given = None,
+    ax: AxesLike = None,
     title: str = "",
 ) -> Panels:
     """Draw curves over time in stacked panels; they differ in their lines as well as in colour.
@@ -120,7 +132,14 @@ def histories(
 
     **Raises:** ValueError for more curves than there are lines, and for limits of an unknown panel.
     """
-    style = _styles(panels, target)
+    names = list(dict.fromkeys(name for curves in panels.values() for name in curves))
+    others = [name for name in names if name != target]
+    if len(others) > len(LINES):
+        raise ValueError(
+            f"{len(others)} curves are too many to be distinguished, {len(LINES)} is the most: "
+            f"split {others} over several figures"
+        )
+    style = dict(zip(others, LINES, strict=False)) | ({target: _TARGET} if target else {})
     unknown = [text for text in limits or {} if text not in panels]
     if unknown:
         raise ValueError(f"limits for {unknown}, but the panels are {list(panels)}")
@@ -138,14 +157,107 @@ def histories(
     return arrange(axes, heights, title=title, legend=legend_of(axes), handle_length=3.5)
 
 
-def _styles(
-    panels: Mapping[str, Mapping[str, Float[ArrayLike, " samples"]]], target: str | None
-) -> dict[str, Style]:
-    names = list(dict.fromkeys(name for curves in panels.values() for name in curves))
-    others = [name for name in names if name != target]
-    if len(others) > len(LINES):
-        raise ValueError(
-            f"{len(others)} curves are too many to be distinguished, {len(LINES)} is the most: "
-            f"split {others} over several figures"
-        )
-    return dict(zip(others, LINES, strict=False)) | ({target: _TARGET} if target else {})
+_SEGMENTS = 60  # over a record, where nothing else is said
+_SHORTEST, _LONGEST = 64, 4096  # samples of a window
+_BINS = 40  # of another channel
+_RANGE = 60.0  # dB that are drawn
+_BAR = 0.16  # inches, of the scale of colours
+
+
+def spectrogram(
+    record: Record,
+    channel: str | None = None,
+    *,
+    over: str = "time",
+    window: float | None = None,
+    ax: AxesLike = None,
+    title: str = "",
+) -> Panels:
+    """Draw the power spectral density of a channel over time, or over another channel.
+
+    Over the throttle, motor harmonics are lines that rise with it, and resonances of the frame
+    are horizontal.
+
+    !!! example
+
+        ```python
+        jq.plot.spectrogram(record, "gyro_x", over="throttle")
+        ```
+
+    **Arguments:**
+
+    - `record`: what was flown.
+    - `channel`: the name of a channel; by default the first output.
+    - `over`: "time", or the name of another channel: its values are averaged over each window, and
+        the spectra over bins of these.
+    - `window`: s, the length of a Hann window; they overlap by three quarters. By default about a
+        fifteenth of the record, 64 to 4096 samples.
+    - `ax`: axes to draw into; the scale of colours takes a part of it.
+    - `title`: above the figure.
+
+    **Returns:** `jq.plot.Panels`, of one; the colours are in dB of (unit)^2 per Hz.
+
+    **Raises:** `RecordError` (a ValueError) for unknown channels, ValueError for a `window` that is
+    longer than the record or shorter than 16 samples.
+    """
+    name = record.output_names[0] if channel is None else channel
+    scale, unit = unit_label(visible(record.unit(name))[:12])
+    if window is None:
+        power = np.round(np.log2(np.clip(4 * record.samples / _SEGMENTS, _SHORTEST, _LONGEST)))
+        samples = min(int(2**power), record.samples)
+    else:
+        samples = round(window / record.dt)
+        if not 16 <= samples <= record.samples:
+            raise ValueError(
+                f"window is {window} s, {samples} samples: give 16 to {record.samples} samples, "
+                f"{16 * record.dt:.4g} to {record.duration:.4g} s"
+            )
+    step, shape = max(samples // 4, 1), np.hanning(samples)
+    windows = lambda values: np.lib.stride_tricks.sliding_window_view(values, samples)[::step]
+    parts = windows(scale * record.channel(name))
+    density = np.abs(np.fft.rfft((parts - parts.mean(axis=1, keepdims=True)) * shape, axis=1)) ** 2
+    density *= 2 * record.dt / np.sum(shape**2)
+    omega = 2 * np.pi * np.fft.rfftfreq(samples, record.dt)[1:]
+    with np.errstate(divide="ignore"):
+        level = 10 * np.log10(density[:, 1:].T)  # dB, [frequencies, windows]
+    if over == "time":
+        begins = record.time[: len(parts) * step : step] - clock_start(record.time)
+        middle = begins + 0.5 * samples * record.dt
+        edges = np.append(middle, middle[-1] + step * record.dt) - 0.5 * step * record.dt
+        label = "time, s"
+    else:  # the mean power of the windows that belong to each bin of the other channel
+        means = windows(record.channel(over)).mean(axis=1)
+        edges = np.linspace(means.min(), means.max() + 1e-9 * (1 + np.ptp(means)), _BINS + 1)
+        place = np.clip(np.digitize(means, edges) - 1, 0, _BINS - 1)
+        power, level = 10 ** (level / 10), np.full((omega.size, _BINS), np.nan)
+        for k in np.unique(place):
+            level[:, k] = 10 * np.log10(power[:, place == k].mean(axis=1))
+        other, text = unit_label(visible(record.unit(over))[:12])
+        edges, label = other * edges, f"{short_names([over])[0]}{text}"
+    panels = stacked(1, ax)
+    [panel] = panels
+    finite = level[np.isfinite(level)]
+    top = float(np.percentile(finite, 99.8)) if finite.size else 0.0
+    low = max(top - _RANGE, float(np.percentile(finite, 2)) if finite.size else -_RANGE)
+    half = 0.5 * (omega[1] - omega[0])
+    drawn = panel.pcolormesh(
+        edges, np.append(omega - half, omega[-1] + half), level, cmap="viridis", vmin=low, vmax=top,
+        rasterized=True,
+    )  # fmt: skip
+    panel.set_facecolor("0.9")  # nothing flew there
+    panel.set_ylabel("frequency, rad/s")
+    few_ticks(panel.yaxis, 6)
+    add_hertz(panel, "right")
+    colours = raise_powers(f"dB of ({unit.removeprefix(', ') or 'unit'})^2/Hz")
+    if not panels.new:
+        panels.figure.colorbar(drawn, ax=panel, label=colours, pad=0.13)
+    panel.set_xlabel(label)
+    panel.set_title(short_names([name])[0], loc="left", fontsize=9, pad=3)
+    if panels.new:
+        bar = panels.figure.add_axes((0, 0, 1, 1), label="scale")
+        panels.figure.colorbar(drawn, cax=bar, label=colours)
+        arrange(panels, [3.4], width=7.4, right=1.75, above=0.1, title=title)
+        left, low, across, high = panel.get_position().bounds
+        width = panels.figure.get_size_inches()[0]
+        bar.set_position((left + across + 0.85 / width, low, _BAR / width, high))
+    return panels

@@ -1,18 +1,22 @@
-"""Axes of a figure, laid out in inches, on the screen of a notebook or off it.
+"""Axes of a figure laid out in inches, their ticks, lines and marks, and names as texts of them.
 
 A layout that measures every text first draws a figure twice. Here margins are fixed, and the room
 for a legend and a title is counted in lines.
 """
 
 import contextlib
-from collections.abc import Iterator, Mapping, Sequence
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextvars import ContextVar
 from math import ceil
+from typing import Any
 
 import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
 
 
 WIDTH = 6.5
@@ -22,7 +26,7 @@ _LINE = 0.2  # of a legend or a title
 _LETTER = 0.072  # of a legend, on average
 _HANDLE = 0.55  # of a legend, with the space around it
 
-Given = Axes | Sequence[Axes] | np.ndarray | None
+AxesLike = Axes | Sequence[Axes] | np.ndarray | None  # to draw into; None for a new figure
 _HEADLESS = ContextVar("headless", default=False)
 
 
@@ -32,12 +36,12 @@ class Panels(tuple[Axes, ...]):
     `.figure.savefig(path)` stores the figure. A notebook shows the figure, and no text for this.
     """
 
-    own: bool  # a new figure, laid out here; else axes that the caller gave
+    new: bool  # a new figure, laid out here; else axes of the caller
 
-    def __new__(cls, axes: Sequence[Axes], *, own: bool) -> "Panels":
-        made = super().__new__(cls, axes)
-        made.own = own
-        return made
+    def __new__(cls, axes: Sequence[Axes], *, new: bool) -> "Panels":
+        self = super().__new__(cls, axes)
+        self.new = new
+        return self
 
     @property
     def figure(self) -> Figure:
@@ -62,23 +66,26 @@ def headless() -> Iterator[None]:
         _HEADLESS.reset(token)
 
 
-def _new_figure() -> Figure:
-    if _HEADLESS.get():
-        return Figure()
-    import matplotlib.pyplot as plt  # here: it is slow to import, and needs no place in a report
-
-    return plt.figure()
-
-
-def stacked(count: int, ax: Given = None, *, columns: int = 1, shared: bool = True) -> Panels:
-    """So many panels of a new figure, or those that are given; with columns in rows of so many.
+def stacked(count: int, ax: AxesLike = None, *, columns: int = 1, shared: bool = True) -> Panels:
+    """So many panels of a new figure, or those of `ax`; with columns in rows of so many.
 
     New ones have one horizontal axis if it is `shared`, with numbers at the lowest panels only.
-    `arrange` gives new ones their places. Raises ValueError for another number of given ones.
+    `arrange` gives new ones their places. Raises ValueError for another number of axes.
     """
     if ax is not None:
-        return _given(count, ax)
-    figure = _new_figure()
+        axes = [ax] if isinstance(ax, Axes) else list(np.ravel(np.asarray(ax, dtype=object)))
+        if len(axes) != count or not all(isinstance(panel, Axes) for panel in axes):
+            raise ValueError(
+                f"ax holds {len(axes)} axes, but this plot draws {count}: give {count} axes, for "
+                f"instance those of matplotlib.pyplot.subplots({count}), or leave ax= out"
+            )
+        return Panels(axes, new=False)
+    if _HEADLESS.get():
+        figure = Figure()
+    else:
+        import matplotlib.pyplot as plt  # here: it is slow to import, and no report needs it
+
+        figure = plt.figure()
     first = figure.add_axes((0, 0, 1, 1), label="0")
     panels = [first]
     for k in range(1, count):
@@ -86,17 +93,7 @@ def stacked(count: int, ax: Given = None, *, columns: int = 1, shared: bool = Tr
         panels.append(figure.add_axes((0, 0, 1, 1), sharex=other, label=f"{k}"))
     for panel in panels[:-columns] if shared else ():
         panel.tick_params(labelbottom=False)
-    return Panels(panels, own=True)
-
-
-def _given(count: int, ax: Given) -> Panels:
-    axes = [ax] if isinstance(ax, Axes) else list(np.ravel(np.asarray(ax, dtype=object)))
-    if len(axes) != count or not all(isinstance(each, Axes) for each in axes):
-        raise ValueError(
-            f"ax holds {len(axes)} axes, but this plot draws {count}: give {count} axes, for "
-            f"instance those of matplotlib.pyplot.subplots({count}), or leave ax= out"
-        )
-    return Panels(axes, own=False)
+    return Panels(panels, new=True)
 
 
 def arrange(
@@ -117,15 +114,22 @@ def arrange(
 
     `heights` are those of the rows, `gap` the room below each of them, `above` that between the
     title and the first row, for what stands on it; `left` and `right` are margins of each column.
-    Panels that the caller gave stay where they are: title and legend go into the first of them.
+    Panels of the caller stay where they are: title and legend go into the first of them.
     """
-    if not panels.own:
-        return _annotate(panels, title, legend)
+    legend = legend or {}
+    if not panels.new:
+        if title:
+            panels[0].set_title(title, fontsize=10)
+        if legend:
+            panels[0].legend(legend.values(), legend.keys(), fontsize=8, handlelength=3.0)
+        return panels
     left += _LINE * max(panel.get_ylabel().count("\n") for panel in panels)
     gaps = list(gap) if isinstance(gap, Sequence) else [gap] * (len(heights) - 1)
     lines = len(title.splitlines())
     top = _TOP + _LINE * lines + above
-    across_legend, rows = _columns(legend or {}, width)
+    longest = max(map(len, legend), default=0)
+    across_legend = max(1, min(len(legend), 3, int(width / (_HANDLE + _LETTER * longest))))
+    rows = ceil(len(legend) / across_legend)
     bottom = _BOTTOM + (_LINE * rows + 0.15 if rows else 0.0)
     total = top + sum(heights) + sum(gaps) + bottom
     panels.figure.set_size_inches(width, total)
@@ -152,23 +156,6 @@ def arrange(
     return panels
 
 
-def _annotate(panels: Panels, title: str, legend: Mapping[str, Artist] | None) -> Panels:
-    if title:
-        panels[0].set_title(title, fontsize=10)
-    if legend:
-        panels[0].legend(legend.values(), legend.keys(), fontsize=8, handlelength=3.0)
-    return panels
-
-
-def _columns(legend: Mapping[str, Artist], width: float) -> tuple[int, int]:
-    """Columns and rows."""
-    if not legend:
-        return 0, 0
-    longest = max(map(len, legend))
-    columns = max(1, min(len(legend), 3, int(width / (_HANDLE + _LETTER * longest))))
-    return columns, ceil(len(legend) / columns)
-
-
 def legend_of(panels: Sequence[Axes]) -> dict[str, Artist]:
     """What the panels have drawn, each text once."""
     named: dict[str, Artist] = {}
@@ -176,3 +163,143 @@ def legend_of(panels: Sequence[Axes]) -> dict[str, Artist]:
         handles, labels = panel.get_legend_handles_labels()
         named |= dict(zip(labels, handles, strict=True))
     return named
+
+
+_MARKS = (
+    {"marker": "o", "color": "black", "mfc": "black", "ms": 4.0, "mew": 0.8},
+    {"marker": "s", "color": "tab:red", "mfc": "none", "ms": 4.0, "mew": 0.8},
+    {"marker": "^", "color": "tab:orange", "mfc": "none", "ms": 4.5, "mew": 0.8},
+    {"marker": "D", "color": "tab:blue", "mfc": "none", "ms": 3.5, "mew": 0.8},
+    {"marker": "+", "color": "tab:green", "mfc": "none", "ms": 5.5, "mew": 1.0},
+    {"marker": "v", "color": "tab:purple", "mfc": "none", "ms": 4.5, "mew": 0.8},
+    {"marker": "*", "color": "0.4", "mfc": "0.7", "ms": 6.0, "mew": 0.6},
+)
+Style = dict[str, Any]  # keyword arguments of `Axes.plot`
+LINES: tuple[Style, ...] = (  # told apart by dash, by lightness and by colour
+    {"color": "tab:blue", "ls": "-", "lw": 1.6},
+    {"color": "tab:red", "ls": "--", "lw": 1.6},
+    {"color": "tab:green", "ls": "-.", "lw": 1.4},
+    {"color": "tab:purple", "ls": (0, (1, 1.2)), "lw": 1.8},
+    {"color": "0.45", "ls": (0, (6, 1, 1, 1, 1, 1)), "lw": 1.4},
+)
+
+
+def look_of(k: int, name: str) -> Style:
+    """The line of one of several models. Raises ValueError beyond the last there is."""
+    if k >= len(LINES):
+        raise ValueError(
+            f"{name} is curve {k + 1}, too many to be distinguished, {len(LINES)} is the most: "
+            "split them over several figures"
+        )
+    return LINES[k] | {"label": name}
+
+
+class _Ticks(LogLocator):
+    """At most so many ticks at round numbers of a logarithmic axis."""
+
+    STEPS = ((1, 1.5, 2, 3, 4, 5, 7), (1, 2, 5), (1,))  # of a decade
+
+    def __init__(self, most: int):
+        super().__init__()
+        self.most = most
+
+    def tick_values(self, vmin: float, vmax: float) -> np.ndarray:
+        low, high = sorted((vmin, vmax))
+        decades = 10.0 ** np.arange(np.floor(np.log10(low)), np.ceil(np.log10(high)) + 1)
+        ticks = np.empty(0)
+        for steps in self.STEPS:
+            round_numbers = np.multiply.outer(decades, steps).ravel()
+            inside = (round_numbers >= low * (1 - 1e-9)) & (round_numbers <= high * (1 + 1e-9))
+            ticks = round_numbers[inside]
+            if ticks.size <= self.most:
+                break
+        if ticks.size < 2:
+            return np.asarray(MaxNLocator(self.most).tick_values(low, high))
+        return ticks[:: -(-ticks.size // self.most)]
+
+
+def few_ticks(axis: Axis, most: int) -> None:
+    """At most so many intervals of a linear axis, at round numbers."""
+    axis.set_major_locator(MaxNLocator(most, steps=[1, 2, 2.5, 5, 10]))
+
+
+def plain_ticks(axis: Axis, most: int = 6) -> None:
+    """At most so many ticks of a logarithmic axis, as plain numbers, not as 2 x 10^1."""
+    axis.set_major_locator(_Ticks(most))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.set_minor_locator(NullLocator())
+
+
+def marks(names: Iterable[str]) -> dict[str, Style]:
+    """A mark for each design, by its place. Raises ValueError for more than there are."""
+    names = list(names)
+    if len(names) > len(_MARKS):
+        raise ValueError(
+            f"{len(names)} designs are too many to be distinguished, {len(_MARKS)} is the most: "
+            f"leave some of {names} out"
+        )
+    return {name: dict(mark) for name, mark in zip(names, _MARKS, strict=False)}
+
+
+def draw_limit(panel: Axes, bound: float, text: str) -> None:
+    """A dashed line with a text at its right end."""
+    panel.axhline(bound, color="black", lw=1.0, ls="--", zorder=3.5)
+    box = {"boxstyle": "square,pad=0.15", "fc": "white", "ec": "none", "alpha": 0.85}
+    panel.annotate(
+        text, (1.0, bound), xycoords=("axes fraction", "data"), xytext=(-3, 2),
+        textcoords="offset points", ha="right", va="bottom", fontsize=8, bbox=box, zorder=5,
+    )  # fmt: skip
+
+
+def add_hertz(panel: Axes, side: str = "top", text: str = "frequency, Hz") -> None:
+    """A second axis in Hz of one in rad/s: above ("top") the horizontal one, or on the "right"."""
+    turn = 2 * np.pi
+    functions = (lambda omega: omega / turn, lambda hertz: hertz * turn)
+    if side == "top":
+        hertz = panel.secondary_xaxis("top", functions=functions)
+        hertz.set_xlabel(text)
+        plain_ticks(hertz.xaxis)
+    else:
+        panel.secondary_yaxis("right", functions=functions).set_ylabel(text)
+
+
+# Controls, overrides of the reading direction, halves of surrogate pairs: they break HTML, XML or
+# UTF-8, or make a text look like another one.
+_HIDDEN = re.compile(
+    "[\x00-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069\ud800-\udfff\ufffe\uffff]"
+)
+_SHORT = 28  # characters of a name in a figure
+COHERENT = 0.6  # magnitude-squared coherence from which a frequency is commonly used
+
+
+def visible(text: str) -> str:
+    """A text with U+FFFD for characters that control a display instead of showing on it."""
+    return _HIDDEN.sub("\ufffd", text)
+
+
+def short_names(names: Sequence[str]) -> tuple[str, ...]:
+    """Names for the labels of a figure: one line, not long, and distinct if there are several."""
+    short: list[str] = []
+    for name in names:
+        line = " ".join(visible(name).split()) or "(no name)"
+        half = (_SHORT - 1) // 2
+        line = line if len(line) <= _SHORT else f"{line[:half]}\u2026{line[-half:]}"
+        while line in short:
+            line += "\u2032"
+        short.append(line)
+    return tuple(short)
+
+
+def unit_label(unit: str) -> tuple[float, str]:
+    """Factor and label of a unit as it is drawn: angles in degrees."""
+    if unit in ("rad", "rad/s"):
+        return float(np.degrees(1.0)), ", " + unit.replace("rad", "deg")
+    return 1.0, f", {unit}" if unit else ""
+
+
+_RAISED = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
+
+
+def raise_powers(text: str) -> str:
+    """`deg s^2` with its exponent raised; a letter of the font, which takes no formula."""
+    return re.sub(r"\^(\d+)", lambda power: power[1].translate(_RAISED), text)

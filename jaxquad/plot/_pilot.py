@@ -1,21 +1,64 @@
 """What a pilot looks at: filters and their delay, spectra before and after them, steps, terms."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
+from jaxtyping import Float
 
 from jaxquad.identify import GainBand
 
-from ._curves import FlownAgain, Spectrum, StepBand, ThrottleCurve
-from ._labels import few_ticks, look_of, plain_ticks
-from ._panels import arrange, Given, legend_of, Panels, stacked
+from ._panels import (
+    arrange,
+    AxesLike,
+    few_ticks,
+    legend_of,
+    look_of,
+    Panels,
+    plain_ticks,
+    stacked,
+)
 
 
 _POINTS = 200
 _LOWEST = 2.0  # Hz
 _HATCHES = (None, "....", "////", "xxxx", "----")  # of bands, for those who see no colours
 _SPAN = 70.0  # dB that a figure shows below the highest level
+
+
+Frequencies = Float[np.ndarray, " frequencies"]
+
+
+class Spectrum(NamedTuple):
+    """A power spectral density, one-sided, per Hz."""
+
+    hertz: Frequencies
+    power: Frequencies
+
+
+class StepBand(NamedTuple):
+    """Step responses of many plants: their median, and between which 95 % of them lie."""
+
+    time: Float[np.ndarray, " samples"]
+    middle: Float[np.ndarray, " samples"]
+    low: Float[np.ndarray, " samples"]
+    high: Float[np.ndarray, " samples"]
+
+
+class ThrottleCurve(NamedTuple):
+    """A quantity over the throttle of 0 to 1, as a firmware takes it."""
+
+    throttle: Float[np.ndarray, " points"]
+    value: Float[np.ndarray, " points"]
+
+
+class FlownAgain(NamedTuple):
+    """A part of a flight as it was logged, and as law and plant fly it again: s and rad/s."""
+
+    time: Float[np.ndarray, " samples"]
+    setpoint: Float[np.ndarray, " samples"]
+    rate: Float[np.ndarray, " samples"]
+    again: Float[np.ndarray, " samples"]
 
 
 @runtime_checkable
@@ -29,7 +72,7 @@ class Filters(Protocol):
 
 
 def filters_figure(
-    chains: Mapping[str, Sequence[Filters]], *, ax: Given = None, title: str = ""
+    chains: Mapping[str, Sequence[Filters]], *, ax: AxesLike = None, title: str = ""
 ) -> Panels:
     """Draw magnitude and delay of filters over the frequency.
 
@@ -43,13 +86,13 @@ def filters_figure(
     """
     panels = stacked(2, ax)
     level, delay = panels
-    highest = min(each.rate_hz for group in chains.values() for each in group) / 2
+    highest = min(chain.rate_hz for group in chains.values() for chain in group) / 2
     hertz = np.geomspace(_LOWEST, 0.98 * highest, _POINTS)
     for k, (name, group) in enumerate(chains.items()):
         response, late = np.ones(hertz.size, complex), np.zeros(hertz.size)
-        for each in group:
-            response = response * np.asarray(each.response(hertz))
-            late = late + np.asarray(each.delay_ms(hertz))
+        for chain in group:
+            response = response * np.asarray(chain.response(hertz))
+            late = late + np.asarray(chain.delay_ms(hertz))
         level.plot(hertz, 20 * np.log10(np.abs(response)), **look_of(k, name))
         delay.plot(hertz, late, **look_of(k, name))
     low, high = level.get_ylim()
@@ -61,7 +104,7 @@ def filters_figure(
 
 def spectra_figure(
     gyro: Mapping[str, Spectrum], derivative: Mapping[str, Spectrum], *, unit: str = "",
-    ax: Given = None, title: str = "",
+    ax: AxesLike = None, title: str = "",
 ) -> Panels:  # fmt: skip
     """Draw the gyro's noise and the D term's, before and behind filters.
 
@@ -82,10 +125,10 @@ def spectra_figure(
     for panel, spectra, label in zip(panels, (gyro, derivative), labels, strict=True):
         factor = np.degrees(1.0) ** 2 if panel is panels[0] else 1.0
         top = -np.inf
-        for name, each in spectra.items():
-            seen = (each.hertz >= _LOWEST) & (each.power > 0)
-            level = 10 * np.log10(factor * each.power[seen])
-            (line,) = panel.plot(each.hertz[seen], level, **look_of(places[name], name))
+        for name, spectrum in spectra.items():
+            shown = (spectrum.hertz >= _LOWEST) & (spectrum.power > 0)
+            level = 10 * np.log10(factor * spectrum.power[shown])
+            (line,) = panel.plot(spectrum.hertz[shown], level, **look_of(places[name], name))
             line.set_linewidth(1.2)
             top = max(top, float(level.max(initial=-np.inf)))
         if np.isfinite(top):
@@ -98,7 +141,7 @@ def spectra_figure(
 
 
 def steps_figure(
-    steps: Mapping[str, StepBand], *, label: str = "rate after a step of 1", ax: Given = None,
+    steps: Mapping[str, StepBand], *, label: str = "rate after a step of 1", ax: AxesLike = None,
     title: str = "",
 ) -> Panels:  # fmt: skip
     """Draw step responses with the band of the plants that are possible.
@@ -114,20 +157,20 @@ def steps_figure(
     """
     panels = stacked(1, ax)
     [panel] = panels
-    for k, (name, each) in enumerate(steps.items()):
+    for k, (name, band) in enumerate(steps.items()):
         look = look_of(k, name)
         panel.fill_between(
-            each.time, each.low, each.high, facecolor=look["color"], alpha=0.22, lw=0,
+            band.time, band.low, band.high, facecolor=look["color"], alpha=0.22, lw=0,
             hatch=_HATCHES[k], edgecolor=look["color"], label=f"{name}, 95 % of plants",
         )  # fmt: skip
-        panel.plot(each.time, each.middle, **look)
+        panel.plot(band.time, band.middle, **look)
     panel.axhline(1.0, color="0.4", lw=0.8, ls=":")
     panel.set(xlabel="time, s", ylabel=label)
     panel.margins(x=0)
     return _finished(panels, (2.8,), title)
 
 
-def again_figure(flight: FlownAgain, *, ax: Given = None, title: str = "") -> Panels:
+def again_figure(flight: FlownAgain, *, ax: AxesLike = None, title: str = "") -> Panels:
     """Draw a part of a flight, logged and simulated, and what is between them.
 
     **Arguments:**
@@ -153,7 +196,7 @@ def again_figure(flight: FlownAgain, *, ax: Given = None, title: str = "") -> Pa
 
 def b0_figure(
     levels: GainBand, taken: Mapping[str, ThrottleCurve], *, curve: GainBand | None = None,
-    ax: Given = None, title: str = "",
+    ax: AxesLike = None, title: str = "",
 ) -> Panels:  # fmt: skip
     """Draw b0 over the throttle: of a log with its 95 % band, and as a firmware takes it.
 
@@ -179,15 +222,15 @@ def b0_figure(
     reach = [levels.value - levels.low, levels.high - levels.value]
     panel.errorbar(levels.throttle, levels.value, yerr=reach, fmt="none", ecolor="black", capsize=4)
     panel.plot(levels.throttle, levels.value, "o", ms=5, color="black", label="levels flown, 95 %")
-    for k, (name, each) in enumerate(taken.items(), start=1):
-        panel.plot(each.throttle, each.value, **look_of(k, name))
+    for k, (name, values) in enumerate(taken.items(), start=1):
+        panel.plot(values.throttle, values.value, **look_of(k, name))
     panel.set(xlabel="throttle", ylabel="b0, deg/s³ per pidsum")
     panel.set_ylim(0, None)
     return _finished(panels, (2.8,), title)
 
 
 def balance_figure(
-    terms: Mapping[str, float], *, unit: str = "", ax: Given = None, title: str = ""
+    terms: Mapping[str, float], *, unit: str = "", ax: AxesLike = None, title: str = ""
 ) -> Panels:
     """Draw how large P, I, D and F were, as bars of their root mean squares.
 

@@ -8,15 +8,25 @@ from matplotlib.collections import EllipseCollection
 from jaxquad.identify import Fit, linear_model
 from jaxquad.models import Model
 
-from ._labels import add_hertz, few_ticks, look_of, Style
-from ._panels import arrange, Given, legend_of, Panels, stacked
+from ._panels import (
+    add_hertz,
+    arrange,
+    AxesLike,
+    COHERENT,
+    few_ticks,
+    legend_of,
+    look_of,
+    Panels,
+    stacked,
+    Style,
+)
 from ._shown import (
     analysed,
     channels_shown,
     frequencies_of,
     measured_and_modelled,
     named_models,
-    response_beside,
+    response_as_sampled,
     Thing,
 )
 
@@ -26,7 +36,7 @@ _ZEROS = ("o", "s", "^", "D", "v")
 _DAMPING = (0.2, 0.4, 0.6, 0.8)  # lines behind the poles
 
 
-def pzmap(*shown: Thing, ax: Given = None, title: str = "") -> Panels:
+def pzmap(*shown: Thing, ax: AxesLike = None, title: str = "") -> Panels:
     """Draw poles and zeros of models and fits, and the closed-loop poles of loops.
 
     The poles of a fit have 95 % intervals of their real and imaginary parts. Poles of a sampled
@@ -48,40 +58,26 @@ def pzmap(*shown: Thing, ax: Given = None, title: str = "") -> Panels:
     panels = stacked(1, ax)
     [panel] = panels
     for k, (name, thing) in enumerate(things.items()):
-        _draw_poles(panel, k, name, thing)
+        if not isinstance(thing, Fit | Model):
+            poles, zeros = analysed(name, thing, "pzmap").poles, np.empty(0)
+        else:
+            plant = linear_model(thing.model if isinstance(thing, Fit) else thing)
+            poles, zeros = plant.poles, plant.zeros
+        poles, colour = poles[np.isfinite(poles)], look_of(k, name)["color"]
+        style: Style = {"ls": "none", "color": colour, "ms": 9.0 - k, "mew": 1.8, "zorder": 3}
+        panel.plot(np.real(poles), np.imag(poles), _POLES[k], label=f"{name}, poles", **style)
+        if isinstance(thing, Fit):
+            half = thing.pole_reach
+            panel.errorbar(
+                np.real(poles), np.imag(poles), np.imag(half), np.real(half), fmt="none",
+                ecolor=colour, elinewidth=1.0, capsize=2.5, label=f"{name}, 95 %",
+            )  # fmt: skip
+        if zeros.size:
+            label = f"{name}, zeros"
+            panel.plot(np.real(zeros), np.imag(zeros), _ZEROS[k], mfc="none", label=label, **style)
     panel.axhline(0, color="0.6", lw=0.8, zorder=1)
     panel.axvline(0, color="0.6", lw=0.8, zorder=1)
     panel.margins(0.12)
-    _damping_lines(panel)
-    panel.set(xlabel="real part, rad/s", ylabel="imaginary part, rad/s")
-    add_hertz(panel, "right", "imaginary part, Hz")
-    few_ticks(panel.xaxis, 6)
-    return arrange(panels, [4.0], right=0.75, title=title, legend=legend_of(panels))
-
-
-def _draw_poles(panel: Axes, k: int, name: str, thing: Thing) -> None:
-    colour = look_of(k, name)["color"]
-    if not isinstance(thing, Fit | Model):
-        poles, zeros = analysed(name, thing, "pzmap").poles, np.empty(0)
-    else:
-        plant = linear_model(thing.model if isinstance(thing, Fit) else thing)
-        poles, zeros = plant.poles, plant.zeros
-    poles = poles[np.isfinite(poles)]
-    size = 9.0 - k
-    style: Style = {"ls": "none", "color": colour, "ms": size, "mew": 1.8, "zorder": 3}
-    panel.plot(np.real(poles), np.imag(poles), _POLES[k], label=f"{name}, poles", **style)
-    if isinstance(thing, Fit):
-        reach = thing.pole_reach
-        panel.errorbar(
-            np.real(poles), np.imag(poles), np.imag(reach), np.real(reach), fmt="none",
-            ecolor=colour, elinewidth=1.0, capsize=2.5, label=f"{name}, 95 %",
-        )  # fmt: skip
-    if zeros.size:
-        label = f"{name}, zeros"
-        panel.plot(np.real(zeros), np.imag(zeros), _ZEROS[k], mfc="none", label=label, **style)
-
-
-def _damping_lines(panel: Axes) -> None:
     (left, right), (low, high) = panel.get_xlim(), panel.get_ylim()
     least = 0.1 * (right - left)  # else rounding of equal poles fills the picture
     low, high = min(low, -least), max(high, least)
@@ -91,6 +87,10 @@ def _damping_lines(panel: Axes) -> None:
         x, y = [-damping * reach, 0, -damping * reach], [root * reach, 0, -root * reach]
         panel.plot(x, y, color="0.88", lw=0.7, zorder=0)
     panel.set(xlim=(left, max(right, -0.05 * left)), ylim=(low, high))
+    panel.set(xlabel="real part, rad/s", ylabel="imaginary part, rad/s")
+    add_hertz(panel, "right", "imaginary part, Hz")
+    few_ticks(panel.xaxis, 6)
+    return arrange(panels, [4.0], right=0.75, title=title, legend=legend_of(panels))
 
 
 _FAR, _NEAR = 3.0, 0.3  # beyond and below which a curve does not set the limits by itself
@@ -101,7 +101,7 @@ def nyquist(
     *shown: Thing,
     pair: tuple[str, str] | None = None,
     omega: Float[ArrayLike, " frequencies"] | None = None,
-    ax: Given = None,
+    ax: AxesLike = None,
     title: str = "",
 ) -> Panels:
     """Draw responses in the complex plane, with -1 and the unit circle.
@@ -128,28 +128,42 @@ def nyquist(
     panels = stacked(1, ax)
     [panel] = panels
     sizes = []
-    for k, each in enumerate(measured):
-        good = np.asarray(each.frf.coherence)[:, o, i] >= 0.6
-        values = np.asarray(each.frf.response)[good, o, i]
-        reach = 1.96 * np.asarray(each.frf.random_error)[good, o, i]
+    for k, response in enumerate(measured):
+        frf = response.frf
+        good = np.asarray(frf.coherence)[:, o, i] >= COHERENT
+        values = np.asarray(frf.response)[good, o, i]
+        reach = 1.96 * np.asarray(frf.random_error)[good, o, i]
         _ellipses(panel, values, reach, reach, "0.6")
         mark: Style = {"ms": 3.5, "color": "0.15", "mfc": "0.15" if k == 0 else "none"}
-        panel.plot(np.real(values), np.imag(values), "o", label=each.name, **mark)
+        panel.plot(np.real(values), np.imag(values), "o", label=response.name, **mark)
         sizes.append(np.abs(values))
-    beside = measured[0].frf if measured else None
-    for k, each in enumerate(modelled):
-        values, look = response_beside(each, grid, beside)[:, o, i], look_of(k, each.name)
+    for k, entry in enumerate(modelled):
+        values = response_as_sampled(entry, grid, measured)[:, o, i]
+        look = look_of(k, entry.name)
         panel.plot(np.real(values), np.imag(values), **look)
         thin: Style = look | {"lw": 0.6, "label": "_nolegend_"}
         panel.plot(np.real(values), -np.imag(values), **thin)
         sizes.append(np.abs(values))
-        if each.fit is not None:
+        if entry.fit is not None:
             some = np.linspace(0, grid.size - 1, _ELLIPSES).astype(int)
-            band = each.fit.response_band(grid[some])
+            band = entry.fit.response_band(grid[some])
             size = band.decibels[:, o, i] * np.log(10) / 20
             turn = np.radians(band.degrees[:, o, i])
             _ellipses(panel, values[some], size, turn, look["color"])
-    _critical_point(panel, np.concatenate(sizes))
+    # Limits about 0, and -1 with the unit circle where the curve comes near.
+    finite = np.concatenate(sizes)
+    finite = finite[np.isfinite(finite)]
+    largest = float(np.max(finite, initial=_NEAR))
+    reach = 1.15 * (min(largest, _FAR) if np.min(finite, initial=1.0) < _FAR else largest)
+    if largest > _NEAR and reach <= 1.15 * _FAR:
+        reach = max(reach, 1.5)
+        angle = np.linspace(0, 2 * np.pi, 181)
+        panel.plot(np.cos(angle), np.sin(angle), ":", color="0.5", lw=0.8)
+        panel.plot(-1, 0, "+", color="black", ms=11, mew=1.8, zorder=4)
+    panel.axhline(0, color="0.6", lw=0.8, zorder=1)
+    panel.axvline(0, color="0.6", lw=0.8, zorder=1)
+    panel.set(xlim=(-reach, reach), ylim=(-reach, reach))
+    panel.set_aspect("equal")
     unit, name = channels.unit(o, i), channels.ratio(o, i)
     text = f"{name}{f', {unit}' if unit else ''}"
     panel.set(xlabel=f"real part{f' of {text}' if text else ''}")
@@ -173,19 +187,3 @@ def _ellipses(
         offset_transform=panel.transData, facecolor=colour, edgecolor="none", alpha=0.3, zorder=1,
     )  # fmt: skip
     panel.add_collection(drawn, autolim=False)
-
-
-def _critical_point(panel: Axes, sizes: Float[np.ndarray, " points"]) -> None:
-    """Limits about 0, and -1 with the unit circle where the curve comes near."""
-    known = sizes[np.isfinite(sizes)]
-    largest = float(np.max(known, initial=_NEAR))
-    reach = 1.15 * (min(largest, _FAR) if np.min(known, initial=1.0) < _FAR else largest)
-    if largest > _NEAR and reach <= 1.15 * _FAR:
-        reach = max(reach, 1.5)
-        angle = np.linspace(0, 2 * np.pi, 181)
-        panel.plot(np.cos(angle), np.sin(angle), ":", color="0.5", lw=0.8)
-        panel.plot(-1, 0, "+", color="black", ms=11, mew=1.8, zorder=4)
-    panel.axhline(0, color="0.6", lw=0.8, zorder=1)
-    panel.axvline(0, color="0.6", lw=0.8, zorder=1)
-    panel.set(xlim=(-reach, reach), ylim=(-reach, reach))
-    panel.set_aspect("equal")

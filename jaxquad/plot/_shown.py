@@ -3,7 +3,6 @@
 from collections.abc import Iterable, Mapping
 from typing import NamedTuple, Protocol, runtime_checkable
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, PyTree
 
@@ -23,14 +22,28 @@ _KINDS = (
 def named(shown: Iterable[Thing]) -> dict[str, Thing]:
     """All things by name. Those that come without one are called by what they are."""
     flat: list[tuple[str, Thing]] = []
-    for each in shown:
-        if isinstance(each, Mapping):
-            flat += [(str(name), thing) for name, thing in each.items()]
+    for thing in shown:
+        if isinstance(thing, Mapping):
+            flat += [(str(name), part) for name, part in thing.items()]
         else:
-            parts = each if isinstance(each, list | tuple) else [each]
-            flat += [("", thing) for thing in parts if thing is not None]
-    bases = [name or _kind(thing) for name, thing in flat]
-    return {_distinct(k, flat, bases): thing for k, (_, thing) in enumerate(flat)}
+            parts = thing if isinstance(thing, list | tuple) else [thing]
+            flat += [("", part) for part in parts if part is not None]
+    kinds = {"flown": Record | StepResponse, "fit": Fit, "model": Model}
+    unnamed = [
+        f"{thing.method} estimate"
+        if isinstance(thing, FrequencyResponse)
+        else next((kind for kind, types in kinds.items() if isinstance(thing, types)), "loop")
+        for name, thing in flat
+        if not name
+    ]
+    things, places = {}, iter(range(len(unnamed)))
+    for name, thing in flat:
+        if not name:
+            k = next(places)
+            name, count = unnamed[k], unnamed[: k + 1].count(unnamed[k])
+            name = name if unnamed.count(name) == 1 else f"{name} {count}"
+        things[name] = thing
+    return things
 
 
 def named_models(shown: Iterable[Thing] | Mapping[str, Thing], what: str) -> dict[str, Thing]:
@@ -42,27 +55,12 @@ def named_models(shown: Iterable[Thing] | Mapping[str, Thing], what: str) -> dic
     if not things:
         raise ValueError(f"{what} has nothing to draw: give a model, a fit of jq.fit or a jq.Loop")
     for name, thing in things.items():
-        if _is_measured(thing):
+        if isinstance(thing, FrequencyResponse | Record):
             raise ValueError(
                 f"{name} was measured, but {what} needs a model: fit one to it with jq.fit, and "
                 "give the fit"
             )
     return things
-
-
-def _distinct(k: int, flat: list[tuple[str, Thing]], bases: list[str]) -> str:
-    unnamed = [bases[m] for m, (name, _) in enumerate(flat) if not name]
-    if flat[k][0] or unnamed.count(bases[k]) == 1:
-        return bases[k]
-    place = sum(bases[m] == bases[k] and not flat[m][0] for m in range(k + 1))
-    return f"{bases[k]} {place}"
-
-
-def _kind(thing: Thing) -> str:
-    if isinstance(thing, FrequencyResponse):
-        return f"{thing.method} estimate"
-    kinds = {"flown": Record | StepResponse, "fit": Fit, "model": Model}
-    return next((name for name, kind in kinds.items() if isinstance(thing, kind)), "loop")
 
 
 class Measured(NamedTuple):
@@ -92,38 +90,28 @@ def measured_and_modelled(
     things = named(shown)
     if not things:
         raise ValueError(f"{what} has nothing to draw: give {_KINDS}")
-    measured = [Measured(name, _measured(x)) for name, x in things.items() if _is_measured(x)]
-    rest = {name: x for name, x in things.items() if not _is_measured(x)}
-    modelled = [each for name, x in rest.items() for each in _modelled(name, x, what)]
-    fits = [x for x in rest.values() if isinstance(x, Fit) and x.origin is not None]
-    for points in (points for fit in fits for points in _points(fit)):
+    measured, modelled, fits = [], [], []
+    for name, thing in things.items():
+        if isinstance(thing, FrequencyResponse | Record):
+            frf = frequency_response(thing) if isinstance(thing, Record) else thing
+            measured.append(Measured(name, frf))
+        elif isinstance(thing, Fit):
+            fits.append(thing)
+            modelled += [Modelled(name, thing.model, thing)] if thing.verdict.fitted else []
+        else:
+            model = thing if isinstance(thing, Model) else analysed(name, thing, what).loop
+            modelled.append(Modelled(name, model))
+    origins = [fit.origin for fit in fits if fit.origin is not None]
+    for points in (points for origin in origins for points in origin.points):
         if not measured:
             measured = [Measured(f"{points.frf.method} estimate", points.frf)]
-        mine = [each.frf is points.frf and each.used is None for each in measured]
         measured = [
-            each._replace(used=points.used) if own else each
-            for each, own in zip(measured, mine, strict=True)
+            response._replace(used=points.used)
+            if response.frf is points.frf and response.used is None
+            else response
+            for response in measured
         ]
     return measured, modelled
-
-
-def _points(fit: Fit):
-    return () if fit.origin is None else fit.origin.points
-
-
-def _is_measured(thing: Thing) -> bool:
-    return isinstance(thing, FrequencyResponse | Record)
-
-
-def _measured(thing: FrequencyResponse | Record) -> FrequencyResponse:
-    return frequency_response(thing) if isinstance(thing, Record) else thing
-
-
-def _modelled(name: str, thing: Thing, what: str) -> list[Modelled]:
-    if isinstance(thing, Fit):
-        return [Modelled(name, thing.model, thing)] if thing.verdict.fitted else []
-    model = thing if isinstance(thing, Model) else _broken_loop(name, thing, what)
-    return [Modelled(name, model)]
 
 
 def analysed(name: str, thing: Thing, what: str) -> PyTree:
@@ -133,19 +121,15 @@ def analysed(name: str, thing: Thing, what: str) -> PyTree:
     """
     from jaxquad.loops import analyse, Loop, LoopAnalysis  # here: most figures show no loop
 
-    found = analyse(thing, 0) if isinstance(thing, Loop) else thing
-    if not isinstance(found, LoopAnalysis):
+    analysis = analyse(thing, 0) if isinstance(thing, Loop) else thing
+    if not isinstance(analysis, LoopAnalysis):
         raise ValueError(f"{what} cannot draw a {type(thing).__name__}: give {_KINDS}")
-    if found.abscissa.ndim:
+    if analysis.abscissa.ndim:
         raise ValueError(
-            f"{name} is an ensemble of {found.abscissa.size} loops: give one of them to {what}, "
+            f"{name} is an ensemble of {analysis.abscissa.size} loops: give one of them to {what}, "
             "jq.analyse(loop, member=0)"
         )
-    return found
-
-
-def _broken_loop(name: str, thing: Thing, what: str) -> Model:
-    return analysed(name, thing, what).loop
+    return analysis
 
 
 @runtime_checkable
@@ -167,32 +151,31 @@ def frequencies_of(
     """Where models are drawn, in rad/s: as given, over what was measured, or about their poles."""
     if omega is not None:
         return np.atleast_1d(omega)
-    spans = [np.asarray(each.frf.omega)[[0, -1]] for each in measured]
-    spans = spans or [_span(each.model) for each in modelled]
+    spans = [np.asarray(response.frf.omega)[[0, -1]] for response in measured]
+    for model in () if measured else (entry.model for entry in modelled):
+        if isinstance(model, _IsSampled):
+            end = np.pi / model.dt
+            spans.append(np.array([1e-3 * end, 0.999 * end]))
+            continue
+        try:
+            plant = linear_model(model)
+            sizes = np.abs(np.concatenate([plant.poles, plant.zeros]))
+            sizes = sizes[(sizes > 1e-6) & np.isfinite(sizes)]
+        except ValueError:
+            sizes = np.empty(0)
+        low, high = _DECADES
+        if sizes.size:
+            low = np.floor(np.log10(sizes.min()) - 1 + 0.3)
+            high = np.ceil(np.log10(sizes.max()) + 1 - 0.3)
+        spans.append(np.array([10.0**low, 10.0**high]))
     return np.geomspace(min(x[0] for x in spans), max(x[1] for x in spans), _POINTS)
 
 
-def _span(model: Model) -> tuple[float, float]:
-    if isinstance(model, _IsSampled):
-        end = np.pi / model.dt
-        return 1e-3 * end, 0.999 * end
-    try:
-        plant = linear_model(model)
-    except ValueError:
-        return 10.0 ** _DECADES[0], 10.0 ** _DECADES[1]
-    sizes = np.abs(np.concatenate([plant.poles, plant.zeros]))
-    sizes = sizes[(sizes > 1e-6) & np.isfinite(sizes)]
-    if not sizes.size:
-        return 10.0 ** _DECADES[0], 10.0 ** _DECADES[1]
-    low, high = np.log10(sizes.min()) - 1, np.log10(sizes.max()) + 1
-    return float(10 ** np.floor(low + 0.3)), float(10 ** np.ceil(high - 0.3))
-
-
-def response_beside(
-    each: Modelled, omega: Float[np.ndarray, " frequencies"], beside: FrequencyResponse | None
+def response_as_sampled(
+    entry: Modelled, omega: Float[np.ndarray, " frequencies"], measured: list[Measured]
 ) -> np.ndarray:
-    """A model's response; beside a measured one as the record's samples show it."""
-    model = each.model if beside is None else as_sampled(each.model, beside)
+    """A model's response; where one was measured, as the samples of that record show it."""
+    model = as_sampled(entry.model, measured[0].frf) if measured else entry.model
     return model_response(model, omega)
 
 
@@ -203,7 +186,7 @@ class Channels(NamedTuple):
     inputs: tuple[str, ...]
     output_units: tuple[str, ...]
     input_units: tuple[str, ...]
-    known: bool  # names come from a record
+    are_named: bool  # by a record
 
     @classmethod
     def numbered(cls, outputs: int, inputs: int) -> "Channels":
@@ -225,18 +208,14 @@ class Channels(NamedTuple):
 
     def ratio(self, o: int, i: int) -> str:
         """`q / M`; nothing for a single pair without names."""
-        if not self.known and len(self.outputs) == len(self.inputs) == 1:
+        if not self.are_named and len(self.outputs) == len(self.inputs) == 1:
             return ""
         return f"{self.outputs[o]} / {self.inputs[i]}"
 
     def unit(self, o: int, i: int) -> str:
         """`rad/s per V`; nothing where a unit is unknown."""
-        return unit_pair(self.output_units[o], self.input_units[i])
-
-
-def unit_pair(output: str, source: str) -> str:
-    """`rad/s per V`; nothing where one of the two is unknown."""
-    return f"{output} per {source}" if output and source else ""
+        output, source = self.output_units[o], self.input_units[i]
+        return f"{output} per {source}" if output and source else ""
 
 
 def channels_shown(measured: list[Measured], modelled: list[Modelled]) -> Channels:
@@ -246,14 +225,10 @@ def channels_shown(measured: list[Measured], modelled: list[Modelled]) -> Channe
         units = frf.output_units or ("",) * len(frf.output_names)
         sources = frf.input_units or ("",) * len(frf.input_names)
         return Channels(frf.output_names, frf.input_names, units, sources, True)
-    shapes = {each.name: _shape(each) for each in modelled}
+    one = np.ones(1)
+    shapes = {entry.name: model_response(entry.model, one).shape[1:] for entry in modelled}
     if len(set(shapes.values())) > 1:
         raise ValueError(
             f"models of different channels (outputs, inputs): {shapes}; draw them one by one"
         )
     return Channels.numbered(*next(iter(shapes.values())))
-
-
-def _shape(each: Modelled) -> tuple[int, int]:
-    found = model_response(each.model, np.asarray(jnp.ones(1)))
-    return found.shape[1], found.shape[2]

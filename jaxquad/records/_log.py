@@ -142,6 +142,14 @@ def add_columns(
         columns[name] = values
 
 
+def number_in(cell: str) -> float:
+    """The number that a cell of a table holds, else NaN."""
+    try:
+        return float(cell)
+    except ValueError:
+        return float("nan")
+
+
 _LARGEST = 4 * 2**30  # bytes of decoded arrays
 _DENSEST = 250  # decoded bytes per byte of the file: real logs stay far below
 _HARMLESS = 64 * 2**20  # bytes that any file may hold

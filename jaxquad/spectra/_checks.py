@@ -15,7 +15,7 @@ _MOST_FREQUENCIES = 1024  # the covariance of a pair is made between all of them
 def in_hertz(omega: Float[np.ndarray, " frequencies"]) -> str:
     """The range of frequencies as messages give it: `2.3 to 619 rad/s (0.37 to 98.5 Hz)`."""
     ends = np.unique([np.min(omega), np.max(omega)])
-    rad, hertz = (" to ".join(f"{x:.3g}" for x in each) for each in (ends, ends / (2 * np.pi)))
+    rad, hertz = (" to ".join(f"{x:.3g}" for x in part) for part in (ends, ends / (2 * np.pi)))
     return f"{rad} rad/s ({hertz} Hz)"
 
 
@@ -95,7 +95,12 @@ def check_excitation(
     first = records[0]
     names = first.input_names + (first.reference_names if method == "joint" else ())
     # A few thousand samples show the size, and nearly always that a channel moves.
-    ends = [_ends(record, max(record.samples // 2048, 1)) for record in records]
+    ends = []
+    for record in records:
+        step = max(record.samples // 2048, 1)
+        groups = record.inputs, record.outputs, record.references
+        thin = np.concatenate([group[::step].T for group in groups])
+        ends.append((np.min(thin, axis=1), np.max(thin, axis=1)))
     for k in np.flatnonzero(np.all([low == high for low, high in ends], axis=0)):
         name = first.names[k]
         if name in names + first.output_names:
@@ -104,13 +109,6 @@ def check_excitation(
                     f"no excitation: {name!r} is constant. Check that it was excited and logged"
                 )
     return np.max([np.maximum(high, -low) for low, high in ends], axis=0)
-
-
-def _ends(record: Record, step: int) -> tuple[np.ndarray, np.ndarray]:
-    """The smallest and the largest of every so many samples, of each channel."""
-    groups = record.inputs, record.outputs, record.references
-    thin = np.concatenate([each[::step].T for each in groups])
-    return np.min(thin, axis=1), np.max(thin, axis=1)
 
 
 def check_band(omega: Float[np.ndarray, "..."] | None, dt: float) -> None:

@@ -1,4 +1,3 @@
-import functools as ft
 from collections.abc import Sequence
 
 import equinox as eqx
@@ -132,8 +131,7 @@ class Welch(eqx.Module):
 
         Below them, leakage through the window exceeds the random error of a good record.
         """
-        # By way of the class: a method bound to a module takes as long to make as a product.
-        length, dt = Welch.length(self, records), records[0].dt
+        length, dt = self.length(records), records[0].dt
         if length <= 30:
             raise ValueError(
                 Message(
@@ -142,12 +140,7 @@ class Welch(eqx.Module):
                     "frequencies (omega=)»"
                 )
             )
-        return _log_spaced(6 * np.pi / (length * dt), 2 * np.pi / (10 * dt)).copy()
-
-
-@ft.lru_cache(maxsize=16)
-def _log_spaced(low: float, high: float) -> Float[np.ndarray, " frequencies"]:
-    return np.geomspace(low, high, 100)
+        return np.geomspace(6 * np.pi / (length * dt), 2 * np.pi / (10 * dt), 100)
 
 
 _LENGTHS = 5
@@ -191,8 +184,7 @@ class Composite(eqx.Module):
     ) -> tuple[Welch, ...]:
         """One estimator for each window length, the longest first."""
         lengths = self.windows or self._lengths(records, omega)
-        make = self._welch
-        return tuple(make(length) for length in sorted(lengths, reverse=True))
+        return tuple(self._welch(length) for length in sorted(lengths, reverse=True))
 
     def _lengths(
         self, records: Sequence[Record], omega: Float[ArrayLike, " frequencies"] | None
@@ -205,13 +197,7 @@ class Composite(eqx.Module):
         return np.unique(np.geomspace(shortest, longest, _LENGTHS)).tolist()
 
     def _welch(self, length: float | None) -> Welch:
-        return _make_welch(
-            length, self.overlap, self.shape, self.detrend, self.integrators, self.delay
-        )
-
-
-# Making and checking a module takes as long as transforming one window length.
-_make_welch = ft.lru_cache(maxsize=64)(Welch)
+        return Welch(length, self.overlap, self.shape, self.detrend, self.integrators, self.delay)
 
 
 _DRIFT = 0.02  # samples by which the periods of a record may shift against its clock
@@ -246,9 +232,9 @@ class Periodic(eqx.Module):
     def samples(self, record: Record) -> int:
         """Samples in a period; `ValueError` unless this is a whole number."""
         exact = self.period / record.dt
-        whole = int(round(exact))
-        shift = abs(exact - whole) * record.samples / max(exact, 1.0)
-        if whole < 4 or shift > _DRIFT:
+        samples = int(round(exact))
+        shift = abs(exact - samples) * record.samples / max(exact, 1.0)
+        if samples < 4 or shift > _DRIFT:
             raise ValueError(
                 f"the period of {self.period:.8g} s is {exact:.8g} samples at "
                 f"{record.sample_rate:.6g} Hz, not a whole number of at least 4: over the record "
@@ -256,7 +242,7 @@ class Periodic(eqx.Module):
                 "period, or read the record with a sample rate at which it is a whole number of "
                 "samples"
             )
-        return whole
+        return samples
 
 
 class JointInputOutput(eqx.Module):

@@ -69,7 +69,7 @@ def fourier_sums(
         [np.empty((angle.size, taper.channels, len(s)), complex) for _, s in windows[taper.first :]]
         for taper in tapers
     ]
-    long = [each for each in windows if each[0] >= _SHORT]
+    long = [group for group in windows if group[0] >= _SHORT]
     blocks = _share_blocks(samples, angle, long) if long else None
     running = [_Channel(row, blocks, detrend) for row in rows] if blocks else []
     for number, (length, starts) in enumerate(windows):
@@ -186,12 +186,12 @@ class _Channel:
         padded[blocks.lead : blocks.lead + row.size] = row
         self.blocks = padded.reshape(blocks.count, blocks.size)
         functions = _block_functions(blocks.size, blocks.reach)
-        self.coefficients = [each.T @ self.blocks.T for each in functions]
+        self.coefficients = [function.T @ self.blocks.T for function in functions]
         still = _block_waves(blocks, 0.0)
         self.still = still.sums(self.coefficients) * still.phase
         time = np.arange(row.size) - row.size / 2
         moments = [row, row * time][: self.trends]
-        self.moments = [np.concatenate([[0.0], np.cumsum(each)]) for each in moments]
+        self.moments = [np.concatenate([[0.0], np.cumsum(part)]) for part in moments]
 
     def sum_windows(
         self,
@@ -219,19 +219,19 @@ class _Channel:
         self, start: Int[np.ndarray, " windows"], length: int, shift: float
     ) -> Complex[np.ndarray, "3 frequencies windows"]:
         """Sums without a taper: at all frequencies, at these less the shift, and more."""
-        still, shifted = (_block_waves(self.shared, each) for each in (0.0, shift))
+        still, shifted = (_block_waves(self.shared, d) for d in (0.0, shift))
         ends, back = np.unique(
             np.concatenate([start, start + length]) + self.shared.lead, return_inverse=True
         )
         place, beyond = np.divmod(ends, self.shared.size)
-        whole, again = np.unique(place, return_inverse=True)
-        used = slice(whole[0], whole[-1])
-        moving = shifted.sums([each[:, used] for each in self.coefficients])
+        blocks, again = np.unique(place, return_inverse=True)
+        used = slice(blocks[0], blocks[-1])
+        moving = shifted.sums([rows[:, used] for rows in self.coefficients])
         moving *= shifted.phase[:, used]
-        running = np.zeros((3 * len(still.even), whole.size), complex)
-        if whole.size > 1:
+        running = np.zeros((3 * len(still.even), blocks.size), complex)
+        if blocks.size > 1:
             sums = np.concatenate([self.still[:, used], moving])
-            sums = np.add.reduceat(sums, whole[:-1] - whole[0], axis=1)
+            sums = np.add.reduceat(sums, blocks[:-1] - blocks[0], axis=1)
             np.cumsum(sums, axis=1, out=running[:, 1:])
         running = running[:, again]
         part = np.flatnonzero(beyond)
@@ -239,8 +239,8 @@ class _Channel:
             inside = np.arange(self.shared.size) < beyond[part, None]
             samples = (self.blocks[place[part]] * inside).T
             functions = _block_functions(self.shared.size, self.shared.reach)
-            few = [each.T @ samples for each in functions]
-            rest = [each.sums(few) * each.phase[:, place[part]] for each in (still, shifted)]
+            few = [function.T @ samples for function in functions]
+            rest = [wave.sums(few) * wave.phase[:, place[part]] for wave in (still, shifted)]
             running[:, part] += np.concatenate(rest)
         running = running[:, back]
         plain = running[:, start.size :] - running[:, : start.size]
@@ -250,7 +250,7 @@ class _Channel:
         self, start: Int[np.ndarray, " windows"], length: int
     ) -> Float[np.ndarray, "trends windows"]:
         """Mean and slope of each window."""
-        parts = [each[start + length] - each[start] for each in self.moments]
+        parts = [part[start + length] - part[start] for part in self.moments]
         if self.trends > 1:
             middle = start + (length - 1) / 2 - (self.moments[0].size - 1) / 2
             parts[1] = (parts[1] - parts[0] * middle) * 12 / (length * (length**2 - 1.0))

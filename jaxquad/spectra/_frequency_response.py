@@ -1,5 +1,5 @@
 from collections.abc import Sequence
-from typing import Literal
+from typing import Literal, Protocol, runtime_checkable
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -11,7 +11,6 @@ from jaxquad._core import pytree_node, require_float64
 from ._checks import in_hertz
 from ._error_covariance import ErrorCovariance, independent_errors
 from ._remarks import points_dominated, Remark, remarks_on_used
-from ._table import HasFrequencyData, read_table
 
 
 class Distortion(eqx.Module):
@@ -53,6 +52,19 @@ class Distortion(eqx.Module):
             lines.append(f"  {name}: noise {noise:.1f} dB, nonlinear distortion {distortion}")
         return "\n".join(lines)
 
+
+@runtime_checkable
+class HasFrequencyData(Protocol):
+    """A `FrequencyResponseData` of python-control: outputs, inputs, frequencies."""
+
+    @property
+    def omega(self) -> np.ndarray: ...  # rad/s
+
+    @property
+    def frdata(self) -> np.ndarray: ...
+
+
+_LEAST = 1e-6  # random error: a response without any would count infinitely
 
 _METHODS = {
     "direct": "direct estimate (H1, unbiased in open loop; with feedback, name a reference)",
@@ -132,17 +144,19 @@ class FrequencyResponse:
 
         Source: Bendat and Piersol, "Random Data", 4th ed., Table 9.6.
         """
-        table = read_table(omega, response, coherence, random_error, averages)
-        variance = 2 * (table.random_error * np.abs(table.response)) ** 2
-        _, outputs, inputs = table.response.shape
+        grid, values, coherent, error = _read_table(
+            omega, response, coherence, random_error, averages
+        )
+        variance = 2 * (error * np.abs(values)) ** 2
+        _, outputs, inputs = values.shape
         return cls(
-            omega=jnp.asarray(table.omega),
-            response=jnp.asarray(table.response),
-            coherence=jnp.asarray(table.coherence),
-            random_error=jnp.asarray(table.random_error),
-            errors=independent_errors(table.omega, variance),
-            direct_coherence=jnp.asarray(table.coherence),
-            multiple_coherence=jnp.asarray(table.coherence.max(axis=2)),
+            omega=jnp.asarray(grid),
+            response=jnp.asarray(values),
+            coherence=jnp.asarray(coherent),
+            random_error=jnp.asarray(error),
+            errors=independent_errors(grid, variance),
+            direct_coherence=jnp.asarray(coherent),
+            multiple_coherence=jnp.asarray(coherent.max(axis=2)),
             method="direct",
             input_names=_names("input_names", input_names, "u", inputs),
             output_names=_names("output_names", output_names, "y", outputs),
@@ -213,3 +227,66 @@ def _names(kind: str, chosen: Sequence[str], letter: str, count: int) -> tuple[s
     if len(names) != count:
         raise ValueError(f"{kind} has {len(names)} names and the response {count} channels")
     return names
+
+
+def _read_table(
+    omega: Float[ArrayLike, " frequencies"] | HasFrequencyData,
+    response: Complex[ArrayLike, "frequencies ..."] | None,
+    coherence: Float[ArrayLike, "..."] | None,
+    random_error: Float[ArrayLike, "..."] | None,
+    averages: float | int,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Frequencies, response, coherence and random error of `FrequencyResponse.from_table`."""
+    if isinstance(omega, HasFrequencyData):
+        if response is not None:
+            raise ValueError("give a FrequencyResponseData alone, or omega and response")
+        omega, response = np.asarray(omega.omega), np.moveaxis(np.asarray(omega.frdata), -1, 0)
+    elif response is None:
+        raise ValueError("a table needs its response: give omega and as many complex numbers")
+    grid, values = np.asarray(omega, float), np.asarray(response, complex)
+    values = values[:, None, None] if values.ndim == 1 else values
+    if grid.ndim != 1 or values.ndim != 3 or len(values) != grid.size:
+        raise ValueError(
+            f"omega has the shape {grid.shape} and the response {np.shape(response)}: give one "
+            "row of frequencies, and as many complex numbers or (frequencies, outputs, inputs)"
+        )
+    if not (np.all(np.isfinite(grid)) and np.all(grid > 0) and np.all(np.diff(grid) > 0)):
+        raise ValueError("omega must be finite, above 0 and rising: sort the table, in rad/s")
+    if not np.all(np.isfinite(values)):
+        first = grid[int(np.argmin(np.isfinite(values).all(axis=(1, 2))))]
+        raise ValueError(f"the response is not finite at {first:.4g} rad/s: leave that row out")
+    if (coherence is None) == (random_error is None):
+        raise ValueError(
+            "a table needs its errors, one of two: coherence= with averages=, or random_error=, "
+            "the relative standard error of the magnitude (0.02 for 2 %)"
+        )
+    if not averages > 0:
+        raise ValueError(f"averages is {averages}: give how many windows were averaged, 1 or more")
+    if coherence is not None:
+        coherent = _like("coherence", coherence, values)
+        if not np.all((coherent > 0) & (coherent <= 1)):
+            ends = f"{coherent.min():.4g} to {coherent.max():.4g}"
+            raise ValueError(f"the coherence runs from {ends}: give numbers above 0, up to 1")
+        error = np.sqrt((1 - coherent) / (2 * averages * coherent))
+    else:
+        assert random_error is not None
+        error = _like("random_error", random_error, values)
+        if not np.all(error > 0):
+            raise ValueError(
+                f"the random error is {error.min():.4g} at its least: give it above 0, 0.02 for 2 %"
+            )
+        coherent = 1 / (1 + 2 * averages * error**2)
+    return grid, values, coherent, np.maximum(error, _LEAST)
+
+
+def _like(name: str, numbers: ArrayLike, values: np.ndarray) -> np.ndarray:
+    """A number, one for each frequency, or one for each pair, as all of a response."""
+    array = np.asarray(numbers, float)
+    array = array[:, None, None] if array.ndim == 1 else array
+    try:
+        return np.broadcast_to(array, values.shape).copy()
+    except ValueError:
+        raise ValueError(
+            f"{name} has the shape {np.shape(numbers)} and the response {values.shape}: give one "
+            "number, one for each frequency, or one for each number of the response"
+        ) from None

@@ -19,7 +19,7 @@ _Levels = Float[np.ndarray, "windows frequencies"]  # dB
 
 
 class SpectralLine(NamedTuple):
-    """The strongest narrow line of a channel, as `find_line` finds it.
+    """The strongest narrow line of a channel, as `find_line` returns it.
 
     **Attributes:**
 
@@ -58,7 +58,7 @@ def find_line(
 
     **Returns:** a `SpectralLine`; None where none stands 13 dB out of half of the windows.
     """
-    size = _window_size(record)
+    size = int(2 ** np.round(np.log2(np.clip(_SECONDS / record.dt, _SHORTEST, _LONGEST))))
     if size > record.samples:
         return None
     starts = np.arange(0, record.samples - size + 1, size // 2)
@@ -71,20 +71,21 @@ def find_line(
     stands = heights > _STANDS
     if np.mean(stands) < _OFTEN:
         return None
-    found = omega[bins[stands]]
-    low, middle, high = np.percentile(found, [5, 50, 95])
+    lines = omega[bins[stands]]
+    low, middle, high = np.percentile(lines, [5, 50, 95])
     follows = np.nan
     if over is not None:
-        follows = _rank_correlation(found, record.channel(over)[places].mean(axis=1)[stands])
+        levels = record.channel(over)[places].mean(axis=1)[stands]
+        follows = 0.0
+        if np.ptp(lines) and np.ptp(levels):  # Spearman's, without a correction for ties
+            ranks = [
+                np.argsort(np.argsort(x, kind="stable"), kind="stable") for x in (lines, levels)
+            ]
+            follows = float(np.asarray(np.corrcoef(ranks)).flat[1])
     return SpectralLine(
         float(middle), float(low), float(high), float(np.median(heights[stands])),
         float(np.mean(stands)), _harmonics(excess[stands], bins[stands]), float(follows),
     )  # fmt: skip
-
-
-def _window_size(record: Record) -> int:
-    wanted = np.clip(_SECONDS / record.dt, _SHORTEST, _LONGEST)
-    return int(2 ** np.round(np.log2(wanted)))
 
 
 def _excess(parts: Float[np.ndarray, "windows size"]) -> _Levels:
@@ -102,19 +103,11 @@ def _excess(parts: Float[np.ndarray, "windows size"]) -> _Levels:
 
 
 def _harmonics(excess: _Levels, bins: np.ndarray) -> tuple[int, ...]:
-    found, rows = [], np.arange(len(bins))
+    multiples, rows = [], np.arange(len(bins))
     for multiple in (2, 3, 4):
         near = multiple * bins[:, None] + np.arange(-multiple, multiple + 1)
         if np.median(near[:, -1]) >= excess.shape[1]:
             break
         level = excess[rows[:, None], np.minimum(near, excess.shape[1] - 1)].max(axis=1)
-        found += [multiple] if np.median(level) > _ALSO else []
-    return tuple(found)
-
-
-def _rank_correlation(a: Float[np.ndarray, " many"], b: Float[np.ndarray, " many"]) -> float:
-    """Spearman's, without a correction for ties."""
-    if np.ptp(a) == 0 or np.ptp(b) == 0:
-        return 0.0
-    ranks = [np.argsort(np.argsort(each, kind="stable"), kind="stable") for each in (a, b)]
-    return float(np.asarray(np.corrcoef(ranks)).flat[1])
+        multiples += [multiple] if np.median(level) > _ALSO else []
+    return tuple(multiples)

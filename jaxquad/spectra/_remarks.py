@@ -63,31 +63,31 @@ class Remarks(Sequence[Remark]):
         self._find = find
 
     @ft.cached_property
-    def _found(self) -> tuple[Remark, ...]:
-        found = self._find()
+    def _remarks(self) -> tuple[Remark, ...]:
+        remarks = self._find()
         del self._find  # and with it the records
-        return found
+        return remarks
 
     def __len__(self) -> int:
-        return len(self._found)
+        return len(self._remarks)
 
     def __getitem__(self, place):
-        return self._found[place]
+        return self._remarks[place]
 
     def __iter__(self) -> Iterator[Remark]:
-        return iter(self._found)
+        return iter(self._remarks)
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, tuple | Remarks) and self._found == tuple(other)
+        return isinstance(other, tuple | Remarks) and self._remarks == tuple(other)
 
     def __hash__(self) -> int:
-        return hash(self._found)
+        return hash(self._remarks)
 
     def __repr__(self) -> str:
-        return repr(self._found)
+        return repr(self._remarks)
 
     def __reduce__(self) -> tuple[type[tuple], tuple[tuple[Remark, ...]]]:
-        return tuple, (self._found,)
+        return tuple, (self._remarks,)
 
 
 def _place(omega: tuple[float, ...]) -> str:
@@ -121,12 +121,12 @@ def points_dominated(
     inputs: Sequence[str],
 ) -> Bool[np.ndarray, "frequencies outputs inputs"]:
     """Points that remarks name as dominated by feedback."""
-    found = np.zeros((omega.size, len(outputs), len(inputs)), bool)
+    dominated = np.zeros((omega.size, len(outputs), len(inputs)), bool)
     for remark in remarks:
         if remark.kind != DOMINATED:
             continue
         here = np.isin(omega, remark.omega)
         pairs = [remark.pair] if remark.pair else itertools.product(outputs, inputs)
         for output, source in pairs:
-            found[here, outputs.index(output), inputs.index(source)] = True
-    return found
+            dominated[here, outputs.index(output), inputs.index(source)] = True
+    return dominated

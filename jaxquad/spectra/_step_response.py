@@ -9,7 +9,7 @@ from jaxquad._core import Message
 from jaxquad.records import Record
 
 
-_WHOLE = 4  # lengths of the response in a window: what precedes a window then hardly reaches in
+_LENGTHS = 4  # lengths of the response in a window: what precedes a window then hardly reaches in
 _WINDOWS = 12  # that a record is cut into, at least, for the default length
 _LONGEST = 3.0  # s, of the default length
 _FEWEST = 5  # windows, with which coherence says something
@@ -29,7 +29,7 @@ _Spectra = Complex[np.ndarray, "windows frequencies"]
 
 
 class StepResponse(NamedTuple):
-    """What an output does after a step of 1 in a reference, as `estimate_step` finds it.
+    """What an output does after a step of 1 in a reference, as `estimate_step` estimates it.
 
     **Attributes:**
 
@@ -115,7 +115,7 @@ class StepResponse(NamedTuple):
         return self.rise_time > _RESOLVED * self.blur
 
     @property
-    def is_told(self) -> bool:
+    def is_conclusive(self) -> bool:
         """Whether the data suffice."""
         return not self.doubts
 
@@ -169,32 +169,6 @@ def estimate_step(
 
     **Raises:** ValueError for a record without a reference, or too short for the length.
     """
-    names = _names(record, reference, output)
-    length, dt = default_length(record) if length is None else float(length), record.dt
-    size = _window_size(record, length)
-    moves = _moves(record.channel(names[0]), size, _RESTS)[:, None]
-    source, answer = (_spectra(record.channel(name), size) * moves for name in names)
-    noise = _noise_over_response(source, answer)
-    power = np.sum(np.abs(source) ** 2, axis=0)
-    bottom = np.maximum(power + noise, 1e-300)
-    answers = [answer]
-    if simulated is not None:
-        measured = record.channel(names[1])
-        answers.append(_simulated_spectra(measured, simulated, size, drift) * moves)
-    transfers = [np.sum(np.conj(source) * each, axis=0) / bottom for each in answers]
-    time, steps = _integrate(np.stack([power / bottom + 0j, *transfers]), size, dt, length)
-    errors = [_errors(source, *each, bottom) for each in zip(answers, transfers, strict=True)]
-    scatter = [_scatter(_integrate(each, size, dt, length)[1]) for each in errors]
-    single = np.conj(source) * answer / np.maximum(np.abs(source) ** 2 + noise, 1e-300)
-    active = _moves(record.channel(names[0]), size, _ACTIVE)
-    _, windows = _integrate(single[active], size, dt, length)
-    found = StepResponse(time, steps[1], scatter[0], windows, steps[0], len(source), names)
-    if simulated is None:
-        return found
-    return found._replace(simulated=steps[2], simulated_error=scatter[1])
-
-
-def _names(record: Record, reference: str | None, output: str | None) -> tuple[str, str]:
     if reference is None and not record.reference_names:
         raise ValueError(
             Message(
@@ -202,46 +176,60 @@ def _names(record: Record, reference: str | None, output: str | None) -> tuple[s
                 "channel, «reference=»"
             )
         )
-    return reference or record.reference_names[0], output or record.output_names[0]
-
-
-def _window_size(record: Record, length: float) -> int:
-    size = int(round(_WHOLE * length / record.dt))
+    names = reference or record.reference_names[0], output or record.output_names[0]
+    length, dt = default_length(record) if length is None else float(length), record.dt
+    size = int(round(_LENGTHS * length / dt))
     if size < 32 or size > record.samples:
         raise ValueError(
-            f"windows of {_WHOLE} times {length:.3g} s do not fit a record of "
+            f"windows of {_LENGTHS} times {length:.3g} s do not fit a record of "
             f"{record.duration:.4g} s at {record.sample_rate:.4g} Hz: choose another length"
         )
-    return size
+    moves = _moves(record.channel(names[0]), size, _RESTS)[:, None]
+    taper = np.sin(np.pi * (np.arange(size) + 0.5) / size) ** 2
+    source, answer = (
+        np.fft.rfft(taper * _windows(record.channel(name), size), axis=1) * moves for name in names
+    )
+    noise = _noise_over_response(source, answer)
+    power = np.sum(np.abs(source) ** 2, axis=0)
+    bottom = np.maximum(power + noise, 1e-300)
+    answers = [answer]
+    if simulated is not None:
+        windows = _windows(simulated, size)
+        if drift >= 0:  # less the polynomial by which it leaves the output in each window
+            away = windows - _windows(record.channel(names[1]), size)
+            basis = np.linalg.qr(np.vander(np.linspace(-1, 1, size), drift + 1))[0]
+            windows = windows - away @ basis @ basis.T
+        answers.append(np.fft.rfft(taper * windows, axis=1) * moves)
+    transfers = [np.sum(np.conj(source) * one, axis=0) / bottom for one in answers]
+    time, steps = _integrate(np.stack([power / bottom + 0j, *transfers]), size, dt, length)
+    # What each window's rest adds to the transfer function: the infinitesimal jackknife.
+    near = _smooth(np.abs(source) ** 2)
+    leverage = np.minimum(near / np.maximum(np.sum(near, axis=0), 1e-300), 0.9)
+    scatter = []
+    for one, transfer in zip(answers, transfers, strict=True):
+        error = np.conj(source) * (one - transfer * source) / bottom / (1 - leverage)
+        _, added = _integrate(error, size, dt, length)
+        # Windows that overlap share half of their samples.
+        alone, shared = np.sum(added**2, axis=0), np.sum(added[1:] * added[:-1], axis=0)
+        scatter.append(np.sqrt(alone + np.maximum(2 * shared, 0.0)))
+    single = np.conj(source) * answer / np.maximum(np.abs(source) ** 2 + noise, 1e-300)
+    active = _moves(record.channel(names[0]), size, _ACTIVE)
+    _, windows = _integrate(single[active], size, dt, length)
+    response = StepResponse(time, steps[1], scatter[0], windows, steps[0], len(source), names)
+    if simulated is None:
+        return response
+    return response._replace(simulated=steps[2], simulated_error=scatter[1])
 
 
 def default_length(record: Record) -> float:
     """Length in s of the response that `estimate_step` looks for."""
-    return min(_LONGEST, 2 * record.duration / ((_WINDOWS + 1) * _WHOLE))
+    return min(_LONGEST, 2 * record.duration / ((_WINDOWS + 1) * _LENGTHS))
 
 
 def _windows(values: Samples, size: int) -> Float[np.ndarray, "windows size"]:
     """Windows that overlap by half, of the channel less its mean."""
     starts = np.arange(0, values.size - size + 1, size // 2)
     return (values - values.mean())[starts[:, None] + np.arange(size)]
-
-
-def _spectra(values: Samples, size: int) -> _Spectra:
-    return np.fft.rfft(_taper(size) * _windows(values, size), axis=1)
-
-
-def _simulated_spectra(output: Samples, simulated: Samples, size: int, drift: int) -> _Spectra:
-    """Those of a simulation, less the polynomial by which it leaves the output in each window."""
-    both = _windows(output, size), _windows(simulated, size)
-    if drift < 0:
-        return np.fft.rfft(_taper(size) * both[1], axis=1)
-    away = both[1] - both[0]
-    basis = np.linalg.qr(np.vander(np.linspace(-1, 1, size), drift + 1))[0]
-    return np.fft.rfft(_taper(size) * (both[1] - away @ basis @ basis.T), axis=1)
-
-
-def _taper(size: int) -> Float[np.ndarray, " size"]:
-    return np.sin(np.pi * (np.arange(size) + 0.5) / size) ** 2
 
 
 def _moves(values: Samples, size: int, share: float) -> Bool[np.ndarray, " windows"]:
@@ -265,38 +253,20 @@ def _above_rounding(power: Float[np.ndarray, " frequencies"]) -> Float[np.ndarra
 
 def _noise_over_response(source: _Spectra, answer: _Spectra) -> Float[np.ndarray, " frequencies"]:
     """The power of noise over that of the response, in units of the reference's power."""
-    each, whole = np.abs(source) ** 2, np.sum(np.abs(answer) ** 2, axis=0)
+    powers, total = np.abs(source) ** 2, np.sum(np.abs(answer) ** 2, axis=0)
     cross = np.sum(np.conj(source) * answer, axis=0)
     near_cross = _smooth(cross.real) + 1j * _smooth(cross.imag)
-    near_power, near_whole = _above_rounding(np.sum(each, axis=0)), _above_rounding(whole)
-    coherence = np.abs(near_cross) ** 2 / (near_power * near_whole)
+    near_power, near_total = _above_rounding(np.sum(powers, axis=0)), _above_rounding(total)
+    coherence = np.abs(near_cross) ** 2 / (near_power * near_total)
     # Windows and neighbours that count: one that holds all the power makes any pair coherent.
     # Neighbours of a tapered spectrum are half as many as they seem.
     most = _WIDTH * len(source)  # by Cauchy and Schwarz: rounding may make it more
-    fourth = np.maximum(_smooth(np.sum(each**2, axis=0)), near_power**2 / most)
+    fourth = np.maximum(_smooth(np.sum(powers**2, axis=0)), near_power**2 / most)
     count = np.maximum(near_power**2 / fourth / 2, 1.0)
-    known = np.clip((count * coherence - 1) / np.maximum(count - 1, 1e-3), 1e-9, 1.0)
-    known[coherence < 1 - _CHANCE ** (1 / np.maximum(count - 1, 1e-3))] = 1e-9
-    noise = near_power * (1 - known) / (known * count) + _LEAKED * np.max(near_power)
+    unbiased = np.clip((count * coherence - 1) / np.maximum(count - 1, 1e-3), 1e-9, 1.0)
+    unbiased[coherence < 1 - _CHANCE ** (1 / np.maximum(count - 1, 1e-3))] = 1e-9
+    noise = near_power * (1 - unbiased) / (unbiased * count) + _LEAKED * np.max(near_power)
     return noise / _WIDTH
-
-
-def _errors(
-    source: _Spectra,
-    answer: _Spectra,
-    transfer: Complex[np.ndarray, " frequencies"],
-    bottom: Float[np.ndarray, " frequencies"],
-) -> _Spectra:
-    """What each window's rest adds to the transfer function: the infinitesimal jackknife."""
-    near = _smooth(np.abs(source) ** 2)
-    leverage = np.minimum(near / np.maximum(np.sum(near, axis=0), 1e-300), 0.9)
-    return np.conj(source) * (answer - transfer * source) / bottom / (1 - leverage)
-
-
-def _scatter(steps: Float[np.ndarray, "windows samples"]) -> Samples:
-    """Standard error of the sum; windows that overlap share half of their samples."""
-    own, shared = np.sum(steps**2, axis=0), np.sum(steps[1:] * steps[:-1], axis=0)
-    return np.sqrt(own + np.maximum(2 * shared, 0.0))
 
 
 def _integrate(

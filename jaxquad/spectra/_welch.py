@@ -21,8 +21,8 @@ from ._estimators import Composite, Welch
 from ._feedback import remarks_on_feedback
 from ._fourier_sums import fourier_sums, Taper
 from ._frequency_response import FrequencyResponse
-from ._invariance import remarks_on_linearity
 from ._leakage import cross_products, shows_leakage, Slopes
+from ._linearity import remarks_on_linearity
 from ._noise import covariance_of_windows, smoothed
 from ._remarks import Remark, Remarks
 from ._windows import coefficients, lattice_windows, Layout, segment_starts
@@ -80,14 +80,14 @@ def transform_records(
             mine += [origin + start for start in local]
         origin += record.samples + max(length for length, _ in layout)
     groups = tuple((n, tuple(mine)) for (n, _), mine in zip(layouts[0], starts, strict=True))
-    # By taper and by length, the windows of all records side by side, as neighbours in memory.
+
+    def side_by_side(part: Sequence[np.ndarray]) -> np.ndarray:
+        """The windows of all records, as neighbours in memory."""
+        rows = [np.swapaxes(x, 1, 2) for x in part]
+        return np.swapaxes(rows[0] if len(rows) == 1 else np.concatenate(rows, axis=2), 1, 2)
+
     joined, *slopes = (
-        tuple(
-            np.swapaxes(np.concatenate([np.swapaxes(x, 1, 2) for x in part], axis=2), 1, 2)
-            if len(part) > 1
-            else part[0]
-            for part in zip(*lengths, strict=True)
-        )
+        tuple(side_by_side(part) for part in zip(*lengths, strict=True))
         for lengths in zip(*parts, strict=True)
     )
     none = Slopes(np.zeros((0, 0, 0), complex), np.zeros((0, 0, 0), complex))
@@ -101,8 +101,7 @@ def _layouts(records: Sequence[Record], omega: Grid, members: Sequence[Welch]) -
     A single window keeps its length to the sample; several take lengths that share blocks of
     samples, because their exact lengths do not matter.
     """
-    # By way of the class: a method bound to a module takes as long to make as a product.
-    lengths = tuple(Welch.length(member, records) for member in members)
+    lengths = tuple(member.length(records) for member in members)
     samples = [record.samples - members[0].integrators for record in records]
     overlap = members[0].overlap
     if len(members) == 1:
@@ -121,7 +120,7 @@ def _transform_record(
     tapers: tuple[Taper, ...],
 ) -> list[list[Complex[np.ndarray, "frequencies _ _"]]]:
     """By taper and then by length; the outputs differenced, and earlier by the delay."""
-    n, late = welch.integrators, Welch.delay_samples(welch, record)
+    n, late = welch.integrators, welch.delay_samples(record)
     outputs = np.diff(record.outputs, n, axis=0)
     if late:
         outputs = np.concatenate([outputs[late:], np.repeat(outputs[-1:], late, axis=0)])
@@ -147,10 +146,10 @@ def frequencies_for(
 ) -> Grid:
     """`omega` or the default of `welch`, rad/s; `ValueError` where the window is too short."""
     if omega is None:
-        return Welch.default_omega(welch, records)
+        return welch.default_omega(records)
     omega = np.atleast_1d(np.asarray(omega, dtype=float))
     check_band(omega, records[0].dt)
-    seconds = Welch.length(welch, records) * records[0].dt
+    seconds = welch.length(records) * records[0].dt
     lowest = 2 * np.pi / seconds
     if omega[0] < 0.999 * lowest:
         raise ValueError(
@@ -183,7 +182,7 @@ def _check_windows(
     power = np.concatenate([power[:first], power[last : last + channels.instruments]])
     names = records[0].input_names + records[0].reference_names[: channels.instruments]
     largest = check_excitation(records, "joint" if channels.instruments else "direct")
-    gain = coefficients(welch.shape)[0] * Welch.length(welch, records)
+    gain = coefficients(welch.shape)[0] * welch.length(records)
     for name, level in zip(names, np.sqrt(power), strict=False):
         lost = np.flatnonzero(~(level > _ROUNDING * gain * largest[records[0].names.index(name)]))
         if lost.size:
@@ -199,7 +198,7 @@ def average_windows(
 ) -> FrequencyResponse:
     """Response by averages over tapered windows of one or several lengths."""
     single = isinstance(spectra, Welch)
-    members = (spectra,) if single else Composite.windowed(spectra, records, omega)
+    members = (spectra,) if single else spectra.windowed(records, omega)
     omega, welch = frequencies_for(omega, records, members[0]), members[0]
     segments = transform_records(records, omega, members, derivatives=2)
     first, dt, groups = records[0], records[0].dt, segments.groups

@@ -6,7 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxquad._compile._scan import in_chunks, most_at_once, scan_in_blocks
+from jaxquad._compile import in_chunks, most_at_once
+from jaxquad._compile._scan import scan_in_blocks
 from jaxquad.control import LADRC
 from jaxquad.loops import Loop, per_member
 from jaxquad.models import DecoupledAxes, sincos

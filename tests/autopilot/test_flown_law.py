@@ -10,21 +10,27 @@ from scipy.signal import lfilter
 from sweep_logs import write_sweep
 
 from jaxquad._core import Message
-from jaxquad.autopilot import Butterworth, FilterChain, loop_of_law, Notch, PT1
-from jaxquad.autopilot._flight_channels import FlightChannels
-from jaxquad.autopilot._flown_law import best_filters, FlownLaw, StoredFilters
+from jaxquad.autopilot import (
+    best_filters,
+    Butterworth,
+    FilterChain,
+    FlightChannels,
+    FlownLaw,
+    loop_of_law,
+    Notch,
+    PT1,
+    StoredFilters,
+)
 from jaxquad.cli import main
 from jaxquad.workflows import (
     identify,
     identify_again,
     IdentifySettings,
     load_result,
-    open_logs,
     tune,
     TuneSettings,
     verify_result,
 )
-from jaxquad.workflows._identify import identify_fit
 
 
 CHAIN = FilterChain((Butterworth(20.0), PT1(60.0)), 400.0)
@@ -117,9 +123,7 @@ def test_betaflights_page_has_a_step_and_the_margins_of_its_law(log, tmp_path, n
 def test_a_loop_of_ones_own_is_tuned_behind_the_filters(tmp_path):
     path = write_sweep(tmp_path / "sweep.csv")
     asked = IdentifySettings(input="M=right-left", output="q", units={"q": "rad/s"}, band=(0.5, 6))
-    opened = open_logs(path, asked)
-    assert identify_fit(opened).settings.keep_gyro_filters
-    found = dataclasses.replace(identify_fit(opened), settings=opened.settings)
+    found = identify(path, asked)
     ahead = dataclasses.replace(found, flown=FlownLaw((CHAIN,), "as the parameters say"))
     assert ahead.filters and not found.filters
     with pytest.raises(ValueError, match="keep_gyro_filters=True"):

@@ -49,6 +49,6 @@ def test_a_term_that_messages_use_is_defined(found, word):
 
 def test_a_warning_is_printed_once_however_often_a_log_is_read(capsys):
     show = printer_of_warnings()
-    for text in ("gaps filled («max_gap=»).", "another", "gaps filled (max_gap=)."):
+    for text in ("gaps filled («max_gap=»).", "another", "gaps filled («max_gap=»)."):
         show(RecordWarning(text), RecordWarning, "a.py", 1)
     assert capsys.readouterr().err == "! gaps filled (--max-gap).\n! another\n"

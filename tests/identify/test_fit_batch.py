@@ -1,3 +1,5 @@
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -9,10 +11,8 @@ from synthetic import response_of
 
 import jaxquad as jq
 from jaxquad._compile import evaluate_once
-from jaxquad.identify import select_parameters
+from jaxquad.identify import make_problem, residuals, select_parameters
 from jaxquad.identify.batch._fit_batch import solve_batch
-from jaxquad.identify.frequency_domain._condition import UNCHANGED
-from jaxquad.identify.frequency_domain._problem import Problem, residuals
 
 
 OMEGA = jnp.asarray(np.geomspace(0.6, 40.0, 30))
@@ -42,19 +42,9 @@ def solved(responses, weights=WEIGHTS, **options):
 
 def one_by_one(response, weights):
     """Optimistix' own Levenberg-Marquardt on one member."""
-    problem = Problem(
-        model=START,
-        parameters=select_parameters(START, FREE),
-        conditions=(UNCHANGED,),
-        quantities=(),
-        omega=(OMEGA,),
-        measured=(response,),
-        weights=(weights,),
-        prior=jnp.zeros((0, 2)),
-        aliases=(None,),
-        silent=((),),
-        mixings=(None,),
-    )
+    frf = response_of(START, omega=np.asarray(OMEGA))
+    frf = dataclasses.replace(frf, response=response)
+    problem = make_problem(START, select_parameters(START, FREE), [frf]).weighted([weights])
     solver = optx.LevenbergMarquardt(rtol=1e-12, atol=1e-12)
     z0 = jnp.asarray(problem.parameters.start[:4])
     found = optx.least_squares(residuals, solver, z0, args=problem, max_steps=256)

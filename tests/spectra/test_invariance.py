@@ -6,7 +6,7 @@ from scipy import signal
 
 from jaxquad.records import Record
 from jaxquad.spectra import frequency_response, JointInputOutput, LocalPolynomial, Welch
-from jaxquad.spectra._invariance import _log_slope, period_of
+from jaxquad.spectra._linearity import log_slope, period_of
 
 
 DT, SAMPLES = 0.02, 2000
@@ -152,5 +152,5 @@ def test_an_excitation_that_repeats_is_told_its_period():
 
 def test_points_far_apart_have_no_slope():
     omega = np.array([1.0, 10.0, 10.5, 11.0, 100.0])
-    slope = _log_slope(omega, 5.0 / (1j * omega))
+    slope = log_slope(omega, 5.0 / (1j * omega))
     np.testing.assert_allclose(slope, [0.0, -1.0, -1.0, -1.0, 0.0], atol=1e-6)

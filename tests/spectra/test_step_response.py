@@ -41,7 +41,7 @@ def exact_at(found):
 
 def test_the_step_of_a_known_loop_is_found_within_two_per_cent_of_a_quiet_log():
     found = estimate_step(flown(noise=0.002))
-    assert found.is_told and found.is_resolved
+    assert found.is_conclusive and found.is_resolved
     assert np.max(np.abs(found.mean - exact_at(found))) < 0.02
     truth = found._replace(mean=exact_at(found))
     assert found.rise_time == pytest.approx(truth.rise_time, rel=0.05)
@@ -80,7 +80,7 @@ def one_step(_, samples):
 )
 def test_a_log_that_cannot_tell_the_step_says_so(reference, noise, why):
     found = estimate_step(flown(reference=reference, noise=noise))
-    assert not found.is_told and any(why in text for text in found.doubts)
+    assert not found.is_conclusive and any(why in text for text in found.doubts)
     assert "this log cannot tell it" in str(found)
 
 
@@ -99,7 +99,7 @@ def test_a_log_that_was_resampled_far_above_its_own_rate_has_the_same_step():
     r, y = (resample_poly(record.channel(name), 10, 1) for name in ("r", "y"))
     time = DT / 10 * np.arange(r.size)
     found = estimate_step(jq.Record(time, r, y, r, input_names="u", output_names="y"))
-    assert found.is_told
+    assert found.is_conclusive
     assert np.max(np.abs(found.mean - exact_at(found))) < 0.02
 
 
@@ -116,7 +116,7 @@ def rests(seconds, reference=stick):
 def test_a_rest_on_the_ground_before_and_behind_the_flight_changes_nothing():
     flight = estimate_step(flown(noise=0.002, seconds=60.0), length=2.0)
     longer = estimate_step(flown(noise=0.002, seconds=100.0, reference=rests(20.0)), length=2.0)
-    assert longer.is_told and len(longer.windows) < longer.total
+    assert longer.is_conclusive and len(longer.windows) < longer.total
     assert np.max(np.abs(longer.mean - exact_at(longer))) < 0.02
     assert np.max(longer.standard_error) < 2 * np.max(flight.standard_error)
 

@@ -36,11 +36,11 @@ from ..frequency_domain._cost import (
     usable,
 )
 from ..frequency_domain._fit import check_options
-from ..frequency_domain._held import held, hold_of
 from ..frequency_domain._mixing import Mixing, mixings_of
 from ..frequency_domain._parameters import Free, Numbers, Parameters, select_parameters, Tie
 from ..frequency_domain._problem import make_problem
 from ..frequency_domain._result import Fit
+from ..frequency_domain._sampled import behind_hold, hold_of
 from ..frequency_domain._solve import solution_at, stopped_early
 from ..uncertainty._assess import assess
 from ..uncertainty._error_budget import weighting_at
@@ -373,7 +373,7 @@ def fit_batch(
 @eqx.filter_jit
 def _sizes(where, z) -> Float[Array, "batch frequencies outputs inputs"]:
     def one(z):
-        model = held(where.parameters.insert(where.model, z), where.hold)
+        model = behind_hold(where.parameters.insert(where.model, z), where.hold)
         return jnp.abs(evaluate_response(model, where.omega))
 
     return jax.vmap(one)(z)

@@ -1,6 +1,7 @@
 """Costs: weights on the logarithm of the ratio of model to measurement."""
 
 import functools as ft
+import itertools
 from collections.abc import Mapping, Sequence
 from typing import Protocol, runtime_checkable
 
@@ -16,6 +17,9 @@ _COHERENT, _POOR = 0.6, 0.05  # least coherence: in general, and beside coherent
 _ENOUGH = 5  # coherent points beside which poor ones count
 _LARGEST = 0.3  # random error of a point that counts
 _DB = 20 / np.log(10)  # dB to a unit of natural logarithm
+_DECADE = 10.0
+_PRECISE = 0.1  # random error that noise alone does not reach
+_ALONE = 1.02  # sum of |rho|^2 below which all points of a pair count as independent
 _W_g, _W_p = 1.0, 0.01745  # so that 1 dB weighs as much as 7.57 deg
 
 Mask = Bool[np.ndarray, "frequencies outputs inputs"]
@@ -124,16 +128,16 @@ class MaximumLikelihood:
         return np.stack([root, root], axis=-1)
 
 
-def least_coherence(given: float | None, cost: Cost, frf: FrequencyResponse) -> float:
-    """The least coherence of a point that counts: as `given`, or what is best for the cost.
+def least_coherence(wanted: float | None, cost: Cost, frf: FrequencyResponse) -> float:
+    """The least coherence of a point that counts: as `wanted`, or what is best for the cost.
 
     A cost that knows the noise weighs poor points as they deserve; others have to do without them.
     So has the joint estimate, a ratio, whose error is no longer small where coherence is; and so
     have the direct estimate of a closed loop and a response that is coherent nowhere: what little
     they show may be noise that is fed back.
     """
-    if given is not None:
-        return given
+    if wanted is not None:
+        return wanted
     if not (isinstance(cost, MaximumLikelihood) and frf.method == "direct" and not frf.fed_back):
         return _COHERENT
     return _POOR if np.count_nonzero(usable(frf, None, _COHERENT)) >= _ENOUGH else _COHERENT
@@ -158,10 +162,45 @@ def usable(frf: FrequencyResponse, band: Band, least: float) -> Mask:
     error, averaged likewise, is below 30 %.
     """
     omega, error = np.asarray(frf.omega), np.asarray(frf.random_error)
-    known = np.isfinite(np.asarray(frf.response)) & np.isfinite(error)
-    coherent = _local_mean(omega, np.asarray(frf.coherence)) >= least
-    sharp = _local_mean(omega, np.fmin(error, 1.0)) <= _LARGEST
-    return known & coherent & sharp & _in_band(frf, band)
+    kernel = _third_of_an_octave(omega.tobytes())
+    mean = lambda values: (kernel @ values.reshape(len(values), -1)).reshape(values.shape)
+    finite = np.isfinite(np.asarray(frf.response)) & np.isfinite(error)
+    coherent = mean(np.asarray(frf.coherence)) >= least
+    sharp = mean(np.fmin(error, 1.0)) <= _LARGEST
+
+    def within(limits: Range | None) -> Bool[np.ndarray, " frequencies"]:
+        low, high = limits or (0.0, np.inf)
+        inside = (omega >= low) & (omega <= high)
+        if not low < high or not np.any(inside):
+            raise ValueError(
+                f"band {limits} rad/s holds none of the response's frequencies, which run from "
+                f"{omega[0]:.4g} to {omega[-1]:.4g} rad/s"
+            )
+        return inside
+
+    if not isinstance(band, Mapping):
+        return finite & coherent & sharp & within(band)[:, None, None]
+    inside, names = np.ones(error.shape, dtype=bool), (frf.output_names, frf.input_names)
+    pairs = list(itertools.product(*names))
+    for pair, limits in band.items():
+        if pair not in pairs:
+            raise ValueError(
+                f"no response pair {pair!r} for a band: (output, input) is one of {pairs}"
+            )
+        o, i = (side.index(name) for side, name in zip(names, pair, strict=True))
+        inside[:, o, i] = limits is not None and within(limits)
+    return finite & coherent & sharp & inside
+
+
+@ft.lru_cache(maxsize=16)
+def _third_of_an_octave(omega: bytes) -> Float[np.ndarray, "frequencies frequencies"]:
+    """Weights of a mean around each frequency (the bytes of their array, rad/s).
+
+    Choosing single points whose coherence came out high by chance would bias the fit.
+    """
+    place = np.log(np.frombuffer(omega))
+    kernel = np.exp(-0.5 * ((place[:, None] - place[None, :]) / 0.2) ** 2)
+    return kernel / kernel.sum(axis=1, keepdims=True)
 
 
 def describe_usable(frfs: Sequence[FrequencyResponse], points: int, least: float) -> str:
@@ -176,31 +215,26 @@ def describe_usable(frfs: Sequence[FrequencyResponse], points: int, least: float
     )
 
 
-_DECADE = 10.0
-_SURE = 0.1  # random error that noise alone does not reach
 WIDER_BAND = "wider band"  # kind of a remedy
 
 
-def widen_band(frfs: Sequence[FrequencyResponse], seen: Sequence[Mask]) -> Message | None:
-    """The advice to excite more than the band of the points `seen`, with numbers.
+def widen_band(frfs: Sequence[FrequencyResponse], used: Sequence[Mask]) -> Message | None:
+    """The advice to excite more than the band of the points `used`, with numbers.
 
     None where that is a decade or more, or nothing.
     """
-    rows = [np.asarray(f.omega)[np.any(m, axis=(1, 2))] for f, m in zip(frfs, seen, strict=True)]
+    rows = [np.asarray(f.omega)[np.any(m, axis=(1, 2))] for f, m in zip(frfs, used, strict=True)]
     omega = np.concatenate(rows)
     if not omega.size or np.max(omega) >= _DECADE * np.min(omega):
         return None
     low, high = float(np.min(omega)), float(np.max(omega))
+    hertz = lambda *ends: " to ".join(f"{end / (2 * np.pi):.3g}" for end in ends)
+    in_both = lambda low, high: f"{low:.3g} to {high:.3g} rad/s ({hertz(low, high)} Hz)"
     return Message(
-        f"excite the axis («jq.sweep») over more than {_in_both(low, high)}, the band that counts "
-        f"here: for instance {_in_both(low, _DECADE * low)}",
+        f"excite the axis («jq.sweep») over more than {in_both(low, high)}, the band that counts "
+        f"here: for instance {in_both(low, _DECADE * low)}",
         WIDER_BAND,
     )
-
-
-def _in_both(low: float, high: float) -> str:
-    turn = 2 * np.pi
-    return f"{low:.3g} to {high:.3g} rad/s ({low / turn:.3g} to {high / turn:.3g} Hz)"
 
 
 def precise_points(frf: FrequencyResponse) -> Mask:
@@ -210,17 +244,17 @@ def precise_points(frf: FrequencyResponse) -> Mask:
     """
     error = np.nan_to_num(np.asarray(frf.random_error), nan=1.0)
     dominated = any(remark.kind == DOMINATED for remark in frf.remarks)
-    return np.isfinite(np.asarray(frf.response)) & (error <= _SURE) & (not dominated)
+    return np.isfinite(np.asarray(frf.response)) & (error <= _PRECISE) & (not dominated)
 
 
 def points_of(frfs: Sequence[FrequencyResponse], used: Sequence[Mask]) -> list[Points]:
     """The points of several responses, with a floor of 0."""
-    found = []
+    points = []
     for frf, mask in zip(frfs, used, strict=True):
         shared, correlations = _shared_noise(frf, mask)
         between = _between_pairs(frf, mask)
-        found.append(Points(frf, mask, shared, np.zeros(mask.shape), correlations, between))
-    return found
+        points.append(Points(frf, mask, shared, np.zeros(mask.shape), correlations, between))
+    return points
 
 
 def _between_pairs(
@@ -236,13 +270,10 @@ def _between_pairs(
     response = np.where(used, np.asarray(frf.response), 1.0).reshape(len(used), -1)
     turn = np.exp(-1j * np.angle(response)) / size
     both = mine[:, :, None] & mine[:, None, :] & ~np.eye(count, dtype=bool)
-    whole = turn[:, :, None] * covariance * np.conj(turn)[:, None, :]
-    correlation = np.where(both, whole, np.eye(count, dtype=complex))
+    relative = turn[:, :, None] * covariance * np.conj(turn)[:, None, :]
+    correlation = np.where(both, relative, np.eye(count, dtype=complex))
     shared = np.sum(np.real(correlation) ** 2 + np.imag(correlation) ** 2, axis=2)
     return correlation if np.any(shared > _ALONE) else None
-
-
-_ALONE = 1.02  # sum of |rho|^2 below which all points of a pair count as independent
 
 
 def _shared_noise(
@@ -264,57 +295,3 @@ def _shared_noise(
         if np.any(sums > _ALONE):
             correlations[o, i] = correlation
     return shared, correlations
-
-
-def _in_band(
-    frf: FrequencyResponse, band: Band
-) -> Bool[np.ndarray, " frequencies #outputs #inputs"]:
-    if not isinstance(band, Mapping):
-        return _between(frf, band)[:, None, None]
-    inside = np.ones(frf.response.shape, dtype=bool)
-    for pair, limits in band.items():
-        if pair not in (pairs := _pairs(frf)):
-            raise ValueError(
-                f"no response pair {pair!r} for a band: (output, input) is one of {list(pairs)}"
-            )
-        inside[(slice(None), *pairs[pair])] = limits is not None and _between(frf, limits)
-    return inside
-
-
-def _pairs(frf: FrequencyResponse) -> dict[tuple[str, str], tuple[int, int]]:
-    return {
-        (output, source): (o, i)
-        for o, output in enumerate(frf.output_names)
-        for i, source in enumerate(frf.input_names)
-    }
-
-
-def _between(frf: FrequencyResponse, band: Range | None) -> Bool[np.ndarray, " frequencies"]:
-    omega = np.asarray(frf.omega)
-    low, high = band or (0.0, np.inf)
-    if not low < high or not np.any((omega >= low) & (omega <= high)):
-        raise ValueError(
-            f"band {band} rad/s holds none of the response's frequencies, which run from "
-            f"{omega[0]:.4g} to {omega[-1]:.4g} rad/s"
-        )
-    return (omega >= low) & (omega <= high)
-
-
-def _local_mean(
-    omega: Float[np.ndarray, " frequencies"],
-    values: Float[np.ndarray, "frequencies outputs inputs"],
-) -> Float[np.ndarray, "frequencies outputs inputs"]:
-    """Mean over about a third of an octave.
-
-    Choosing single points whose own coherence came out high by chance would bias the fit.
-    """
-    kernel = _third_of_an_octave(omega.tobytes())
-    return (kernel @ values.reshape(len(values), -1)).reshape(values.shape)
-
-
-@ft.lru_cache(maxsize=16)
-def _third_of_an_octave(omega: bytes) -> Float[np.ndarray, "frequencies frequencies"]:
-    """Weights of a mean around each frequency (the bytes of their array, rad/s)."""
-    place = np.log(np.frombuffer(omega))
-    kernel = np.exp(-0.5 * ((place[:, None] - place[None, :]) / 0.2) ** 2)
-    return kernel / kernel.sum(axis=1, keepdims=True)

@@ -17,7 +17,6 @@ from ..uncertainty._error_budget import Weighting, weighting_at
 from ..uncertainty._fit_remarks import DOUBT
 from ..uncertainty._verdict import Verdict, without_numbers
 from ._bounds import settle_at_bounds, solve_within_bounds
-from ._condition import Condition
 from ._cost import (
     Band,
     Cost,
@@ -34,9 +33,15 @@ from ._cost import (
     widen_band,
 )
 from ._mixing import Mixing, mixings_of
-from ._model_checks import require_model, require_model_response
-from ._parameters import Free, Parameters, select_parameters, Tie
-from ._problem import make_problem, Prior, Problem, require_priors
+from ._parameters import Condition, Free, Parameters, select_parameters, Tie
+from ._problem import (
+    make_problem,
+    Prior,
+    Problem,
+    require_model,
+    require_model_response,
+    require_priors,
+)
 from ._refits import Options, Origin
 from ._result import Fit
 from ._solve import Solution

@@ -6,8 +6,8 @@ at each frequency across pairs, estimates are nearly as sharp as under the whole
 
 Under the inverse of their whole covariance the estimates would be the sharpest, but also trust
 what the covariance says of the small differences between neighbours, which nobody knows: they
-would follow any bias. So each point has a share of doubt, noise of its own, as large as that of
-all the points that it shares noise with.
+would follow any bias. So each point has a share of doubt, noise that it shares with none, as large
+as that of all the points that it shares noise with.
 """
 
 import functools as ft
@@ -46,7 +46,7 @@ class Mixing(NamedTuple):
 
 def mixings_of(points: Sequence[Points], weights: Sequence[Weights]) -> tuple[Mixing | None, ...]:
     """One for each response, `None` where the points share no noise."""
-    return tuple(_mixing(*each) for each in zip(points, weights, strict=True))
+    return tuple(_mixing(*pair) for pair in zip(points, weights, strict=True))
 
 
 def _mixing(points: Points, weights: Weights) -> Mixing | None:
@@ -56,26 +56,22 @@ def _mixing(points: Points, weights: Weights) -> Mixing | None:
     factor, correlation = np.array(none.factor), np.array(none.correlation)
     for (o, i), shared in points.correlations.items():
         mine = np.flatnonzero(points.used[:, o, i])
-        # A floor on the error is the points' own.
-        own = np.minimum((weights[mine, o, i, 0] * points.floor[mine, o, i]) ** 2, 1.0)
-        size = np.sqrt((1 - own) / points.shared[mine, o, i])
-        whole = size[:, None] * shared * size + np.diag(own + _DOUBT)
-        root = np.sqrt(1 + _DOUBT) * np.linalg.inv(np.linalg.cholesky(whole))
+        # A floor on the error is shared with no other point.
+        alone = np.minimum((weights[mine, o, i, 0] * points.floor[mine, o, i]) ** 2, 1.0)
+        size = np.sqrt((1 - alone) / points.shared[mine, o, i])
+        total = size[:, None] * shared * size + np.diag(alone + _DOUBT)
+        root = np.sqrt(1 + _DOUBT) * np.linalg.inv(np.linalg.cholesky(total))
         factor[o, i][np.ix_(mine, mine)] = root
         correlation[o, i][np.ix_(mine, mine)] = shared
-    mixed = np.array(False)
-    if points.between is None:
-        return Mixing(factor, correlation, none.across, none.between, mixed)
-    return Mixing(factor, correlation, _across(points, weights), points.between, mixed)
-
-
-def _across(points: Points, weights: Weights) -> Across:
-    """What whitens the pairs at each frequency."""
-    own = np.minimum((weights[..., 0] * points.floor) ** 2, 1.0).reshape(len(weights), -1)
-    size, identity = np.sqrt(1 - own), np.eye(own.shape[1])
-    whole = size[:, :, None] * points.between * size[:, None, :]
-    whole = whole + (own + _DOUBT)[:, :, None] * identity
-    return np.sqrt(1 + _DOUBT) * np.linalg.inv(np.linalg.cholesky(whole))
+    across, between = none.across, none.between
+    if points.between is not None:  # what whitens the pairs at each frequency
+        alone = np.minimum((weights[..., 0] * points.floor) ** 2, 1.0).reshape(len(weights), -1)
+        size, identity = np.sqrt(1 - alone), np.eye(alone.shape[1])
+        total = size[:, :, None] * points.between * size[:, None, :]
+        total = total + (alone + _DOUBT)[:, :, None] * identity
+        across = np.sqrt(1 + _DOUBT) * np.linalg.inv(np.linalg.cholesky(total))
+        between = points.between
+    return Mixing(factor, correlation, across, between, np.array(False))
 
 
 @ft.lru_cache(maxsize=8)
@@ -165,23 +161,19 @@ def mix_parts(
         return real, imag
 
     def turned(real: Array, imag: Array) -> tuple[Array, Array]:
-        return _turned_parts(mixing, real, imag)
+        turn = lambda matrix, part: jnp.einsum("oifg,...oig->...oif", matrix, part)
+        along = _turn_parts(turn, mixing.factor, real, imag)
+        if mixing.across is None:
+            return along
+        shape = real.shape
+        flat = (part.reshape(*shape[:-3], -1, shape[-1]) for part in along)
+        turn = lambda matrix, part: jnp.einsum("fpq,...qf->...pf", matrix, part)
+        real, imag = _turn_parts(turn, mixing.across, *flat)
+        return real.reshape(shape), imag.reshape(shape)
 
     if mixing.idle is None:
         return turned(real, imag)
     return jax.lax.cond(mixing.idle, lambda *same: same, turned, real, imag)
-
-
-def _turned_parts(mixing: Mixing, real: Array, imag: Array) -> tuple[Array, Array]:
-    turn = lambda matrix, part: jnp.einsum("oifg,...oig->...oif", matrix, part)
-    along = _turn_parts(turn, mixing.factor, real, imag)
-    if mixing.across is None:
-        return along
-    shape = real.shape
-    flat = (part.reshape(*shape[:-3], -1, shape[-1]) for part in along)
-    turn = lambda matrix, part: jnp.einsum("fpq,...qf->...pf", matrix, part)
-    real, imag = _turn_parts(turn, mixing.across, *flat)
-    return real.reshape(shape), imag.reshape(shape)
 
 
 def _turn_parts(

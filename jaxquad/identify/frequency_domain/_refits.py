@@ -13,9 +13,8 @@ from jaxtyping import Array, Complex, Float, PyTree
 from jaxquad._core import pytree_node
 from jaxquad.spectra import FrequencyResponse
 
-from ._condition import Condition
 from ._cost import Band, Cost, MaximumLikelihood, Points, Range
-from ._parameters import Free, Parameters, Positive, Real, Tie, with_values
+from ._parameters import Condition, Free, Parameters, Positive, Real, Tie, with_values
 from ._problem import on_device, Prior
 
 

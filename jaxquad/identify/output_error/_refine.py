@@ -15,9 +15,8 @@ from jaxquad.models import with_arrays
 from jaxquad.records import Record
 
 from ..frequency_domain._fit import check_priors
-from ..frequency_domain._model_checks import require_model
 from ..frequency_domain._parameters import Free, select_parameters, Tie
-from ..frequency_domain._problem import make_problem, Prior, require_priors
+from ..frequency_domain._problem import make_problem, Prior, require_model, require_priors
 from ..frequency_domain._refits import free_again
 from ..frequency_domain._result import Fit
 from ._descent import descend_by_turns, descend_with_noise

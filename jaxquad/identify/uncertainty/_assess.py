@@ -12,11 +12,11 @@ from jaxquad.models import LaggedIntegrator, StateSpace, TransferFunction
 from jaxquad.spectra import FrequencyResponse
 
 from ..frequency_domain._cost import widen_band
-from ..frequency_domain._held import remarks_on_hold
 from ..frequency_domain._parameters import Parameters, Place
 from ..frequency_domain._problem import on_device, Problem
 from ..frequency_domain._refits import Origin
 from ..frequency_domain._result import Fit
+from ..frequency_domain._sampled import remarks_on_hold
 from ..frequency_domain._solve import is_saddle, same_responses, Solution
 from ..frequency_domain._starts import Minimum, remarks_on_minima
 from ..output_error._noise import NoiseModel

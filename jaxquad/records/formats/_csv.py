@@ -1,6 +1,5 @@
 import csv
 import io
-from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -12,11 +11,9 @@ from .._errors import ReadError
 from .._log import columns_of, Log, Table
 
 
-Line = tuple[int, str]  # number in the file from 1, text
 _LONGEST_LINE = 1 << 20  # bytes
 _BLOCK = 1 << 22  # bytes parsed at once
 _BLANK = 0.1  # of a column: with more blank cells, the table holds several topics
-_UTF16 = (b"\xff\xfe", b"\xfe\xff")
 
 
 def sniff(head: bytes, path: Path) -> bool:
@@ -37,25 +34,24 @@ def load(path: Path) -> Log:
     try:
         values = _rows(content, header)
     except _BlankCell as error:
-        return _with_units(_topics(content, header, error))
-    if not header.named:
-        last = f"data[{len(values) - 1}]"
-        remark = f"the file has no line of channel names: its columns are called data[0] .. {last}"
-        return Log({"": Table({"data": values.T})}, (remark,))
-    return _with_units(Log({"": Table(dict(zip(header.names, values, strict=True)))}))
-
-
-def _with_units(log: Log) -> Log:
-    """The columns by the names in their titles, with the units that stand behind these."""
-    table = log.tables[""]
-    parts = columns_of(list(table.columns))
-    whole = Table(
-        columns={parts[title].name: values for title, values in table.columns.items()},
+        columns, rows, remarks = _topics(content, header, error)
+    else:
+        columns, rows, remarks = dict(zip(header.names, values, strict=True)), {}, ()
+        if not header.named:
+            remark = (
+                "the file has no line of channel names: its columns are called data[0] .. "
+                f"data[{len(values) - 1}]"
+            )
+            return Log({"": Table({"data": values.T})}, (remark,))
+    # The columns by the names in their titles, with the units that stand behind these.
+    parts = columns_of(list(columns))
+    table = Table(
+        columns={parts[title].name: values for title, values in columns.items()},
         units={name: unit for name, unit in parts.values() if unit},
-        rows={parts[title].name: rows for title, rows in table.rows.items()},
+        rows={parts[title].name: there for title, there in rows.items()},
         titles={title: name for title, (name, _) in parts.items() if title != name},
     )
-    return Log({"": whole}, log.remarks)
+    return Log({"": table}, remarks)
 
 
 class _Header(NamedTuple):
@@ -74,42 +70,45 @@ class _BlankCell(ReadError):
 
 def _rows(content: bytes, header: _Header) -> Float[np.ndarray, "columns rows"]:
     names, _, separator, place, number = header
-    values, rows = np.empty((len(names), _most_rows(content, place, len(names)))), 0
-    for begin, end in _blocks(content, place):
-        block = content[begin:end]
+    # A row takes two bytes for each cell at least, however many line ends there are.
+    most = min(content.count(b"\n", place) + 1, (len(content) - place + 1) // (2 * len(names)))
+    values, rows = np.empty((len(names), most)), 0
+    while place < len(content):
+        end = content.find(b"\n", min(place + _BLOCK, len(content)))
+        end = len(content) if end < 0 else end + 1
+        block = content[place:end]
         table = _parse(block, separator, len(names))
         table = _parse_rows(block, number, names, separator) if table is None else table
         values[:, rows : rows + len(table)] = table.T
-        rows += len(table)
-        number += block.count(b"\n")
+        rows, number, place = rows + len(table), number + block.count(b"\n"), end
     if not rows:
         raise ReadError(f"the file has only a header ({', '.join(names)}) and no row of numbers")
     return values[:, :rows]
 
 
-def _topics(content: bytes, header: _Header, error: _BlankCell) -> Log:
-    """A table in which a row has the values of one topic, or each topic rows of its own.
+def _topics(
+    content: bytes, header: _Header, error: _BlankCell
+) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray], tuple[str, ...]]:
+    """Of a table of several topics the columns, the rows that they have a value in, and remarks.
 
-    Raises `error` where a few cells are blank only: those are missing values.
+    A row has the values of one topic, or each topic rows of its own. Raises `error` where a few
+    cells are blank only: those are missing values.
     """
     lines = enumerate(content[header.place :].decode().split("\n"), start=header.number)
     rows = [
-        _numbers((number, text), header.names, header.separator, blank=np.nan)
+        _numbers(number, text, header.names, header.separator, blank=np.nan)
         for number, text in lines
         if text.strip() and not text.lstrip().startswith("#")
     ]
-    columns = np.array(rows).T
-    held = ~np.isnan(columns)
-    counts = dict(zip(header.names, held.sum(axis=1).tolist(), strict=True))
+    table = np.array(rows).T
+    filled = dict(zip(header.names, ~np.isnan(table), strict=True))
+    counts = {name: int(there.sum()) for name, there in filled.items()}
     partly = {name for name, count in counts.items() if 0 < count < len(rows)}
     rarest = min(partly or counts, key=lambda name: counts[name] or len(rows))
     if counts[rarest] < FEWEST or (partly and 1 - counts[rarest] / len(rows) < _BLANK):
         raise error
-    found = {
-        name: (values[there], there)
-        for name, values, there in zip(header.names, columns, held, strict=True)
-        if counts[name]
-    }
+    named = dict(zip(header.names, table, strict=True))
+    columns = {name: values[filled[name]] for name, values in named.items() if counts[name]}
     remarks = []
     if partly:
         remarks += [
@@ -118,18 +117,12 @@ def _topics(content: bytes, header: _Header, error: _BlankCell) -> Log:
         ]
     if empty := [name for name in header.names if not counts[name]]:
         remarks.append(f"columns without any value were left out: {', '.join(empty)}")
-    rows_of = {name: there for name, (_, there) in found.items() if name in partly}
-    return Log({"": Table({n: v for n, (v, _) in found.items()}, rows=rows_of)}, tuple(remarks))
-
-
-def _most_rows(content: bytes, place: int, columns: int) -> int:
-    """A row takes two bytes for each cell at least, however many line ends there are."""
-    return min(content.count(b"\n", place) + 1, (len(content) - place + 1) // (2 * columns))
+    return columns, {name: filled[name] for name in columns if name in partly}, tuple(remarks)
 
 
 def _as_utf8(content: bytes) -> bytes:
     """Text in UTF-8 with the line ends of Unix; other 8-bit text is taken as Latin-1."""
-    if content.startswith(_UTF16):
+    if content.startswith((b"\xff\xfe", b"\xfe\xff")):
         content = content.decode("utf-16", "replace").encode()
     zero = content.find(b"\0")
     if zero >= 0:
@@ -146,37 +139,8 @@ def _as_utf8(content: bytes) -> bytes:
 
 
 def _header(content: bytes) -> _Header:
-    comment = ""
-    for number, begin, end in _line_places(content):
-        text = content[begin:end].decode().strip(" ")
-        if not text.strip():
-            continue
-        if text.lstrip().startswith("#"):
-            comment = text.lstrip("# \t")
-            continue
-        separator = next((mark for mark in ";\t," if mark in text), None)
-        cells = split(text, separator)
-        if not all(map(_is_number, cells)):
-            return _Header(_distinct(cells), True, separator, end + 1, number + 1)
-        names = split(comment, separator) if comment else []
-        named = len(names) == len(cells)
-        names = _distinct(names) if named else [f"data[{k}]" for k in range(len(cells))]
-        return _Header(names, named, separator, begin, number)
-    raise ReadError("the file holds no table: it needs lines of numbers, below a line of names")
-
-
-def _distinct(names: list[str]) -> list[str]:
-    seen: set[str] = set()
-    for name in names:
-        if name in seen:
-            raise ReadError(f"the header names {name!r} twice: rename one of them")
-        seen.add(name)
-    return names
-
-
-def _line_places(content: bytes) -> Iterator[tuple[int, int, int]]:
-    number, begin = 0, 0
-    while begin < len(content):
+    comment, number, end = "", 0, -1
+    while (begin := end + 1) < len(content):
         end = content.find(b"\n", begin)
         end = len(content) if end < 0 else end
         number += 1
@@ -184,19 +148,30 @@ def _line_places(content: bytes) -> Iterator[tuple[int, int, int]]:
             raise ReadError(
                 f"line {number} has {end - begin} bytes: the file is not a table", offset=begin
             )
-        yield number, begin, end
-        begin = end + 1
+        text = content[begin:end].decode().strip(" ")
+        if not text.strip():
+            continue
+        if text.lstrip().startswith("#"):
+            comment = text.lstrip("# \t")
+            continue
+        separator = next((mark for mark in ";\t," if mark in text), None)
+        cells = _split(text, separator)
+        above = not all(map(_is_number, cells))
+        names = cells if above else _split(comment, separator) if comment else []
+        named = len(names) == len(cells)
+        names = names if named else [f"data[{k}]" for k in range(len(cells))]
+        earlier: set[str] = set()
+        for name in names:
+            if name in earlier:
+                raise ReadError(f"the header names {name!r} twice: rename one of them")
+            earlier.add(name)
+        if above:
+            return _Header(names, True, separator, end + 1, number + 1)
+        return _Header(names, named, separator, begin, number)
+    raise ReadError("the file holds no table: it needs lines of numbers, below a line of names")
 
 
-def _blocks(content: bytes, place: int) -> Iterator[tuple[int, int]]:
-    while place < len(content):
-        end = content.find(b"\n", min(place + _BLOCK, len(content)))
-        end = len(content) if end < 0 else end + 1
-        yield place, end
-        place = end
-
-
-def split(text: str, separator: str | None) -> list[str]:
+def _split(text: str, separator: str | None) -> list[str]:
     """The cells of one line, free of blanks and quotes."""
     if separator is None:
         return text.split()
@@ -228,16 +203,20 @@ def _parse_rows(
     rows = []
     for number, text in enumerate(block.decode().split("\n"), start=first):
         if text.strip() and not text.lstrip().startswith("#"):
-            rows.append(_numbers((number, text), names, separator))
+            rows.append(_numbers(number, text, names, separator))
     return np.array(rows).reshape(-1, len(names))
 
 
 def _numbers(
-    row: Line, header: list[str], separator: str | None, *, blank: float | None = None
+    number: int,
+    text: str,
+    header: list[str],
+    separator: str | None,
+    *,
+    blank: float | None = None,
 ) -> list[float]:
-    """The numbers of a line; a cell without one is `blank`."""
-    number, text = row
-    cells = split(text, separator)
+    """The numbers of a line, the file's `number` from 1; a cell without one is `blank`."""
+    cells = _split(text, separator)
     if len(cells) != len(header):
         raise ReadError(
             f"line {number} has {len(cells)} cells for {len(header)} columns: the file is cut off, "

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from .._errors import ReadError
-from .._log import changes_of, Log, Table
+from .._log import changes_of, Log, number_in, Table
 from ._dataflash import (
     ABOUT,
     choose_log,
@@ -62,7 +62,7 @@ def load_text(path: Path) -> Log:
         name, value = names.index("Name"), names.index("Value")
     cells = [c for c in _split(lines.get("PARM", [])) if len(c) >= max(2, name + 1, value + 1)]
     timed = names[:1] == ("TimeUS",)
-    stamped = [(1e-6 * _number(c[0]) if timed else None, c[name], c[value]) for c in cells]
+    stamped = [(1e-6 * number_in(c[0]) if timed else None, c[name], c[value]) for c in cells]
     settings = {name: value for _, name, value in stamped}
     changes = changes_of(stamped, lambda time: time)
     texts = (line.decode("latin-1") for name in ("VER", "MSG") for line in lines.get(name, []))
@@ -91,7 +91,7 @@ def _one_log(content: bytes) -> tuple[bytes, list[str]]:
         if timed:
             most = max(timed, key=lambda layout: len(lines[layout.name]))
             cells = (line.partition(b",")[0] for line in lines[most.name])
-            stamps = np.array([_number(cell.decode("latin-1")) for cell in cells])
+            stamps = np.array([number_in(cell.decode("latin-1")) for cell in cells])
             span = span_of(CLOCKS[most.columns[0]] * stamps)
         parts.append(LogPart(begin, end, span, bool(timed) and "SIDD" in lines))
     numbers, remarks = choose_log(parts)
@@ -141,7 +141,7 @@ def _text_scaling(lines: dict[str, list[bytes]], names: dict[int, str]) -> Scali
         if kind.isdecimal() and len(kind) < 9 and int(kind) in names
     }
     factors = {
-        letter: mult for letter, text in mults.items() if 0 < (mult := _number(text)) < np.inf
+        letter: mult for letter, text in mults.items() if 0 < (mult := number_in(text)) < np.inf
     }
     return Scaling(units, factors, letters)
 
@@ -159,14 +159,7 @@ def _text_columns(lines: list[bytes], layout: Format) -> tuple[dict[str, np.ndar
         return dict(zip(layout.columns, numbers.reshape(-1, width).T, strict=True)), odd
     columns = {}
     for name, cells in zip(layout.columns, zip(*_split(fitting), strict=True), strict=True):
-        values = np.array([_number(cell) for cell in cells])
+        values = np.array([number_in(cell) for cell in cells])
         if np.isfinite(values).any():
             columns[name] = values
     return columns, odd
-
-
-def _number(cell: str) -> float:
-    try:
-        return float(cell)
-    except ValueError:
-        return float("nan")
