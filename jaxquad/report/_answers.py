@@ -19,8 +19,8 @@ from jaxquad.plot import COHERENT
 from jaxquad.records import Record
 from jaxquad.spectra import FrequencyResponse
 
-from ._figure import Section
-from ._record import GOOD_TIC
+from ._measured import GOOD_TIC
+from ._page import Section
 
 
 Grid = Float[np.ndarray, " frequencies"]
