@@ -9,7 +9,7 @@ from ratios import delayed_integrator, Ratio, ratio
 
 import jaxquad as jq
 from jaxquad.loops import attitude_bandwidth, disturbance_rejection, margins, rms_response
-from jaxquad.loops.qualities._curve import crossed, first
+from jaxquad.loops._curve import crossed, first
 
 
 pytestmark = pytest.mark.usefixtures("compiled_quickly")
