@@ -259,15 +259,16 @@ class ErrorCovariance:
 
     def _parameters(self) -> Float[np.ndarray, "parameters parameters"]:
         """Covariance of the real parameters."""
-        drive = np.ascontiguousarray(self.drive)
+        drive = np.ascontiguousarray(np.asarray(self.drive))
         parts = drive.reshape(len(drive), -1).view(float)  # real and imaginary ones in turn
         return 0.5 * (parts @ parts.T)
 
     def _with_parameters(self) -> Complex[np.ndarray, "frequencies outputs inputs parameters"]:
         """Twice the covariance of what atoms do to each response with the real parameters."""
         effect, reach, driven = np.asarray(self.effect), self._reach, self._driven
-        parameters, _, roots = np.shape(self.drive)
-        rows = np.conj(np.swapaxes(np.asarray(self.drive), 0, 1))
+        drive = np.asarray(self.drive)
+        parameters, _, roots = drive.shape
+        rows = np.conj(np.swapaxes(drive, 0, 1))
         rows = np.ascontiguousarray(rows).reshape(driven.size, -1)
         crossed = np.zeros((*effect.shape[:2], parameters * roots), complex)
         begins, ends = np.searchsorted(driven, reach.first), np.searchsorted(driven, reach.last)

@@ -8,9 +8,8 @@ from synthetic import response_of
 import jaxquad as jq
 from jaxquad.plot import StepBand
 from jaxquad.report import LawLoop
-from jaxquad.report._loop import entry_of, loop_section
-from jaxquad.report._spectrum import spectrum_section, throttle_of
-from jaxquad.report._step import step_section
+from jaxquad.report._loop import entry_of, loop_section, step_section
+from jaxquad.report._measured import spectrum_section, throttle_of
 from jaxquad.spectra import BrokenLoop
 
 

@@ -5,7 +5,7 @@ import pytest
 from synthetic import response_of
 
 import jaxquad as jq
-from jaxquad.report._step import predict_step, step_section
+from jaxquad.report._loop import predict_step, step_section
 from jaxquad.spectra import estimate_step
 
 
