@@ -6,11 +6,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ._channel import Channel, repair_values, resample
 from ._clock import dates_in_seconds, doubt_of_seconds, Number, PER_SECOND, Times, TimeUnit
 from ._errors import ReadError, RecordError, unknown_name
 from ._record import as_tuple, assemble, check_distinct, Hold, Names, Record
-from ._repair import repair_values
-from ._resample import Channel, resample
 from .formats import load_log
 
 

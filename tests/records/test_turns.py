@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from jaxquad.records import read, RecordWarning
-from jaxquad.records._repair import without_turns
+from jaxquad.records._channel import without_turns
 
 
 TIME = np.arange(4000) / 200
