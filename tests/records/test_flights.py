@@ -295,8 +295,9 @@ def test_a_gap_that_is_allowed_is_allowed_for_the_spectrum_over_the_throttle(tmp
     time = np.arange(20_000) / 1000
     wave = 50 * np.sin(20 * time)
     columns = {
-        "loopIteration": np.arange(20_000), "time (us)": np.round(1e6 * time), "axisP[0]": 50 * np.cos(20 * time),
-        "gyroADC[0] (deg/s)": wave, "setpoint[0]": wave, "setpoint[3]": 300 + 100 * np.sin(time),
+        "loopIteration": np.arange(20_000), "time (us)": np.round(1e6 * time),
+        "axisP[0]": 50 * np.cos(20 * time), "gyroADC[0] (deg/s)": wave,
+        "setpoint[0]": wave, "setpoint[3]": 300 + 100 * np.sin(time),
     }  # fmt: skip
     kept = (time < 9) | (time > 9.08)
     path, table = tmp_path / "log.csv", np.column_stack(list(columns.values()))[kept]
