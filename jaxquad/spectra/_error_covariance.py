@@ -135,7 +135,8 @@ class ErrorCovariance:
                 yield effect.reshape(-1, effect.shape[3]).T @ along
             return
         effect, reach, driven = np.asarray(self.effect), self._reach, self._driven
-        values, moved, drive = drawn.reshape(*effect.shape[:2], -1), None, None
+        values, moved = drawn.reshape(*effect.shape[:2], -1), np.zeros((0, columns.shape[3]))
+        drive = np.zeros((0, 0, 0), complex)
         begin, end = int(np.min(reach.first)), int(np.max(reach.last))
         if self.sensitivity is not None and self.drive is not None:
             slope, drive = np.asarray(self.sensitivity), np.asarray(self.drive)
@@ -144,7 +145,7 @@ class ErrorCovariance:
         for low in range(begin, end, _ATOMS):
             part = np.zeros((min(_ATOMS, end - low), values.shape[2]), complex)
             add_effects(part, low, effect, reach, values)
-            if drive is not None:
+            if drive.size:
                 taken = slice(*np.searchsorted(driven, (low, low + len(part))))
                 both = np.einsum("nac,np->acp", drive[:, taken], moved)
                 part[driven[taken] - low] += both.reshape(len(both), part.shape[1])

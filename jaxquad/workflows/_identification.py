@@ -289,7 +289,7 @@ class Identification:
             filters=self.filters,
             law=_law_if_any(self),
             formula="; ".join(filter(None, (self.formula, self.filters_text))),
-            beside=self.supplements,
+            texts=self.supplements,
         )
         self._write_figures(folder)
         return path
