@@ -3,6 +3,7 @@
 import functools as ft
 import itertools
 from collections.abc import Callable, Iterator, Sequence
+from typing import Self
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -26,7 +27,7 @@ class Remark(Message):
     - `text`: what happened, the number, and what to do. `{where}` stands for the frequencies.
     - `omega`: the frequencies that it is about, in rad/s; none for the response as a whole.
     - `pair`: names of the output and the input that it is about; `None` for all pairs.
-    - `kind`: what it is about, for code that decides by it.
+    - `kind`: what it is about, such as "leakage" or "nonlinear", for code that decides by it.
     """
 
     text: str
@@ -39,7 +40,7 @@ class Remark(Message):
         omega: Sequence[float] | Float[np.ndarray, " points"] = (),
         pair: Pair | None = None,
         kind: str = "",
-    ) -> "Remark":
+    ) -> Self:
         points = tuple(float(x) for x in omega)
         self = super().__new__(cls, text.replace("{where}", _place(points)), kind)
         self.text, self.omega, self.pair = text, points, pair

@@ -3,7 +3,7 @@
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
@@ -47,6 +47,7 @@ from ._result_file import load_result, StoredResult
 from ._settings import IdentifySettings
 
 
+T = TypeVar("T")
 _COSTS = {"ml": MaximumLikelihood(), "coherence": CoherenceWeighted()}
 _POINTS = 100  # frequencies, log-spaced over the band
 _LONGEST = 0.02  # of the record: a longer delay is no delay of the vehicle
@@ -124,7 +125,7 @@ def identify_opened(opened: OpenedLogs) -> Identification:
     method, frf, fit, parts, delay = estimate
     responses, fits, failures = {method: frf}, {method: fit}, {}
 
-    def attempt(title: str, compute: Callable[[], object]):
+    def attempt(title: str, compute: Callable[[], T]) -> T | None:
         try:
             return compute()
         except Exception as error:
