@@ -1,7 +1,6 @@
 """Messages as values: what they are about, and which of their words are those of Python."""
 
 from collections.abc import Callable, Iterable
-from typing import Self
 
 
 class Message(str):
@@ -18,7 +17,7 @@ class Message(str):
     marked: str  # with the guillemets
     kind: str
 
-    def __new__(cls, text: str, kind: str = "") -> Self:
+    def __new__(cls, text: str, kind: str = "") -> "Message":
         marked = marked_text(text)
         self = super().__new__(cls, _replaced(marked, lambda term: term.rpartition("|")[2]))
         self.marked, self.kind = marked, kind or getattr(text, "kind", "")

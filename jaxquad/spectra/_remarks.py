@@ -3,7 +3,6 @@
 import functools as ft
 import itertools
 from collections.abc import Callable, Iterator, Sequence
-from typing import Self
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -40,9 +39,10 @@ class Remark(Message):
         omega: Sequence[float] | Float[np.ndarray, " points"] = (),
         pair: Pair | None = None,
         kind: str = "",
-    ) -> Self:
+    ) -> "Remark":
         points = tuple(float(x) for x in omega)
-        self = super().__new__(cls, text.replace("{where}", _place(points)), kind)
+        sentence = text.replace("{where}", _place(points))
+        self: Remark = super().__new__(cls, sentence, kind)  # pyright: ignore[reportAssignmentType]
         self.text, self.omega, self.pair = text, points, pair
         return self
 
