@@ -106,14 +106,18 @@ from .uncertainty._curves import (
     step_response as step_response,
     StepBand as StepBand,
 )
-from .uncertainty._derived import Tied as Tied
+from .uncertainty._derived import (
+    Factor as Factor,
+    Factors as Factors,
+    factors as factors,
+    Tied as Tied,
+)
 from .uncertainty._discrepancy import Discrepancy as Discrepancy
 from .uncertainty._draw_models import (
     check_drawable as check_drawable,
     draw_models as draw_models,
     known_covariance as known_covariance,
 )
-from .uncertainty._factors import Factor as Factor, Factors as Factors, factors as factors
 from .uncertainty._fit_remarks import MISFIT as MISFIT
 from .uncertainty._verdict import (
     Bound as Bound,

@@ -6,11 +6,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ._channel import Channel, repair_values, resample
 from ._clock import dates_in_seconds, doubt_of_seconds, Number, PER_SECOND, Times, TimeUnit
 from ._errors import ReadError, RecordError, unknown_name
 from ._record import as_tuple, assemble, check_distinct, Hold, Names, Record
-from ._repair import repair_values
-from ._resample import Channel, resample
 from .formats import load_log
 
 
@@ -156,7 +155,8 @@ _SAVE = "s = get(z); save('z.mat', 's', '-v7')"
 def from_iddata(path: str | Path, variable: str | None, references: Names) -> Record:
     """`Record.from_iddata`, where the arguments are described."""
     fields = _fields(path, variable)
-    y, u = (_matrix(path, fields, *names) for names in (("y", "OutputData"), ("u", "InputData")))
+    y = _matrix(path, fields, "y", "OutputData")
+    u = _matrix(path, fields, "u", "InputData")
     time, dt = _uniform_time(path, fields, len(y))
     inputs = _labels(fields, "InputName", u, "u")
     input_units = _labels(fields, "InputUnit", u, "")

@@ -6,14 +6,21 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ._channel import (
+    Channel,
+    check_ranges,
+    repair_values,
+    resample,
+    Valid,
+    within,
+    without_turns,
+)
 from ._clock import clock_start, JITTER, nonuniformity, Number, show_times, TimeUnit, window
 from ._edit import combine
 from ._errors import located, ReadError, RecordError, RecordWarning, unknown_name
 from ._firmwares import firmware_log
 from ._log import known_unit
 from ._record import as_tuple, assemble, check_distinct, Hold, Record
-from ._repair import check_ranges, repair_values, Valid, within, without_turns
-from ._resample import Channel, resample
 from ._timebase import Timebases
 from .formats import load_log, load_signals
 

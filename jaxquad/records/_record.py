@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
+from ._channel import as_float64, check_ranges, repair_values, Valid
 from ._clock import (
     check_increasing,
     check_uniform,
@@ -24,7 +25,6 @@ from ._clock import (
     TimeUnit,
 )
 from ._errors import mend_holes, RecordError, RecordWarning, unknown_name
-from ._repair import as_float64, check_ranges, repair_values, Valid
 
 
 if TYPE_CHECKING:

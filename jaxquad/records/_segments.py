@@ -9,11 +9,11 @@ from pathlib import Path
 
 import numpy as np
 
+from ._channel import Valid
 from ._clock import clock_start, Number, show_times, TimeUnit
 from ._errors import GapError, RecordError, RecordWarning
 from ._read import read
 from ._record import assemble, Hold, Record
-from ._repair import Valid
 
 
 Mix = dict[str, dict[str, float]]  # name -> channel, or its power `m1^2`, -> weight

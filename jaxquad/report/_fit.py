@@ -18,7 +18,7 @@ _DASH = "\u2013"
 
 
 def parameter_section(
-    fit: Fit, derived: Sequence[Combination], beside: Mapping[str, str]
+    fit: Fit, derived: Sequence[Combination], texts: Mapping[str, str]
 ) -> dict[str, object]:
     """Every number with its standard error, and how good the fit is."""
     units = fit.parameter_units
@@ -64,7 +64,7 @@ def parameter_section(
         "facts": facts,
         "correlation": _correlation(fit),
         "text": str(fit),
-        "beside": [{"title": title, "text": text} for title, text in beside.items()],
+        "texts": [{"title": title, "text": text} for title, text in texts.items()],
     }
 
 

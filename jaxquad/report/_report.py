@@ -50,7 +50,7 @@ def write_report(
     law: LawLoop | None = None,
     checks: Verification | Mapping[str, Verification] | None = None,
     derived: Sequence[Combination] = (),
-    beside: Mapping[str, str] | None = None,
+    texts: Mapping[str, str] | None = None,
     tuned: "Tuned | Certificate | None" = None,
     flights: "Mapping[str, Simulation] | None" = None,
     provenance: Provenance | None = None,
@@ -80,7 +80,7 @@ def write_report(
     - `filters`: of the outputs, up to whose inputs response and model are.
     - `law`: the flown loop where its law is known, which is shown instead of an estimate.
     - `derived`: rows below the parameters, see `Fit.derived`.
-    - `beside`: texts below them by title, such as `Fit.bands` and `Fit.explain` in print.
+    - `texts`: what stands below them by title, such as `Fit.bands` and `Fit.explain` in print.
     - `tuned`: gains with their certificate, or a certificate alone.
     - `flights`: of these gains, by name, see `jaxquad.tuning.worst_flights`.
     - `provenance`: where the result comes from, see `jaxquad.report.provenance`.
@@ -112,7 +112,7 @@ def write_report(
         "identifiability": attempt(identifiability_section, fit),
     }
     if fit.verdict.fitted:
-        sections["parameters"] = attempt(parameter_section, fit, derived, beside or {})
+        sections["parameters"] = attempt(parameter_section, fit, derived, texts or {})
     if provenance is not None:
         sections["provenance"] = attempt(provenance_section, provenance)
     remarks = remarks_of(fit, verified)

@@ -80,14 +80,14 @@ def transform_records(
             mine += [origin + start for start in local]
         origin += record.samples + max(length for length, _ in layout)
     groups = tuple((n, tuple(mine)) for (n, _), mine in zip(layouts[0], starts, strict=True))
-    # By taper and by length, the windows of all records side by side, as neighbours in memory.
+
+    def side_by_side(part: Sequence[np.ndarray]) -> np.ndarray:
+        """The windows of all records, as neighbours in memory."""
+        rows = [np.swapaxes(x, 1, 2) for x in part]
+        return np.swapaxes(rows[0] if len(rows) == 1 else np.concatenate(rows, axis=2), 1, 2)
+
     joined, *slopes = (
-        tuple(
-            np.swapaxes(np.concatenate([np.swapaxes(x, 1, 2) for x in part], axis=2), 1, 2)
-            if len(part) > 1
-            else part[0]
-            for part in zip(*lengths, strict=True)
-        )
+        tuple(side_by_side(part) for part in zip(*lengths, strict=True))
         for lengths in zip(*parts, strict=True)
     )
     none = Slopes(np.zeros((0, 0, 0), complex), np.zeros((0, 0, 0), complex))

@@ -12,7 +12,6 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxquad._core import announce, marked_text, Message
-from jaxquad.autopilot import FlownLaw
 from jaxquad.identify import (
     Bands,
     Combination,
@@ -42,6 +41,7 @@ from ._settings import IdentifySettings
 
 
 if TYPE_CHECKING:
+    from jaxquad.autopilot import FlownLaw
     from jaxquad.plot import Panels
 
 
@@ -82,7 +82,7 @@ class Identification:
     parts: Mapping[str, Fit | None]
     proposal: Proposal | None = None
     more: tuple[Path, ...] = ()
-    flown: FlownLaw | None = None
+    flown: "FlownLaw | None" = None
     check: Verification | None = None
     bands: Bands | None = None
     explanation: Explanation | None = None
@@ -289,7 +289,7 @@ class Identification:
             filters=self.filters,
             law=_law_if_any(self),
             formula="; ".join(filter(None, (self.formula, self.filters_text))),
-            beside=self.supplements,
+            texts=self.supplements,
         )
         self._write_figures(folder)
         return path
@@ -351,6 +351,8 @@ def _record_title(record: Record, more: Sequence[Path]) -> str:
 
 
 def _law_if_any(found: Identification) -> LawLoop | None:
+    if found.flown is None:
+        return None
     from jaxquad.autopilot import loop_of_law
 
     try:

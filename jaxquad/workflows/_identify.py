@@ -3,12 +3,11 @@
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple, TYPE_CHECKING, TypeVar
 
 import numpy as np
 
 from jaxquad._core import announce, as_messages
-from jaxquad.autopilot import flown_law
 from jaxquad.identify import (
     behind_filters,
     CoherenceWeighted,
@@ -28,6 +27,7 @@ from jaxquad.identify import (
 )
 from jaxquad.models import LaggedIntegrator, parameter_units, TransferFunction
 from jaxquad.records import Proposal, Record
+from jaxquad.records.firmware import axis_of_rate
 from jaxquad.report import reason_of
 from jaxquad.spectra import (
     Composite,
@@ -46,6 +46,9 @@ from ._log import mix_of, open_again, open_logs, OpenedLogs, read_records
 from ._result_file import load_result, StoredResult
 from ._settings import IdentifySettings
 
+
+if TYPE_CHECKING:
+    from jaxquad.autopilot import FlownLaw
 
 T = TypeVar("T")
 _COSTS = {"ml": MaximumLikelihood(), "coherence": CoherenceWeighted()}
@@ -119,7 +122,7 @@ def identify_opened(opened: OpenedLogs) -> Identification:
     - `opened`: what `open_logs`, or `open_again` of a stored result, returned.
     """
     paths, settings, proposal, records = opened
-    flown = flown_law(paths, mix_of(settings.output), mix_of(settings.input), proposal, settings)
+    flown = _flown_law(opened)
     filters = () if flown is None or settings.keep_gyro_filters else flown.filters
     estimate = _estimate(opened, filters, vehicle=flown is not None, compare=True)
     method, frf, fit, parts, delay = estimate
@@ -146,6 +149,19 @@ def identify_opened(opened: OpenedLogs) -> Identification:
         paths[0], settings, records, responses, fits, parts, proposal, paths[1:], flown, check,
         bands, explanation, failures,
     )  # fmt: skip
+
+
+def _flown_law(opened: OpenedLogs) -> "FlownLaw | None":
+    """The gyro's filters and the law of an autopilot's log; None for any other output."""
+    paths, settings, proposal, _ = opened
+    [outputs] = mix_of(settings.output).values() or [{}]
+    axes = [axis for name in outputs if (axis := axis_of_rate(name)) is not None]
+    if len(outputs) != 1 or not axes:
+        return None
+    from jaxquad.autopilot import flown_law  # here: with it come the laws of all firmwares
+
+    [rate], [axis], [command] = outputs, axes, mix_of(settings.input).values()
+    return flown_law(paths, rate, axis, command, proposal, settings)
 
 
 def identify_fit(opened: OpenedLogs) -> Identification:

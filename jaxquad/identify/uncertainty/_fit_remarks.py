@@ -14,6 +14,20 @@ from ._discrepancy import Discrepancy
 from ._verdict import NO_MINIMUM, Verdict, without_numbers
 
 
+_STILL = 0.25  # standard errors: a bias of that size leaves a 95 % interval at 94.3 %
+_ROUNDING = 1e-4  # relative change that nobody looks for, where there is no noise
+MISFIT = 1.5  # ratio of misfit to random error from which the model's structure is in doubt
+DOUBT = 0.05  # probability that the model is right, below which a misfit is remarked
+NO_MODEL = 0.5  # discrepancy in rad, above which nothing counts as determined
+_LARGE = 0.3  # discrepancy in neper, above which intervals by small changes are rough
+_POOR = 10.0  # ratio above which a local minimum is likely
+_EXACT = 1e-9  # cost of a response without noise: no step lowers what rounding has left
+_LOCAL = ", or this is a local minimum: «try other starting values»"
+_FAR = 7.0  # in ln: a parameter that moved by a factor of 1000 ran for zero or infinity
+_BEYOND = 4.0  # random errors that a parameter at zero is pulled beyond it
+_FEEDBACK = "feedback"  # kind of a reason
+
+
 def no_minimum(
     names: tuple[str, ...], decrement: float, cost: float, *remedies: str, message: str = ""
 ) -> Verdict:
@@ -39,18 +53,6 @@ def is_unfinished(
     return not solution.converged and bool(np.any(np.abs(step) > limit))
 
 
-_STILL = 0.25  # standard errors: a bias of that size leaves a 95 % interval at 94.3 %
-_ROUNDING = 1e-4  # relative change that nobody looks for, where there is no noise
-MISFIT = 1.5  # ratio of misfit to random error from which the model's structure is in doubt
-DOUBT = 0.05  # probability that the model is right, below which a misfit is remarked
-NO_MODEL = 0.5  # discrepancy in rad, above which nothing counts as determined
-_LARGE = 0.3  # discrepancy in neper, above which intervals by small changes are rough
-_POOR = 10.0  # ratio above which a local minimum is likely
-_EXACT = 1e-9  # cost of a response without noise: no step lowers what rounding has left
-_LOCAL = ", or this is a local minimum: «try other starting values»"
-_FAR = 7.0  # in ln: a parameter that moved by a factor of 1000 ran for zero or infinity
-
-
 def remarks_on_fit(
     problem: Problem,
     solution: Solution,
@@ -66,11 +68,12 @@ def remarks_on_fit(
         remarks.append(Message(f"the solver stopped early: {solution.message}", "stopped early"))
     if no_minimum:
         more = "take more steps (max_steps=), or " if solution.message else ""
+        turned = "; the phase is off by about 180 deg: try the other sign of the gain"
         remarks.append(
             Message(
                 f"no minimum: one more Gauss-Newton step would lower the cost, {cost:.4g}, by "
                 f"{2 * decrement:.3g}; {more}«try other starting values»"
-                f"{_opposite(problem, solution)}",
+                f"{turned if _is_opposite(problem, solution) else ''}",
                 NO_MINIMUM,
             )
         )
@@ -95,9 +98,6 @@ def no_model(names: tuple[str, ...], unexplained: float) -> Verdict:
         "«start from other values»: this may be a local minimum",
     )
     return without_numbers("no model", names, reason, *remedies)
-
-
-_BEYOND = 4.0  # random errors that a parameter at zero is pulled beyond it
 
 
 def remarks_on_bounds(pulled: Mapping[str, float], verdict: Verdict) -> list[Message]:
@@ -140,9 +140,6 @@ def fed_back(names: tuple[str, ...], dominated: int, used: int) -> Verdict:
     return without_numbers("no model", names, reason, *remedies)
 
 
-_FEEDBACK = "feedback"  # kind of a reason
-
-
 def is_fed_back(verdict: Verdict) -> bool:
     """Whether feedback is why no model holds."""
     return any(reason.kind == _FEEDBACK for reason in verdict.reasons)
@@ -160,13 +157,8 @@ def remarks_on_discrepancy(discrepancy: Discrepancy) -> list[Message]:
     return [Message(text, "discrepancy")]
 
 
-def _opposite(problem: Problem, solution: Solution) -> str:
-    """A hint where the model turns the wrong way at the lowest frequencies."""
-    hint = "; the phase is off by about 180 deg: try the other sign of the gain"
-    return hint if _is_opposite(problem, solution) else ""
-
-
 def _is_opposite(problem: Problem, solution: Solution) -> bool:
+    """Whether the model turns the wrong way at the lowest frequencies."""
     for weights, misfit in zip(problem.weights, solution.sensitivity.misfits, strict=True):
         used = np.asarray(weights)[..., 0] > 0
         phases = np.abs(np.asarray(misfit)[..., 1][used])
@@ -196,22 +188,19 @@ def remarks_on_priors(
         )
     resolved = [name for name in by_data.undetermined if name not in verdict.undetermined]
     if resolved:
-        others = ", ".join(combination.name for combination in by_data.combinations)
+        alone = ", ".join(combination.name for combination in by_data.combinations)
         texts.append(
             f"{' and '.join(resolved)}: determined by the prior alone; the record by itself "
-            f"determines {'only ' + others if others else 'none of them'}"
+            f"determines {'only ' + alone if alone else 'none of them'}"
         )
     return [Message(text, "prior") for text in texts]
-
-
-def _change_of_z(problem: Problem, solution: Solution) -> Float[np.ndarray, " parameters"]:
-    return np.asarray(solution.z) - np.asarray(problem.parameters.start)[: solution.z.size]
 
 
 def runaways(problem: Problem, solution: Solution, verdict: Verdict) -> list[Message]:
     """Remarks on parameters that ran to zero or to infinity, as far as nothing bounds them."""
     names, lost = problem.parameters.names, verdict.undetermined
-    if verdict.kind == "no model" and _starts_opposite(problem, solution):
+    start = np.asarray(problem.parameters.start)[: solution.z.size]
+    if verdict.kind == "no model" and _is_opposite(problem, solution_at(problem, start)):
         text = "the phase at the start is off by about 180 deg: start with the other sign of the "
         return [Message(f"{text}gain", "sign")]
     texts = [
@@ -220,12 +209,7 @@ def runaways(problem: Problem, solution: Solution, verdict: Verdict) -> list[Mes
         for k in solution.at_zero
         if names[k] in lost
     ]
-    for k in np.flatnonzero(_change_of_z(problem, solution) > 2 * _FAR):
+    for k in np.flatnonzero(np.asarray(solution.z) - start > 2 * _FAR):
         if problem.parameters.logarithmic[k] and names[k] in lost:
             texts.append(f"{names[k]} ran to infinity: «start from other values», or leave it out")
     return [Message(text, "runaway") for text in texts]
-
-
-def _starts_opposite(problem: Problem, solution: Solution) -> bool:
-    start = np.asarray(problem.parameters.start)[: solution.z.size]
-    return _is_opposite(problem, solution_at(problem, start))
