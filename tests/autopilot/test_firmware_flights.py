@@ -19,7 +19,6 @@ from jaxquad.cli import main
 from jaxquad.workflows import (
     _autopilot as workflow,
     autopilot,
-    AutopilotSettings,
     IdentifySettings,
     propose_settings,
 )
@@ -44,8 +43,7 @@ def flown_of(path, axis):
     assert proposal is not None
     flight = read_channels_if_any(path, proposal, asked, settings_of(path, proposal).values)
     assert flight is not None
-    settings = AutopilotSettings(axis=axis, throttle=flight.middle)
-    return read_flown(path, proposal, settings, flight.tracked_hz), flight
+    return read_flown(path, proposal, flight.middle, flight.tracked_hz), flight
 
 
 def law_of(path, axis, **changed):
