@@ -319,6 +319,8 @@ def resample(
     - `RecordError`: for a longer gap or a value that is not finite within the range, and where the
         channels do not overlap.
     """
+    from scipy.interpolate import CubicSpline, make_interp_spline
+
     begin, end = _common_extent(channels, start, stop)
     if not (np.isfinite(sample_rate) and sample_rate > 0):
         raise RecordError(f"the sample rate is {sample_rate} Hz: it must be positive.")
@@ -338,7 +340,15 @@ def resample(
     fastest = max(channel.rate for channel in channels)
     columns = []
     for piece in pieces:
-        curve = _interpolate(piece)
+        holes, knots, values = _gaps(piece, -np.inf, np.inf), piece.time, piece.values
+        if holes.size:  # filled by a cubic: far apart knots make a spline of degree 7 oscillate
+            fill = []
+            for left, right in zip(piece.time[holes], piece.time[holes + 1], strict=True):
+                steps = round((right - left) * piece.rate)
+                fill.append(np.linspace(left, right, steps + 1)[1:-1])
+            knots = np.sort(np.concatenate([piece.time, *fill]))
+            values = CubicSpline(piece.time, piece.values)(knots)
+        curve = make_interp_spline(knots, values, k=7)
         if fastest <= _SAME * sample_rate:
             columns.append(curve(time))
         else:
@@ -373,21 +383,6 @@ def _common_extent(
     if begin < first - slack or end > last + slack:
         raise RecordError(f"{shown(begin, end)} is out of range; {overlap}.")
     return max(begin, first), min(end, last)
-
-
-def _interpolate(piece: Channel) -> Callable[[Times], Times]:
-    """A spline of degree 7, with gaps filled by a cubic: far apart knots make it oscillate."""
-    from scipy.interpolate import CubicSpline, make_interp_spline
-
-    holes, time, values = _gaps(piece, -np.inf, np.inf), piece.time, piece.values
-    if holes.size:
-        fill = []
-        for left, right in zip(piece.time[holes], piece.time[holes + 1], strict=True):
-            steps = round((right - left) * piece.rate)
-            fill.append(np.linspace(left, right, steps + 1)[1:-1])
-        time = np.sort(np.concatenate([piece.time, *fill]))
-        values = CubicSpline(piece.time, piece.values)(time)
-    return make_interp_spline(time, values, k=7)
 
 
 def _remarks(

@@ -155,7 +155,8 @@ _SAVE = "s = get(z); save('z.mat', 's', '-v7')"
 def from_iddata(path: str | Path, variable: str | None, references: Names) -> Record:
     """`Record.from_iddata`, where the arguments are described."""
     fields = _fields(path, variable)
-    y, u = (_matrix(path, fields, *names) for names in (("y", "OutputData"), ("u", "InputData")))
+    y = _matrix(path, fields, "y", "OutputData")
+    u = _matrix(path, fields, "u", "InputData")
     time, dt = _uniform_time(path, fields, len(y))
     inputs = _labels(fields, "InputName", u, "u")
     input_units = _labels(fields, "InputUnit", u, "")

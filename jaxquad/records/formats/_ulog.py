@@ -258,7 +258,17 @@ def _interpret(kind: int, body: bytes, place: int, messages: _Messages) -> None:
         return
     try:
         if letter == "F":
-            _define(body.decode(), place, messages)
+            text = body.decode()  # `name:type field;type[4] field;`
+            name, colon, rest = text.partition(":")
+            parts = [part.strip() for part in rest.split(";") if part.strip()]
+            matches = [_FIELD.fullmatch(part) for part in parts]
+            if not name or not colon or not parts or not all(matches):
+                raise ReadError(f"{text[:60]!r} is not a definition of a format", offset=place)
+            fields = tuple(
+                Field(m[1], None if m[2] is None else int(m[2]), m[3]) for m in matches if m
+            )
+            if messages.formats.setdefault(name, fields) != fields:
+                raise ReadError(f"the format {name!r} is defined twice, differently", offset=place)
         elif letter == "A":
             _subscribe(body, place, messages)
         elif letter == "R":
@@ -281,18 +291,6 @@ def _interpret(kind: int, body: bytes, place: int, messages: _Messages) -> None:
         if len(messages.notes) < _MOST_NOTES:
             reason = str(error).rstrip(".")
             messages.notes.append(f"message {letter} at byte {place} was left out: {reason}")
-
-
-def _define(text: str, place: int, messages: _Messages) -> None:
-    """Take `name:type field;type[4] field;`."""
-    name, colon, body = text.partition(":")
-    parts = [part.strip() for part in body.split(";") if part.strip()]
-    matches = [_FIELD.fullmatch(part) for part in parts]
-    if not name or not colon or not parts or not all(matches):
-        raise ReadError(f"{text[:60]!r} is not a definition of a format", offset=place)
-    fields = tuple(Field(m[1], None if m[2] is None else int(m[2]), m[3]) for m in matches if m)
-    if messages.formats.setdefault(name, fields) != fields:
-        raise ReadError(f"the format {name!r} is defined twice, differently", offset=place)
 
 
 def _subscribe(body: bytes, place: int, messages: _Messages) -> None:
