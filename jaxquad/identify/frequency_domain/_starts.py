@@ -12,6 +12,7 @@ from jaxquad._core import (
     CONVERGED,
     decrement,
     Descent,
+    Message,
     minimise,
     Normal,
     RUNNING,
@@ -215,21 +216,25 @@ def _point(parameters: Parameters, stops: _Stops, group: list[int]) -> Minimum:
 _NEAR = 1.5  # ratio of costs within which another minimum is a rival
 
 
-def remarks_on_minima(problem: Problem, is_saddle: bool, minima: tuple[Minimum, ...]) -> list[str]:
+def remarks_on_minima(
+    problem: Problem, is_saddle: bool, minima: tuple[Minimum, ...]
+) -> list[Message]:
     """Remarks on a saddle instead of a minimum, and on other minima of nearly the best cost."""
     remarks = []
     if is_saddle:
-        remarks.append(
+        text = (
             "stationary, but no minimum: the cost falls to one side; «start from other values»"
             "«, or give starts=20»"
         )
+        remarks.append(Message(text, "saddle"))
     true = [point for point in minima if point.is_minimum]
     rivals = [point for point in true[1:] if point.cost <= _NEAR * true[0].cost]
     if rivals:
         values = ", ".join(f"{x:.4g}" for x in rivals[0].values)
-        remarks.append(
+        text = (
             f"{len(rivals)} other minima cost less than {_NEAR:g} times the best; the next costs "
             f"{rivals[0].cost:.4g} at {', '.join(problem.parameters.names)} = {values}: record "
             "more, or over a wider band, to know which is right"
         )
+        remarks.append(Message(text, "other minima"))
     return remarks
