@@ -30,7 +30,7 @@ from ._flight_channels import FlightChannels, read_channels_if_any, settings_of
 from ._identified import RecordSettings
 from ._law import RateLoop
 from ._pilot_page import StepGrid
-from ._rate_gains import law_responses
+from ._rate_loops import law_responses
 
 
 Frequencies = Float[np.ndarray, " frequencies"]

@@ -26,7 +26,7 @@ from ._firmware import firmware_named
 from ._flight_channels import FlownAutopilot
 from ._identified import IdentifiedPlant
 from ._parameters import find_parameter
-from ._plants import PlantSource
+from ._rate_loops import PlantSource
 
 
 ReadBeside = Callable[[Mapping[str, Mapping[str, float]]], Sequence[Record]]

@@ -125,11 +125,11 @@ def write_pilot_page(path: str | Path, *pages: PilotPage) -> Path:
 # The sections that hold figures, None for what a page does not have. `plot` and `embed_figure` are
 # looked up when a page is written: with them comes matplotlib.
 
-Section = dict[str, object] | None
+PageSection = dict[str, object] | None
 _SHOWN = (10.0, 50.0)  # Hz, of a table of delays
 
 
-def filters_section(page: PilotPage) -> Section:
+def filters_section(page: PilotPage) -> PageSection:
     """Magnitude and delay of what each signal has passed, and the shares of the delay."""
     drawn = {}
     for design, chains in page.filters.items():
@@ -161,7 +161,7 @@ def filters_section(page: PilotPage) -> Section:
     return {"image": image, "tables": tables}
 
 
-def noise_section(page: PilotPage) -> Section:
+def noise_section(page: PilotPage) -> PageSection:
     """Spectra of gyro and D term."""
     if not page.gyro:
         return None
@@ -174,7 +174,7 @@ def noise_section(page: PilotPage) -> Section:
     return {"image": image, "text": page.noise}
 
 
-def steps_section(page: PilotPage) -> Section:
+def steps_section(page: PilotPage) -> PageSection:
     """Steps of the set-point, and their overshoot."""
     if not page.steps:
         return None
@@ -193,7 +193,7 @@ def steps_section(page: PilotPage) -> Section:
     return {"image": image, "table": Table("Step responses", heads, rows)}
 
 
-def again_section(page: PilotPage) -> Section:
+def again_section(page: PilotPage) -> PageSection:
     """A part of the flight as logged and as law and plant make it."""
     flight = page.again
     if flight is None:
@@ -207,7 +207,7 @@ def again_section(page: PilotPage) -> Section:
     return {"image": image, "text": page.again_text}
 
 
-def b0_section(page: PilotPage) -> Section:
+def b0_section(page: PilotPage) -> PageSection:
     """b0 over the throttle."""
     section = page.b0
     if section is None:
@@ -227,7 +227,7 @@ def b0_section(page: PilotPage) -> Section:
     return {"image": image, "table": Table("Levels flown", heads, rows), "text": section.text}
 
 
-def balance_section(page: PilotPage) -> Section:
+def balance_section(page: PilotPage) -> PageSection:
     """How large the terms were, and how often motors were at their limits."""
     if not page.terms and not page.motors:
         return None
@@ -247,7 +247,7 @@ def balance_section(page: PilotPage) -> Section:
     return {"image": image, "motors": motors if rows else None}
 
 
-SECTIONS: Mapping[str, Callable[[PilotPage], Section]] = {
+SECTIONS: Mapping[str, Callable[[PilotPage], PageSection]] = {
     "filters": filters_section,
     "again": again_section,
     "noise": noise_section,

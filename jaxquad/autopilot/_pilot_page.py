@@ -17,7 +17,7 @@ from ._flight_channels import FlightChannels
 from ._gyro_noise import gyro_noise, GyroNoise
 from ._law import RateLoop
 from ._page import PilotPage
-from ._rate_gains import gains_in, gains_of, gyro_chain_response, law_paths
+from ._rate_loops import gains_in, gains_of, gyro_chain_response, law_paths
 from ._stages import limits_text
 
 
