@@ -3,7 +3,7 @@
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple, TYPE_CHECKING
+from typing import NamedTuple, TYPE_CHECKING, TypeVar
 
 import numpy as np
 
@@ -50,7 +50,7 @@ from ._settings import IdentifySettings
 if TYPE_CHECKING:
     from jaxquad.autopilot import FlownLaw
 
-
+T = TypeVar("T")
 _COSTS = {"ml": MaximumLikelihood(), "coherence": CoherenceWeighted()}
 _POINTS = 100  # frequencies, log-spaced over the band
 _LONGEST = 0.02  # of the record: a longer delay is no delay of the vehicle
@@ -128,7 +128,7 @@ def identify_opened(opened: OpenedLogs) -> Identification:
     method, frf, fit, parts, delay = estimate
     responses, fits, failures = {method: frf}, {method: fit}, {}
 
-    def attempt(title: str, compute: Callable[[], object]):
+    def attempt(title: str, compute: Callable[[], T]) -> T | None:
         try:
             return compute()
         except Exception as error:
