@@ -189,14 +189,15 @@ def _distinct(parameters: Parameters, stops: _Stops) -> tuple[Minimum, ...]:
     points = [_point(parameters, stops, group) for group in groups]
     lost = tuple(k for k in range(len(z)) if not np.isfinite(costs[k]))
     if lost:
-        values = np.asarray(parameters.values(z[lost[0]]))
-        points.append(Minimum(np.inf, z[lost[0]], values, lost, np.inf, -np.inf, NOT_FINITE))
+        first = np.asarray(z[lost[0]])
+        values = np.asarray(parameters.values(first))
+        points.append(Minimum(np.inf, first, values, lost, np.inf, -np.inf, NOT_FINITE))
     return tuple(points)
 
 
 def _point(parameters: Parameters, stops: _Stops, group: list[int]) -> Minimum:
     k, curvature = group[0], -np.inf
-    z, left, cost = stops.z[k], float(stops.decrement[k]), float(stops.normal.cost[k])
+    z, left, cost = np.asarray(stops.z[k]), float(stops.decrement[k]), float(stops.normal.cost[k])
     hessian = stops.bent[k]
     if np.all(np.isfinite(hessian)):
         size = np.sqrt(np.maximum(np.abs(np.diagonal(hessian)), 1e-300))
