@@ -24,6 +24,7 @@ from jaxquad.models import DecoupledAxes
 from jaxquad.simulation import Pulse, Saturation, scenario, Sine, Step
 from jaxquad.tuning import Objective
 from jaxquad.tuning._cost import evaluate_cost, initial_multipliers, stack_copies, Subproblem
+from jaxquad.tuning._lbfgs import minimise as minimise  # for its test and its benchmark
 from jaxquad.tuning._parameters import select_coordinates
 from jaxquad.tuning._problem import linear_loops, make_problem, TimeSpan
 

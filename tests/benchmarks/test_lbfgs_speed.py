@@ -14,10 +14,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
-from tuning_case import coordinates_of, cost_at, ensemble, loop, pose, STARTS
+from tuning_case import coordinates_of, cost_at, ensemble, loop, minimise, pose, STARTS
 
 from jaxquad.tuning import LBFGS
-from jaxquad.tuning._lbfgs import minimise
 
 
 jax.config.update("jax_enable_x64", True)

@@ -103,6 +103,7 @@ def test_a_flown_chirp_shows_a_damping_where_there_is_one(damping):
 
 def test_one_more_fit_which_starts_from_the_phase_at_the_lowest_frequencies_is_enough(monkeypatch):
     plain, starts = jq.fit(START, flown(1.0, seed=0)), []
+    assert plain.origin is not None
     kind = type(plain.origin)
     run = kind.fit_again
 
@@ -121,6 +122,7 @@ def test_the_errors_count_what_a_damping_of_three_degrees_moves():
     plain = jq.fit(START, flown(2.1, seed=3))
     sharp, fit = fit_damped(plain, unmodelled=0.0), fit_damped(plain)
     np.testing.assert_array_equal(fit.values, sharp.values)
+    assert plain.used_band is not None
     share = 0.05 * plain.used_band[0] / fit["damping"]
     moved = share * (sharp.values[:3] - plain.values) / 1.96
     wanted = np.sqrt(sharp.standard_errors[:3] ** 2 + moved**2)

@@ -84,7 +84,7 @@ def solve_batch(
     `weights` (batch, frequencies, outputs, inputs, 2) are those of `ln|T/T^|` and of the wrapped
     phase of `T/T^` in rad, as of `jq.fit`, 0 where a point does not count; `mixings`, one for each
     member or none at all, take points together that share noise. All start from the model's values,
-    or from `start`. The model is evaluated one frequency at a time, with inputs held for `hold` s
+    or from `start`. The model is evaluated at all frequencies at once, inputs held for `hold` s
     (0: not held). A member that did not reach a stationary point has `converged` false, and its
     decrement says how far it is; one in a local minimum shows by its cost alone.
     Raises ValueError for shapes that do not match, no batch at all, or a response that at one

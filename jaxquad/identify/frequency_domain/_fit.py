@@ -202,7 +202,7 @@ def _fit_with(
 
 def _remarks_on_silence(
     frfs: Sequence[FrequencyResponse], usable_points: Sequence[Mask], problem: Problem
-) -> list[str]:
+) -> list[Message]:
     """Remark on responses that were measured, and that the model has none of."""
     remarks = []
     for frf, mask, pairs in zip(frfs, usable_points, problem.silent, strict=True):
@@ -211,11 +211,12 @@ def _remarks_on_silence(
             if not error.size or np.mean(error < _PRESENT) < 0.5:
                 continue
             pair = (frf.output_names[o], frf.input_names[i])
-            remarks.append(
+            text = (
                 f"{pair[0]} answers to {pair[1]} (random error {100 * np.median(error):.2g} % at "
                 f"{error.size} frequencies), but the model's response is zero: these points are "
                 f"left out; free what joins the two, or say band={{{pair}: None}}"
             )
+            remarks.append(Message(text, "no response"))
     return remarks
 
 

@@ -204,7 +204,7 @@ def _log_ratios(z: Float[Array, " n"], problem: Problem) -> list[tuple[Part, Par
     # Frequencies come last until all is done: derivatives are then fast loops over them.
     model, logs = problem.parameters.insert(problem.model, z), []
     records = zip(problem.conditions, problem.omega, problem.aliases, strict=True)
-    responses = [evaluate_sampled(change(model), *where) for change, *where in records]
+    responses = [evaluate_sampled(change(model), w, aliases) for change, w, aliases in records]
     for response, measured, silent in zip(
         responses, problem.measured, problem.silences, strict=True
     ):

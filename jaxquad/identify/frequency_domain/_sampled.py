@@ -116,7 +116,7 @@ def hold_of(frf: FrequencyResponse) -> float:
 
 def remarks_on_hold(
     frfs: Sequence[FrequencyResponse], used: Sequence[Bool[np.ndarray, "..."]]
-) -> list[str]:
+) -> list[Message]:
     """Remark on inputs of which nobody said how they are held, where it would show.
 
     What is held for a sample loses (w dt)^2 / 24 of its magnitude, beside a delay of half a sample.
@@ -131,13 +131,14 @@ def remarks_on_hold(
         k = np.unravel_index(np.argmax(over), over.shape)
         if over[k] > 1:
             omega = np.asarray(frf.omega)[k[0]]
-            return [
+            text = (
                 "it is not known how long the input keeps each value: if it is held for a sample "
                 f"({1e3 * frf.dt:.3g} ms), the gain is {100 * lost[k]:.2g} % too low at "
                 f"{omega:.3g} rad/s ({omega / (2 * np.pi):.3g} Hz), {over[k]:.2g} times the random "
                 "error, and the delay half a sample too long; give «hold=» in s, the loop's period "
                 "for a command, 0 for a quantity that was measured« (jq.Record, jq.read)»"
-            ]
+            )
+            return [Message(text, "hold")]
     return []
 
 

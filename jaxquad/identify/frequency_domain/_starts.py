@@ -12,6 +12,7 @@ from jaxquad._core import (
     CONVERGED,
     decrement,
     Descent,
+    Message,
     minimise,
     Normal,
     RUNNING,
@@ -188,14 +189,15 @@ def _distinct(parameters: Parameters, stops: _Stops) -> tuple[Minimum, ...]:
     points = [_point(parameters, stops, group) for group in groups]
     lost = tuple(k for k in range(len(z)) if not np.isfinite(costs[k]))
     if lost:
-        values = np.asarray(parameters.values(z[lost[0]]))
-        points.append(Minimum(np.inf, z[lost[0]], values, lost, np.inf, -np.inf, NOT_FINITE))
+        first = np.asarray(z[lost[0]])
+        values = np.asarray(parameters.values(first))
+        points.append(Minimum(np.inf, first, values, lost, np.inf, -np.inf, NOT_FINITE))
     return tuple(points)
 
 
 def _point(parameters: Parameters, stops: _Stops, group: list[int]) -> Minimum:
     k, curvature = group[0], -np.inf
-    z, left, cost = stops.z[k], float(stops.decrement[k]), float(stops.normal.cost[k])
+    z, left, cost = np.asarray(stops.z[k]), float(stops.decrement[k]), float(stops.normal.cost[k])
     hessian = stops.bent[k]
     if np.all(np.isfinite(hessian)):
         size = np.sqrt(np.maximum(np.abs(np.diagonal(hessian)), 1e-300))
@@ -214,21 +216,25 @@ def _point(parameters: Parameters, stops: _Stops, group: list[int]) -> Minimum:
 _NEAR = 1.5  # ratio of costs within which another minimum is a rival
 
 
-def remarks_on_minima(problem: Problem, is_saddle: bool, minima: tuple[Minimum, ...]) -> list[str]:
+def remarks_on_minima(
+    problem: Problem, is_saddle: bool, minima: tuple[Minimum, ...]
+) -> list[Message]:
     """Remarks on a saddle instead of a minimum, and on other minima of nearly the best cost."""
     remarks = []
     if is_saddle:
-        remarks.append(
+        text = (
             "stationary, but no minimum: the cost falls to one side; «start from other values»"
             "«, or give starts=20»"
         )
+        remarks.append(Message(text, "saddle"))
     true = [point for point in minima if point.is_minimum]
     rivals = [point for point in true[1:] if point.cost <= _NEAR * true[0].cost]
     if rivals:
         values = ", ".join(f"{x:.4g}" for x in rivals[0].values)
-        remarks.append(
+        text = (
             f"{len(rivals)} other minima cost less than {_NEAR:g} times the best; the next costs "
             f"{rivals[0].cost:.4g} at {', '.join(problem.parameters.names)} = {values}: record "
             "more, or over a wider band, to know which is right"
         )
+        remarks.append(Message(text, "other minima"))
     return remarks

@@ -98,12 +98,15 @@ def descend(
             "Start from other values, cut the record with jq.records.trim, or fit in the "
             "frequency domain with jq.fit"
         )
-    stop, status, steps = minimise_on_host(start, type(start).moved, max_steps, tolerance=tolerance)
-    if isinstance(stop, FilteredPoint) and not stop.is_precise:
-        start = _point(problem, stop.z)
-        stop, status, steps = minimise_on_host(start, Point.moved, max_steps, tolerance=tolerance)
-    if isinstance(stop, FilteredPoint):
-        stop = Point(problem, stop.z, stop.evaluation)
+    options = {"max_steps": max_steps, "tolerance": tolerance}
+    if isinstance(start, FilteredPoint):
+        end, status, steps = minimise_on_host(start, FilteredPoint.moved, **options)
+        precise = end.is_precise
+        stop = Point(problem, end.z, end.evaluation) if precise else _point(problem, end.z)
+    else:
+        precise, stop, status, steps = False, start, RUNNING, 0
+    if not precise:
+        stop, status, steps = minimise_on_host(stop, Point.moved, **options)
     message = ""
     if status == RUNNING:
         message = f"the maximum of {steps} steps was reached"

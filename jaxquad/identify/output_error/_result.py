@@ -233,12 +233,12 @@ def _same_outputs(descent: Descent, values: Float[np.ndarray, " parameters"]) ->
 
 def _remarks_on_output_error(
     descent: Descent, records: Sequence[Record], decrement: float, taken: float, verdict: Verdict
-) -> list[str]:
+) -> list[Message]:
     """Runaway parameters, missing convergence, and feedback."""
     solution, no_minimum = descent.solution, decrement > _LEFT * max(taken, 1.0)
     remarks = runaways(descent.problem.base, solution, verdict)
     if not solution.converged and (no_minimum or not remarks):
-        remarks.append(f"the solver stopped early: {solution.message}")
+        remarks.append(Message(f"the solver stopped early: {solution.message}", "stopped early"))
     if no_minimum:
         remarks.append(
             Message(
@@ -261,19 +261,20 @@ def _remarks_on_output_error(
                 "compare",
                 "",
             )
-        remarks.append(
+        text = (
             f"the record has references ({', '.join(names)}), so a loop may have been closed: "
             f"{doubt} the joint estimate{instead}"
             "«joint estimate|, jq.frequency_response(..., estimator=jq.spectra.JointInputOutput())»"
         )
-    remarks.append(
+        remarks.append(Message(text, "feedback"))
+    text = (
         "the noise level is estimated from the residuals, so misfit / random error is 1 for any "
         "model: check the model by «jq.verify» on another record"
     )
-    return remarks
+    return [*remarks, Message(text, "noise level")]
 
 
-def _remarks_on_colour(descent: Descent, bread: Matrix, covariance: Matrix) -> list[str]:
+def _remarks_on_colour(descent: Descent, bread: Matrix, covariance: Matrix) -> list[Message]:
     """Remark on residuals whose colour changes the standard errors."""
     white = np.diagonal(scaled_inverse(bread))
     ratio = np.sqrt(np.diagonal(covariance) / np.maximum(white, 1e-300))
@@ -288,7 +289,8 @@ def _remarks_on_colour(descent: Descent, bread: Matrix, covariance: Matrix) -> l
         subject, advice = "the noise model leaves the residuals", "try one of higher order"
     else:
         subject, advice = "the residuals are", 'noise="auto" weights them by their spectrum'
-    return [
+    text = (
         f"{subject} coloured (lag-one correlation {correlation:.2f}): standard errors allow for "
         f"it, and are up to {most:.2g} times those under white noise; {advice}"
-    ]
+    )
+    return [Message(text, "coloured residuals")]

@@ -225,7 +225,7 @@ def _costs_by_noise(
 
 def _remarks_on_growth(
     model: PyTree, frfs: Sequence[FrequencyResponse], used: Sequence[np.ndarray]
-) -> list[str]:
+) -> Sequence[str]:
     """Remark on a model that grows within the band of a direct estimate: no open loop does."""
     lags = isinstance(model, LaggedIntegrator) and not np.asarray(model.lag) < 0
     if lags or not any(frf.method == "direct" for frf in frfs):
