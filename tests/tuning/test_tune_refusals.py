@@ -82,10 +82,10 @@ def test_a_tune_that_is_stopped_has_not_converged_and_says_so():
 
 @pytest.mark.slow
 def test_a_limit_that_cannot_be_met_ends_the_rounds_nearest_to_it_and_says_so():
-    limits = [Limit("sensitivity_peak", at_most=1.02)]
+    limits = [Limit("itae", at_most=1e-6)]
     found = brief(case.ladrc(3.0, 30.0), Objective(), None, limits=limits, evaluations=60)
     [missed] = found.limits
-    assert not missed.met and 1.02 < missed.reached < 1.4
+    assert not missed.met and missed.reached > 1e-6
     assert found.convergence.holds is False and "the limit on " in found.convergence.text
     assert "Relax the limits" in found.convergence.remedy
 
