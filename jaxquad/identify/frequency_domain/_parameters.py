@@ -237,24 +237,20 @@ def select_parameters(
     ratio = np.array([values[p.name] for p in ordered]) / np.array(scales)
     start = np.where(logs, np.log(np.where(logs, ratio, 1.0)), ratio)
     parameters = Parameters(ordered, ties, logs, len(chosen), np.asarray(scales, float), start)
-    _check_order(model, parameters)
-    return parameters
-
-
-def _check_order(model: PyTree, parameters: Parameters) -> None:
-    """Raise ValueError for a tie that follows itself, or one that comes after it."""
-    if not parameters.ties:
-        return
-    values = _MOVED * parameters.values(parameters.start[: parameters.count])
-    moved = parameters.replace(model, values)
-    again = parameters.replace(moved, values)
-    places = [place for place, _ in parameters.ties]
-    for name, value in _numbers(moved, places).items():
-        if not np.isclose(value, _numbers(again, places)[name], rtol=1e-9, equal_nan=True):
+    if not ties:
+        return parameters
+    # No tie follows itself, or one that comes after it.
+    start = _MOVED * parameters.values(parameters.start[: parameters.count])
+    moved = parameters.replace(model, start)
+    again = parameters.replace(moved, start)
+    tied_places = [place for place, _ in ties]
+    for name, value in _numbers(moved, tied_places).items():
+        if not np.isclose(value, _numbers(again, tied_places)[name], rtol=1e-9, equal_nan=True):
             raise ValueError(
                 f"{name} is tied to itself, or to a parameter whose tie comes later: ties are "
                 "computed one after the other, each from free, fixed and earlier tied parameters"
             )
+    return parameters
 
 
 def _expand(
