@@ -112,12 +112,12 @@ from .uncertainty._derived import (
     factors as factors,
     Tied as Tied,
 )
-from .uncertainty._discrepancy import Discrepancy as Discrepancy
 from .uncertainty._draw_models import (
     check_drawable as check_drawable,
     draw_models as draw_models,
     known_covariance as known_covariance,
 )
+from .uncertainty._error_budget import Discrepancy as Discrepancy
 from .uncertainty._fit_remarks import MISFIT as MISFIT
 from .uncertainty._verdict import (
     Bound as Bound,

@@ -37,6 +37,12 @@ CHAIN = FilterChain((Butterworth(20.0), PT1(60.0)), 400.0)
 AT = np.array([0.5, 3.0, 20.0, 150.0])
 
 
+def law_of(found):
+    """The flown loop of an identification."""
+    [unit] = found.records[0].output_units
+    return loop_of_law(found.flown, found.fit, found.frf, found.filters, unit)
+
+
 @pytest.fixture
 def log(data):
     """The path of a log that a firmware flew."""
@@ -62,11 +68,6 @@ def test_stored_filters_are_those_that_were_divided_out():
         StoredFilters.of({"chains": [{}]})
 
 
-def loop_of(found):
-    [unit] = found.records[0].output_units
-    return loop_of_law(found.flown, found.fit, found.frf, found.filters, unit)
-
-
 @pytest.mark.slow
 def test_ardupilots_filters_are_divided_out_and_the_result_stays_one(log, tmp_path, capsys):
     """True: 25067 deg/s^2, lag .030 s, no delay, Ms of the rate loop 1.80."""
@@ -77,7 +78,7 @@ def test_ardupilots_filters_are_divided_out_and_the_result_stays_one(log, tmp_pa
     assert low < 25067 < high and high - low < 0.03 * 25067
     assert found.fit.interval("lag")[0] < 0.030 < found.fit.interval("lag")[1] + 1e-4
     assert found.fit["delay"] < 5e-4
-    loop = loop_of(found)
+    loop = law_of(found)
     assert loop is not None and loop.model is not None and loop.step is not None
     assert np.max(1 / np.abs(1 + loop.model.response)) == pytest.approx(1.80, abs=0.03)
     assert loop.measured.crossover == pytest.approx(loop.model.crossover, rel=0.02)
@@ -110,7 +111,7 @@ def test_ardupilots_filters_are_divided_out_and_the_result_stays_one(log, tmp_pa
 def test_betaflights_page_has_a_step_and_the_margins_of_its_law(log, tmp_path, name):
     """Sticks and chirp of one vehicle and one set of gains: the same loop, whatever F adds."""
     found = identify(log(name), IdentifySettings(axis="roll"))
-    loop = loop_of(found)
+    loop = law_of(found)
     assert loop is not None and loop.model is not None
     margin, error = loop.measured.phase_margin
     assert loop.measured.crossover == pytest.approx(40.0, rel=0.03)

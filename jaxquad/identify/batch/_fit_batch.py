@@ -30,13 +30,14 @@ from ..frequency_domain._cost import (
     Cost,
     least_coherence,
     MaximumLikelihood,
+    Mixing,
+    mixings_of,
     Points,
     points_of,
     Range,
     usable,
 )
 from ..frequency_domain._fit import check_options
-from ..frequency_domain._mixing import Mixing, mixings_of
 from ..frequency_domain._parameters import Free, Numbers, Parameters, select_parameters, Tie
 from ..frequency_domain._problem import make_problem
 from ..frequency_domain._result import Fit

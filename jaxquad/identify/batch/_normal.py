@@ -14,7 +14,7 @@ from jaxquad._compile import evaluate_once
 from jaxquad._core import Normal
 from jaxquad.models import evaluate_response, StateSpace
 
-from ..frequency_domain._mixing import Mixing
+from ..frequency_domain._cost import Mixing
 from ..frequency_domain._parameters import Numbers, Parameters, Place, UNCHANGED
 from ..frequency_domain._problem import Problem, problem_normal
 from ..frequency_domain._sampled import behind_hold

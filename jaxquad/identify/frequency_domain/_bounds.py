@@ -11,7 +11,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from ._mixing import mix
+from ._cost import mix
 from ._problem import Problem
 from ._solve import Solution, solution_at, solve, weighted_residuals
 

@@ -4,7 +4,7 @@ from typing import NamedTuple, TYPE_CHECKING
 
 import numpy as np
 
-from ..uncertainty._discrepancy import SHARES
+from ..uncertainty._error_budget import SHARES
 
 
 if TYPE_CHECKING:

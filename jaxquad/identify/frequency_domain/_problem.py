@@ -15,7 +15,7 @@ from jaxquad._core import Message, Normal, normal_equations, on_host, pytree_nod
 from jaxquad.models import evaluate_response, LaggedIntegrator, StateSpace, TransferFunction
 from jaxquad.spectra import FrequencyResponse
 
-from ._mixing import mix_parts, Mixing, unmixed
+from ._cost import mix_parts, Mixing, unmixed
 from ._parameters import Condition, find_place, Numbers, Parameters, require_conditions
 from ._sampled import Aliases, evaluate_sampled, hold_of, plan_aliases
 

@@ -77,7 +77,14 @@ def assess_output_error(descent: Descent, records: Sequence[Record]) -> Fit:
     covariance = calibrated_covariance(bread, noise)
     taken = float(np.trace(scaled_inverse(bread) @ noise.data))
     step = scaled_inverse(bread) @ gradient
-    decrement, explained = 0.5 * float(gradient @ step), _explained(projected, problem.terms)
+    decrement = 0.5 * float(gradient @ step)
+    # The share of the outputs' power that the inputs explain, without initial state and trim.
+    total = 0.0
+    for one, term in zip(projected, problem.terms, strict=True):
+        basis = one.nuisance.reshape(-1, one.nuisance.shape[2])
+        output = np.asarray(term.measured).reshape(-1)
+        total += float(np.sum(output**2) - np.sum((basis.T @ output) ** 2))
+    explained = 1 - data_cost / total if total > 0 else 1.0
     # In units of what the noise moves: a share of the cost would grow with the record.
     if decrement > count * max(taken, 1.0) or is_unfinished(solution, step, covariance):
         remedy = "«start from other values», for instance those of jq.fit"
@@ -158,17 +165,6 @@ def _reduce_rows(
         noise += projected_noise(mine, one.misfit, one.nuisance, count)
         at += one.misfit.size
     return Reduced(root, aim, noise, output)
-
-
-def _explained(projected: Sequence[Projected], terms: Sequence[RecordTerm]) -> float:
-    """The share of the outputs' power that the inputs explain, without initial state and trim."""
-    left = total = 0.0
-    for one, term in zip(projected, terms, strict=True):
-        basis = one.nuisance.reshape(-1, one.nuisance.shape[2])
-        output = np.asarray(term.measured).reshape(-1)
-        total += float(np.sum(output**2) - np.sum((basis.T @ output) ** 2))
-        left += float(np.sum(one.misfit**2))
-    return 1 - left / total if total > 0 else 1.0
 
 
 def _verdict(

@@ -11,7 +11,7 @@ from jaxtyping import Complex, Float
 
 from jaxquad.spectra import FrequencyResponse
 
-from ..frequency_domain._mixing import expected_cost, mix, mix_twice, Mixing
+from ..frequency_domain._cost import expected_cost, mix, mix_twice, Mixing
 
 
 Matrix = Float[np.ndarray, "parameters parameters"]

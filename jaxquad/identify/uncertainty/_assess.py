@@ -37,8 +37,15 @@ from ._accuracy import (
     PriorRows,
     scaled_inverse,
 )
-from ._discrepancy import Discrepancy
-from ._error_budget import error_budget, ErrorBudget, records_of, Units, units_of, Weighting
+from ._error_budget import (
+    Discrepancy,
+    error_budget,
+    ErrorBudget,
+    records_of,
+    Units,
+    units_of,
+    Weighting,
+)
 from ._fit_remarks import (
     DOUBT,
     fed_back,

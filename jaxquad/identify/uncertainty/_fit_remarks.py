@@ -10,7 +10,7 @@ from jaxquad._core import Message
 from ..frequency_domain._problem import Problem
 from ..frequency_domain._solve import Solution, solution_at
 from ._accuracy import Matrix
-from ._discrepancy import Discrepancy
+from ._error_budget import Discrepancy
 from ._verdict import NO_MINIMUM, Verdict, without_numbers
 
 
