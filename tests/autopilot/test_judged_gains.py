@@ -1,6 +1,7 @@
 """The verdict on certified gains of a flown rate loop."""
 
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
@@ -22,8 +23,8 @@ def stage(stable, peak=1.5, rejection=0.5):
 )
 @pytest.mark.usefixtures("without_type_checks")  # of the stand-ins
 def test_a_loop_that_flew_is_stable_on_the_plants_that_are_the_vehicle(flown, best, kind):
-    stages = [stage(flown, peak=30.0), stage(best), stage(best)]
-    throttle = SimpleNamespace(logged=())
+    stages: Any = [stage(flown, peak=30.0), stage(best), stage(best)]
+    throttle: Any = SimpleNamespace(logged=())
     found, words = _judge(stages, AutopilotSettings(), 200.0, None, throttle)
     assert found == kind
     assert ("stable on 2.0 % only" in words) == (kind == "cannot tell")

@@ -119,7 +119,7 @@ def _work(
             print(f"BAD {kind} seed {seed} case {number}: {text}", flush=True)
 
 
-def _in_this_process(command: list[str], **_: object) -> subprocess.CompletedProcess:
+def _in_this_process(command: list[str], **unused: object) -> subprocess.CompletedProcess:
     """What the child process of a reader would write."""
     stream = io.BytesIO()
     *_, script, name, path, limit = command

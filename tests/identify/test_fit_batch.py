@@ -38,13 +38,13 @@ class Alike(eqx.Module):
         return np.where(points.used, 50.0, 0.0)[..., None] * np.ones(2)
 
 
-def frf_of(response, coherence=0.95):
+def frf_of(response, coherence: float | np.ndarray = 0.95):
     like = response_of(START, omega=np.asarray(OMEGA)[: len(response)])
     coherence = jnp.broadcast_to(jnp.asarray(coherence), like.coherence.shape)
     return dataclasses.replace(like, response=jnp.asarray(response), coherence=coherence)
 
 
-def solved(responses, coherence=0.95, **options):
+def solved(responses, coherence: float | np.ndarray = 0.95, **options):
     frfs = [frf_of(each, coherence) for each in responses]
     return fit_batch(START, frfs, free=FREE, cost=Alike(), **options)
 

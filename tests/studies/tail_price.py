@@ -149,13 +149,13 @@ def main() -> None:
     draw = lambda key, n: ensemble().fresh(START, n, key)
     far = jax.random.key(4242)
     fold = jax.random.fold_in
-    test = [linear_members(draw(fold(far, k), SLICE), None) for k in range(32)]
+    test = [linear_members(draw(fold(far, k), SLICE)) for k in range(32)]
     fresh = cost_of(draw(far, 1024))
     rows: dict[str, list[Row]] = {}
     for key in map(jax.random.key, range(count)):
         cost = cost_of(ensemble().draw(START, 64, key))
-        searched = [linear_members(draw(fold(key, 2 + k), SLICE), None) for k in range(32)]
-        others = linear_members(ensemble().draw(START, ACTIVE, fold(key, 1)), None)
+        searched = [linear_members(draw(fold(key, 2 + k), SLICE)) for k in range(32)]
+        others = linear_members(ensemble().draw(START, ACTIVE, fold(key, 1)))
         first = tuned(key)
         ends = {"`jq.tune`": first}
         for name, (bound, slices) in SETTINGS.items():
