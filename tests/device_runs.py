@@ -6,6 +6,7 @@ python tests/device_runs.py
 import json
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -15,6 +16,7 @@ from jaxquad.control import LADRC, PD
 from jaxquad.loops import Loop
 from jaxquad.models import DecoupledAxes
 from jaxquad.simulation import (
+    devices_for,
     evaluate,
     over_devices,
     Pulse,
@@ -23,10 +25,7 @@ from jaxquad.simulation import (
     simulate,
     Step,
     WhiteNoise,
-    Window,
 )
-from jaxquad.simulation._evaluate import _run
-from jaxquad.simulation._parallel import devices_for, where_put
 
 
 MEMBERS, SAMPLES = 67, 120  # no multiple of two
@@ -94,9 +93,14 @@ def drawn(gains, devices):
 
 def kernels(devices):
     """Whether the loop of each device is one kernel."""
-    judged = Window(*(jnp.asarray(k) for k in (0, SAMPLES - 1, 0, SAMPLES - 1)))
     loop = (Loop(plant(), LADRC([10.0], [30.0], [0.85])), happens())
-    return "xla_cpu_small_call" in _run.lower(*loop, judged, devices).as_text()
+    run = eqx.filter_jit(lambda loop, happens: evaluate(loop, happens, devices=devices))
+    return "xla_cpu_small_call" in run.lower(*loop).as_text()
+
+
+def by_hand(inertia):
+    """Of data that lie where they were put."""
+    return evaluate(Loop(plant(inertia), PD([40.0], [10.0])), happens(inertia.shape[-1]))
 
 
 def lies(tree):
@@ -121,9 +125,8 @@ def main():
         "alone within": bool(drawn_by_two[0][1]),
         "diverged": int(np.sum(both.diverged)),
         "results lie on": lies(both),
-        "data put by hand lie on": [x.id for x in where_put(jax.device_put(inertia, two)) or ()],
-        "data that are split lie on": [x.id for x in where_put(in_two(inertia)) or ()],
-        "the same data on two": where_put(drawn_by_two),
+        "those of data put by hand lie on": lies(by_hand(jax.device_put(inertia, two))),
+        "those of split data lie on": lies(by_hand(in_two(inertia))),
         "kernels": kernels((one, two)),
         "devices for 63": len(devices_for(63, None)),
         "devices for 64": len(devices_for(64, None)),
@@ -132,8 +135,9 @@ def main():
 
 
 def in_two(x):
-    mesh = Mesh(np.array(jax.local_devices()), ("axes",))
-    return jax.device_put(jnp.stack([x, x]), NamedSharding(mesh, PartitionSpec("axes")))
+    mesh = Mesh(np.array(jax.local_devices()), ("members",))
+    both = jnp.concatenate([x, x], axis=1)
+    return jax.device_put(both, NamedSharding(mesh, PartitionSpec(None, "members")))
 
 
 if __name__ == "__main__":

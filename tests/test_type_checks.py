@@ -5,31 +5,33 @@ import pytest
 import type_checks
 from jaxtyping import TypeCheckError
 
-from jaxquad.spectra._leakage import cross_products, power_of, shows_leakage
+from jaxquad.identify import coherence_weight, paper_cost
+from jaxquad.tuning import upper_bound
 
 
-RIGHT = np.ones((2, 3, 4), complex)
+RIGHT = np.ones(4, complex)
+COHERENCE = np.ones(4)
 
 
 @pytest.mark.parametrize("again", [False, True])
-@pytest.mark.parametrize("wrong", [np.ones((2, 3, 4)), RIGHT[0], "text"])
+@pytest.mark.parametrize("wrong", [np.ones(4), RIGHT[None], "text"])
 def test_a_wrong_array_is_refused_after_many_right_ones(wrong, again):
     for _ in range(2 * type_checks.CALLS):
-        cross_products(RIGHT)
+        paper_cost(RIGHT, RIGHT, COHERENCE)
     with pytest.raises(TypeCheckError, match="Complex"):
-        cross_products(wrong)
+        paper_cost(wrong, RIGHT, COHERENCE)
 
 
 def test_a_wrong_number_is_refused_after_many_right_ones():
     for _ in range(2 * type_checks.CALLS):
-        assert shows_leakage(6, 1)
+        assert upper_bound(1, 6) < 1
     with pytest.raises(TypeCheckError, match="int"):
-        shows_leakage(6.5, 1)  # pyright: ignore[reportArgumentType]
+        upper_bound(1, 6.5)  # pyright: ignore[reportArgumentType]
 
 
 def test_what_is_returned_is_checked_too(monkeypatch):
     for _ in range(2 * type_checks.CALLS):
-        power_of(RIGHT)
-    monkeypatch.setattr(np, "real", lambda x: x[0])
+        coherence_weight(COHERENCE)
+    monkeypatch.setattr(np, "exp", lambda x: 1j * x)
     with pytest.raises(TypeCheckError, match="return value"):
-        power_of(RIGHT[:, 0])
+        coherence_weight(COHERENCE)

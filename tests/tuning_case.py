@@ -24,8 +24,9 @@ from jaxquad.models import DecoupledAxes
 from jaxquad.simulation import Pulse, Saturation, scenario, Sine, Step
 from jaxquad.tuning import Objective
 from jaxquad.tuning._cost import evaluate_cost, initial_multipliers, stack_copies, Subproblem
+from jaxquad.tuning._lbfgs import minimise as minimise  # for its test and its benchmark
 from jaxquad.tuning._parameters import select_coordinates
-from jaxquad.tuning._problem import make_problem, TimeSpan
+from jaxquad.tuning._problem import linear_loops, make_problem, TimeSpan
 
 
 KT, J0, LIMIT, DT = 0.0468, 0.0552, 10.0, 0.002  # N m/V, kg m^2, V, s
@@ -119,23 +120,44 @@ PRINTED = {
 }
 
 
-def evaluator(controller, free=None, *, members=64, limits=(), fly=True, multiplier=0.0):
-    """A function of z that gives the cost and its gradient, and the z of the controller.
+def linear_members(drawn):
+    """The linear loops of members that were drawn."""
+    return linear_loops(drawn, None)
+
+
+def coordinates_of(controller, free=None):
+    """The free gains, whose `start` is the z of the controller."""
+    return select_coordinates(controller, free)
+
+
+def pose(controller, drawn, *, limits=(), fly=True, multiplier=0.0, copies=1):
+    """What is minimised over the members that were drawn, in so many problems at once.
 
     Over flights, or the linear loops alone. `multiplier` is that of every limit and member.
     """
-    drawn = ensemble().draw(loop(), members, jax.random.key(0))
     problem = make_problem(controller, drawn, flight(), span=TimeSpan(EVENTS))
-    coordinates, on = select_coordinates(controller, free), jnp.array([True])
-    given = initial_multipliers(problem, limits, 1)
+    given = initial_multipliers(problem, limits, copies)
     given = given._replace(values=tuple(multiplier + x for x in given.values))
     subproblem = Subproblem(
-        stack_copies(objective(), 1), stack_copies(tuple(limits), 1), given, jnp.array([fly]),
-        jnp.full(1, -0.75),
+        stack_copies(objective(), copies), stack_copies(tuple(limits), copies), given,
+        jnp.full(copies, fly), jnp.full(copies, -0.75),
     )  # fmt: skip
+    return problem, subproblem
+
+
+def cost_at(z, coordinates, posed, on=None):
+    """Values, gradients and the numbers of each member, z [problems, n]; of those that are `on`."""
+    on = np.ones(len(z), bool) if on is None else on
+    return evaluate_cost(jnp.asarray(z), jnp.asarray(on), coordinates, *posed)
+
+
+def evaluator(controller, free=None, *, members=64, **options):
+    """A function of z that gives the cost and its gradient, and the z of the controller."""
+    drawn = ensemble().draw(loop(), members, jax.random.key(0))
+    coordinates, posed = coordinates_of(controller, free), pose(controller, drawn, **options)
 
     def cost(z):
-        found = evaluate_cost(jnp.asarray(z)[None], on, coordinates, problem, subproblem)
+        found = cost_at(jnp.asarray(z)[None], coordinates, posed)
         return float(found.value[0]), np.asarray(found.gradient[0])
 
     return cost, coordinates.start

@@ -17,7 +17,7 @@ class Message(str):
     marked: str  # with the guillemets
     kind: str
 
-    def __new__(cls, text: str, kind: str = "") -> "Message":
+    def __new__(cls, text: str, kind: str = ""):
         marked = marked_text(text)
         self = super().__new__(cls, _replaced(marked, lambda term: term.rpartition("|")[2]))
         self.marked, self.kind = marked, kind or getattr(text, "kind", "")

@@ -183,17 +183,17 @@ def _primitive(name: str, kernel: Callable[..., Flat], plain: Callable[..., Flat
     return primitive
 
 
-def _forward(*args: Array, loop: Loop, scan: Scan, keep: bool) -> Flat:
-    return run_forward(loop, *args, keep=keep)
-
-
-def _reverse(*args: Array, loop: Loop, scan: Scan, which: tuple[bool, ...]) -> Flat:
-    return run_reverse(loop, *args, which=which)
-
-
-_loop = _primitive("ensemble_loop", _forward, _plain)
+_loop = _primitive(
+    "ensemble_loop",
+    lambda *args, loop, scan, keep: run_forward(loop, *args, keep=keep),
+    _plain,
+)
 _tangent = _primitive("ensemble_loop_tangent", _plain_tangents, _plain_tangents)
-_cotangent = _primitive("ensemble_loop_cotangent", _reverse, _plain_cotangents)
+_cotangent = _primitive(
+    "ensemble_loop_cotangent",
+    lambda *args, loop, scan, which: run_reverse(loop, *args, which=which),
+    _plain_cotangents,
+)
 
 
 def _shaped(shape: tuple[int, ...], kind: np.dtype) -> ShapedArray:

@@ -20,37 +20,22 @@ Value = Any  # an array, or the number of a literal
 
 def no_fuse(function: Callable[..., PyTree], *args: PyTree) -> PyTree:
     """`function(*args)` as a call that the CPU's compiler does not fuse with what is around it."""
-    with set_xla_metadata(inlineable="false"):
-        return jax.jit(_fuse_within(function))(*args)
-
-
-def _fuse_within(function: Callable[..., PyTree]) -> Callable[..., PyTree]:
-    """The same function, in which `jnp.where` and its like, calls themselves, are fused again."""
 
     def run(*args: PyTree) -> PyTree:
-        with set_xla_metadata(inlineable="true"):
+        with set_xla_metadata(inlineable="true"):  # `jnp.where` and its like are calls themselves
             return function(*args)
 
-    return run
+    with set_xla_metadata(inlineable="false"):
+        return jax.jit(run)(*args)
 
 
 _COSTLY = {"exp", "log", "sin", "cos", "tan", "div", "atan2", "sqrt", "rsqrt", "pow", "tanh"}
 _INLINED = {"jit": "jaxpr", "pjit": "jaxpr", "closed_call": "call_jaxpr"}
 _LARGE = 1024  # elements, from which on no call costs more than recomputing
-FEW = 32  # elements, from which on a call costs less than recomputing them five times
 
 
-def evaluate_once(function: Callable[..., PyTree], *, least: int = _LARGE) -> Callable[..., PyTree]:
-    """The same function, in which expensive operations on large arrays are not recomputed.
-
-    A response with its slopes by five parameters, for many members at many frequencies, takes less
-    than half the time with it. Arrays are large from `least` elements on. What is called by
-    `no_fuse` stays a call where its result is of 1024 elements or more.
-
-    Complex quotients become products with one reciprocal, which loses them where a denominator's
-    square overflows or underflows (1e-154 to 1e154): the result is then not finite. On other
-    devices than the CPU, the function itself.
-    """
+def evaluate_once(function: Callable[..., PyTree], *, least: int) -> Callable[..., PyTree]:
+    """See the door's, `jaxquad._compile.evaluate_once`."""
     if jax.default_backend() != "cpu":
         return function
 

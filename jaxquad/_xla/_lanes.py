@@ -348,8 +348,11 @@ def _window(lanes: Lanes, shape: Shape, sizes: Shape, starts: Sequence[Cells]) -
 def _iota(lanes: Lanes, equation: JaxprEqn) -> Cells:
     shape, axis = _result(equation), equation.params["dimension"]
     _require(not lanes.is_members(shape, axis), "the members' numbers")
+    rest = lanes.small(shape)
     row = cells_of(list(np.arange(shape[axis], dtype=equation.params["dtype"])), (shape[axis],))
-    return np.moveaxis(np.broadcast_to(row, _moved_last(lanes.small(shape), axis)), -1, axis)
+    return np.moveaxis(
+        np.broadcast_to(row, (*rest[:axis], *rest[axis + 1 :], rest[axis])), -1, axis
+    )
 
 
 @_rule("empty", "empty2")
@@ -357,10 +360,6 @@ def _empty(lanes: Lanes, equation: JaxprEqn) -> Cells:
     """What a loop fills."""
     zeros = np.zeros((), equation.outvars[0].aval.dtype)  # pyright: ignore
     return np.broadcast_to(cells_of([zeros[()]], ()), lanes.small(_result(equation)))
-
-
-def _moved_last(shape: Shape, axis: int) -> Shape:
-    return (*shape[:axis], *shape[axis + 1 :], shape[axis])
 
 
 @_rule("reduce_sum", "reduce_prod", "reduce_max", "reduce_min", "reduce_and", "reduce_or")
@@ -381,14 +380,11 @@ def _accumulate(lanes: Lanes, equation: JaxprEqn, x: Cells) -> Cells:
     turned = (lambda a: np.flip(a, axis)) if equation.params["reverse"] else (lambda a: a)
     rows, totals = (np.moveaxis(turned(a), axis, 0) for a in (x, out))
     for k, row in enumerate(rows):
-        total = row if k == 0 else _pairwise(lanes, "reduce_sum", total, row)  # noqa: F821
-        totals[k] = total
+        if k:
+            pairs = zip(np.ravel(as_cells(totals[k - 1])), np.ravel(as_cells(row)), strict=True)
+            row = cells_of([lanes.pair("reduce_sum", *pair) for pair in pairs], np.shape(row))
+        totals[k] = row
     return out
-
-
-def _pairwise(lanes: Lanes, name: str, a: Cells, b: Cells) -> Cells:
-    pairs = zip(np.ravel(as_cells(a)), np.ravel(as_cells(b)), strict=True)
-    return cells_of([lanes.pair(name, *pair) for pair in pairs], np.shape(a))
 
 
 @_rule("dot_general")

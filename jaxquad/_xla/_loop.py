@@ -19,7 +19,7 @@ from jax.typing import DTypeLike
 from jaxtyping import Array
 
 from ._cuda_text import EXPRESSIONS
-from ._lanes import as_cells, CALLS, Cells, cells_of, Lane, Lanes, NotInLanes, NUMBERS, numbers
+from ._lanes import as_cells, CALLS, cells_of, Lane, Lanes, NotInLanes, NUMBERS, numbers
 
 
 # How often the forward kernel of a time loop keeps the carry for the reverse one.
@@ -174,17 +174,13 @@ def in_lanes(loop: Loop, jaxpr: ClosedJaxpr, *, leave_sums: bool = False) -> Clo
         parts = split(args, *map(math.prod, shapes))
         cells = [cells_of(part, shape) for part, shape in zip(parts, shapes, strict=False)]
         out = lanes.evaluate(jaxpr.jaxpr, jaxpr.consts, cells)
-        return [lane for x in out for lane in _listed(x)]
+        return [lane for x in out for lane in as_cells(x).reshape(-1).tolist()]
 
     lanes_jaxpr = jax.make_jaxpr(flat)(*shapes_of_lanes)
     unknown = {x.primitive.name for x in lanes_jaxpr.jaxpr.eqns} - EXPRESSIONS.keys()
     if unknown:
         raise NotInLanes(f"{', '.join(sorted(unknown))} of a member's numbers")
     return lanes_jaxpr
-
-
-def _listed(x: Cells) -> list[Lane]:
-    return as_cells(x).reshape(-1).tolist()
 
 
 @ft.lru_cache(maxsize=16)
@@ -247,7 +243,11 @@ def without_invariants(
     constants, rest = body.invars[: len(consts)], body.invars[len(consts) :]
     parts = _Parts(body, constants)
     per_sample = _used(parts.in_sample, parts.outs)
-    read = dict.fromkeys(v for v in (*_read(per_sample), *parts.outs) if isinstance(v, Var))
+    read = dict.fromkeys(
+        v
+        for v in (*(v for equation in per_sample for v in equation.invars), *parts.outs)
+        if isinstance(v, Var)
+    )
     needed = [v for v in read if v in parts.before or v in constants]
     grown = max(_size(needed, members) - _size(constants, members), len(needed) - len(constants))
     if grown > _MORE:
@@ -306,10 +306,6 @@ def _computes(equation: JaxprEqn) -> bool:
     name = equation.primitive.name
     kinds = {v.aval.dtype for v in equation.outvars}  # pyright: ignore[reportAttributeAccessIssue]
     return (name in EXPRESSIONS or name in CALLS) and kinds.issubset(NUMBERS)
-
-
-def _read(equations: Iterable[JaxprEqn]) -> list[Any]:
-    return [v for equation in equations for v in equation.invars]
 
 
 def _used(equations: Sequence[JaxprEqn], results: Iterable[Any]) -> list[JaxprEqn]:

@@ -60,23 +60,18 @@ def _new_function(
     return function, ir.StringAttr(symbols.insert(function)).value
 
 
-def _like(kind: ir.Type, shape: tuple[int, ...]) -> ir.Type:
-    return ir.RankedTensorType.get(shape, ir.RankedTensorType(kind).element_type)
-
-
 def _sum_of_firsts(values: list[ir.Value]) -> ir.Value:
-    total, *others = map(_first, values)
-    for other in others:
-        total = stablehlo.AddOp(total, other).result
+    """The sum of the first number of each array, in single precision."""
+    single, total = ir.RankedTensorType.get((), ir.F32Type.get()), None
+    for value in values:
+        kind = ir.RankedTensorType(value.type)
+        rank, scalar = len(kind.shape), ir.RankedTensorType.get((), kind.element_type)
+        corner = stablehlo.SliceOp(value, [0] * rank, [1] * rank, [1] * rank).result
+        number = stablehlo.ReshapeOp(scalar, corner).result
+        first = stablehlo.ConvertOp(single, number).result
+        total = first if total is None else stablehlo.AddOp(total, first).result
+    assert total is not None
     return total
-
-
-def _first(value: ir.Value) -> ir.Value:
-    """The first number of an array, in single precision."""
-    rank = len(ir.RankedTensorType(value.type).shape)
-    corner = stablehlo.SliceOp(value, [0] * rank, [1] * rank, [1] * rank).result
-    scalar = stablehlo.ReshapeOp(_like(value.type, ()), corner).result
-    return stablehlo.ConvertOp(ir.RankedTensorType.get((), ir.F32Type.get()), scalar).result
 
 
 # What a kernel is known to hold. XLA hands other operations (sorts, scatters, custom calls, ...) to
@@ -342,7 +337,10 @@ class Division:
                         op.operands[i] = values[operand]
                     values[self.ops[k].results[0]] = op.results[0]
                 results = [values[self.ops[k].results[0]] for k in members]
-                func.ReturnOp([*results, stablehlo.ConstantOp(_zero()).result])
+                single = ir.F32Type.get()
+                scalar = ir.RankedTensorType.get((), single)
+                zero = ir.DenseElementsAttr.get_splat(scalar, ir.FloatAttr.get(single, 0.0))
+                func.ReturnOp([*results, stablehlo.ConstantOp(zero).result])
             with ir.InsertionPoint(self.end):
                 call = func.CallOp(kinds, ir.FlatSymbolRefAttr.get(name), inputs)
         call.operation.attributes[ATTRIBUTE] = ir.DictAttr.get(
@@ -363,13 +361,6 @@ class Division:
                     within.add(k)
                     open_.append(k)
         return list(inputs), sorted(within)
-
-
-def _zero() -> ir.Attribute:
-    single = ir.F32Type.get()
-    return ir.DenseElementsAttr.get_splat(
-        ir.RankedTensorType.get((), single), ir.FloatAttr.get(single, 0.0)
-    )
 
 
 def operations(block: ir.Block) -> list[Op]:

@@ -65,11 +65,8 @@ def switches() -> tuple:
     return plain_loops.value, device_kernels.value
 
 
-def compiler_options() -> dict[str, int]:
-    """What to give `jax.jit(..., compiler_options=...)` around a loop; empty where nothing helps.
-
-    On a CPU, 512-bit vectors; warns, once, if this XLA does not know the option.
-    """
+def compiler_options() -> dict[str, Any]:
+    """512-bit vectors on a CPU."""
     return dict(_vector_options()) if jax.default_backend() == "cpu" else {}
 
 

@@ -35,11 +35,20 @@ def why_not_trusted() -> str | None:
     version = jaxlib.version.__version__
     if version in TESTED or _CHILD in os.environ:
         return None
-    path = _answer_path()
-    answer = _stored(path)
-    if answer is None:
+    path, answer = _answer_path(), None  # empty if kernels passed; None if there is none
+    if path is not None and path.is_file():
+        try:
+            answer = json.loads(path.read_text())["why_not"]
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            warn_once(f"{path} cannot be read ({error}); the trial is run again")
+    if not isinstance(answer, str):
         answer = _ask_child()
-        _store(path, answer)
+        try:
+            if path is not None:
+                path.parent.mkdir(parents=True, exist_ok=True)
+                path.write_text(json.dumps({"why_not": answer}))
+        except OSError as error:
+            warn_once(f"the result of the trial cannot be stored in {path} ({error})")
     if answer:
         warn_once(f"jaxlib {version} did not pass the trial of one-kernel loops ({answer})")
     return answer or None
@@ -51,28 +60,6 @@ def _answer_path() -> Path | None:
     versions = f"jax-{jax.__version__}-jaxlib-{jaxlib.version.__version__}"
     folder = Path(platformdirs.user_cache_dir("jaxquad"))
     return folder / f"kernel-{versions}-{platform.machine()}.json"
-
-
-def _stored(path: Path | None) -> str | None:
-    """The answer of another time: empty if kernels passed; None if there is none."""
-    if path is None or not path.is_file():
-        return None
-    try:
-        answer = json.loads(path.read_text())["why_not"]
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        warn_once(f"{path} cannot be read ({error}); the trial is run again")
-        return None
-    return answer if isinstance(answer, str) else None
-
-
-def _store(path: Path | None, answer: str) -> None:
-    if path is None:
-        return
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(json.dumps({"why_not": answer}))
-    except OSError as error:
-        warn_once(f"the result of the trial cannot be stored in {path} ({error})")
 
 
 def _ask_child() -> str:
@@ -151,23 +138,20 @@ def _largest_difference(mode: str) -> float:
     from ._cuda_text import PRELUDE
 
     _nvrtc.ptx_of(PRELUDE, _nvrtc.architecture())  # raises what is wrong with NVRTC
-    with device_kernels(mode):
-        return max(map(_difference, *_both_results()))
-
-
-def _difference(one: np.ndarray, other: np.ndarray) -> float:
-    if not np.isfinite(one).all():
-        return np.inf
-    return float(np.max(np.abs(one - other)) / np.max(np.abs(other)))
-
-
-def _both_results() -> list[list[np.ndarray]]:
-    """By the kernels and plain: the value, what was stored, three gradients."""
     x = jnp.linspace(0.2, 0.8, 2 * _MEMBERS, dtype=jnp.float32).reshape(2, _MEMBERS)
     gain, push = jnp.array([0.9, 0.4], jnp.float32), jnp.linspace(0.0, 0.5, _SAMPLES)
     args = x, gain, push.astype(jnp.float32)[:, None]
-    results = (_measure(scan)(*args) for scan in (_by_kernel, _plain_scan))
-    return [[np.asarray(x) for x in jax.tree.leaves(result)] for result in results]
+    with device_kernels(mode):  # the value, what was stored, three gradients
+        pairs = zip(
+            *(jax.tree.leaves(_measure(f)(*args)) for f in (_by_kernel, _plain_scan)), strict=True
+        )
+    differ = 0.0
+    for one, other in pairs:
+        one, other = np.asarray(one), np.asarray(other)
+        if not np.isfinite(one).all():
+            return np.inf
+        differ = max(differ, float(np.max(np.abs(one - other)) / np.max(np.abs(other))))
+    return differ
 
 
 def _plain_scan(step: Step, carry: PyTree, signals: PyTree) -> tuple[PyTree, PyTree]:

@@ -142,15 +142,10 @@ def change_table(changes: Sequence[ParameterChange], words: Sequence[WordChange]
     """The changes as a table in Markdown: old, new, unit, documented range and reason."""
     rows = ["| parameter | old | new | unit | range | reason |", "|---|---|---|---|---|---|"]
     for row, old, new, reason in changes:
-        bounds = "none documented" if row.low == -_INF else f"{row.low:g} to {row.high:g}"
-        bounds = f"{row.low:g} or above" if row.high == _INF != -row.low else bounds
         numbers = f"{number_text(old, row.integer)} | {number_text(new, row.integer)}"
-        rows.append(f"| {row.name} | {numbers} | {row.unit} | {bounds} | {reason} |")
+        rows.append(f"| {row.name} | {numbers} | {row.unit} | {row.range_text} | {reason} |")
     rows += [f"| {name} | {old} | {new} |  |  | {reason} |" for name, old, new, reason in words]
     return joined_lines(rows)
-
-
-_INF = float("inf")
 
 
 class ParameterFiles(NamedTuple):

@@ -49,6 +49,14 @@ class Parameter(NamedTuple):
     field: str = ""
     axis: int = -1
 
+    @property
+    def range_text(self) -> str:
+        """The documented range."""
+        if not np.isfinite(self.low):
+            return "none documented"
+        above = f"{self.low:g} or above"
+        return f"{self.low:g} to {self.high:g}" if np.isfinite(self.high) else above
+
 
 Range = tuple[Number, Number]
 

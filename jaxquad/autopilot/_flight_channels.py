@@ -29,7 +29,7 @@ from ._firmware import firmware_named, HOVER, OuterLoop, Span
 from ._identified import RecordSettings
 from ._law import FlownLoop, RateLoop
 from ._parameters import change_filters, flown_loop
-from ._rate_gains import gains_of, parameters_of
+from ._rate_loops import gains_of, parameters_of
 
 
 Samples = Float[np.ndarray, " samples"]

@@ -20,20 +20,17 @@ from jaxquad.identify import (
     usable,
     with_values,
 )
-from jaxquad.models import Model
-from jaxquad.plot import StepBand
-from jaxquad.records import AXES, Mix, Proposal, propose
-from jaxquad.records.firmware import firmware_log, firmware_names
+from jaxquad.records import AXES, Proposal, propose
 from jaxquad.report import LawLoop, reason_of
 from jaxquad.spectra import BrokenLoop, FrequencyResponse
 
 from ._filters import FilterChain
-from ._firmware import firmware_named
+from ._firmware import firmware_named, HOVER
 from ._flight_channels import FlightChannels, read_channels_if_any, settings_of
 from ._identified import RecordSettings
 from ._law import RateLoop
 from ._pilot_page import StepGrid
-from ._rate_gains import law_responses
+from ._rate_loops import law_responses
 
 
 Frequencies = Float[np.ndarray, " frequencies"]
@@ -67,16 +64,13 @@ class FlownLaw:
     def content(self) -> dict[str, object]:
         """For `result.json`; `StoredFilters.of` reads the filters."""
         measured = [x for x in self.filters if isinstance(x, MeasuredChain)]
+        number = lambda x: 0.0 if x is None else float(np.ravel(np.asarray(x))[0])
         chains = [
-            {"rate_hz": x.rate_hz, "sections": [_numbers(x) for x in x.sections()]}
-            for x in self.chains
+            {"rate_hz": chain.rate_hz, "sections": [list(map(number, x)) for x in chain.sections()]}
+            for chain in self.chains
         ]
         correction = [{"delay_s": x.delay, "lag_s": x.lag} for x in measured]
         return {"text": self.text, "chains": chains, "correction": (*correction, {})[0]}
-
-
-def _numbers(section: Sequence[object]) -> list[float]:
-    return [0.0 if x is None else float(np.ravel(np.asarray(x))[0]) for x in section]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -119,25 +113,14 @@ class StoredFilters:
 
 
 def flown_law(
-    paths: Sequence[Path], output: Mix, command: Mix, proposal: Proposal | None,
-    settings: RecordSettings,
+    paths: Sequence[Path], rate: str, axis: int, command: Mapping[str, float],
+    proposal: Proposal | None, settings: RecordSettings,
 ) -> FlownLaw | None:  # fmt: skip
-    """Of the rate that is identified; None where that is no logged rate of a known autopilot.
+    """Of a logged `rate` that is identified; None where the logs are of no known autopilot.
 
-    `output` and `command` are the channels that are identified.
-
-    What a log does not tell costs nothing but itself: `text` says why.
+    `command` are the channels of the identified input; `proposal` is that of the first log. What a
+    log does not tell costs nothing but itself: `text` says why.
     """
-    [channels] = output.values() or [{}]
-    axes = [
-        axis
-        for log in map(firmware_log, firmware_names()) if log is not None and log.gyro_cutoffs
-        for name in channels
-        for axis, rate in enumerate(log.rates) if name == rate or name.endswith(f".{rate}")
-    ]  # fmt: skip
-    if len(channels) != 1 or not axes:
-        return None
-    [rate], axis = channels, axes[0]
     announce("the gyro's filters")
     try:
         laws = [
@@ -147,21 +130,15 @@ def flown_law(
     except Exception as error:
         return FlownLaw((), f"the gyro's filters are in the model: {reason_of(error)}")
     first, *others = laws
-    if first is None or any(_differs(first, law) for law in others):
-        text = "the gyro's filters are in the model: those of the logs differ"
-        return None if first is None else FlownLaw((), text)
-    return first
-
-
-def _differs(one: FlownLaw, other: FlownLaw | None) -> bool:
-    if other is None:
-        return True
-    both = [np.prod([x.response(_AT) for x in law.filters], axis=0) for law in (one, other)]
-    return bool(np.max(np.abs(np.asarray(both[0]) / np.asarray(both[1]) - 1)) > _SAME)
+    passed = lambda law: np.prod([x.response(_AT) for x in law.filters], axis=0)
+    alike = lambda law: np.max(np.abs(np.asarray(passed(first)) / passed(law) - 1)) <= _SAME
+    if first is None or all(law is not None and alike(law) for law in others):
+        return first
+    return FlownLaw((), "the gyro's filters are in the model: those of the logs differ")
 
 
 def _law_of(
-    path: Path, rate: str, axis: int, command: Mix, proposal: Proposal | None,
+    path: Path, rate: str, axis: int, command: Mapping[str, float], proposal: Proposal | None,
     settings: RecordSettings,
 ) -> FlownLaw | None:  # fmt: skip
     if proposal is None:
@@ -169,34 +146,23 @@ def _law_of(
             proposal = propose(path, axis=AXES[axis])
         except ValueError:  # a table whose channels have these names
             return None
-    log = firmware_log(proposal.vehicle)
-    if proposal.setup.rate != rate or log is None or not log.gyro_cutoffs:
+    firmware, setup = firmware_named(proposal.vehicle), proposal.setup
+    if setup.rate != rate or not firmware.log.gyro_cutoffs:
         return None
-    return _read_law(path, axis, command, proposal, settings)
-
-
-def _read_law(
-    path: Path, axis: int, command: Mix, proposal: Proposal, settings: RecordSettings
-) -> FlownLaw:
-    from ._firmware import HOVER
-
     logged = settings_of(path, proposal)
-    firmware = firmware_named(proposal.vehicle)
     if not any(name in logged.values for name in firmware.log.gyro_cutoffs):
         names = " or ".join(firmware.log.gyro_cutoffs)
         return FlownLaw((), f"the gyro's filters are in the model: the log does not hold {names}")
     flight = read_channels_if_any(path, proposal, settings, logged.values)
-    middle = None if flight is None else flight.middle
-    tracked = {} if flight is None else flight.tracked_hz
     loop = firmware.flown_loop(
-        logged.values, logged.version, throttle=HOVER if middle is None else middle,
-        tracked_hz=tracked,
+        logged.values, logged.version,
+        throttle=HOVER if flight is None or flight.middle is None else flight.middle,
+        tracked_hz={} if flight is None else flight.tracked_hz,
     )  # fmt: skip
     chains = tuple(chain for chain in loop.law.gyro_chains() if chain.filters)
     filters, text = best_filters(chains, loop.unmodelled, flight, axis)
-    adrc = firmware.flies_adrc(logged.values)
-    [channels] = command.values()
-    law = loop.law if not adrc and channels == dict(proposal.setup.command) else None
+    flew = not firmware.flies_adrc(logged.values) and dict(command) == dict(setup.command)
+    law = loop.law if flew else None
     return FlownLaw(filters, text, law, axis, tuple(loop.unmodelled), chains)
 
 
@@ -210,34 +176,24 @@ def best_filters(
     hidden = [text for text in unmodelled if text.kind == "notch"]
     missing = "" if not hidden else f" (not {'; '.join(text.partition(':')[0] for text in hidden)})"
     if hidden and flight is not None and len(flight.unfiltered) > axis and not flight.averaged:
-        measured = _measured(chains, flight, axis)
-        if isinstance(measured, MeasuredChain):
+        unfiltered, filtered = flight.unfiltered[axis], flight.rates[axis]
+        try:
+            if len(unfiltered) != len(filtered):
+                raise ValueError("both rates have other instants")
+            measured = measured_chain(
+                unfiltered, filtered, flight.dt, filters=chains,
+                names=(flight.names[1], flight.names[0]),
+                reference=flight.setpoint if np.ptp(flight.setpoint) > 0 else None,
+            )  # fmt: skip
             return (measured,), f"the gyro's filters are divided out, {measured.description}"
-        missing = f"{missing[:-1]}, which could not be measured: {measured})"
+        except ValueError as error:
+            missing = f"{missing[:-1]}, which could not be measured: {error})"
     if not chains:
         return (), f"the gyro has no filter that is known{missing}"
-    words = ", ".join(text.in_words() for chain in chains for text in chain.filters)
+    words = ", ".join(filter.in_words() for chain in chains for filter in chain.filters)
     late = sum(float(chain.delay_ms([_SHOWN])[0]) for chain in chains)
     text = f"the gyro's filters, {words}{missing}, are divided out: {late:.2g} ms at {_SHOWN:g} Hz"
     return chains, text
-
-
-def _measured(
-    chains: tuple[FilterChain, ...], flight: FlightChannels, axis: int
-) -> MeasuredChain | str:
-    """The reason where the log does not show it."""
-    unfiltered, filtered = flight.unfiltered[axis], flight.rates[axis]
-    if len(unfiltered) != len(filtered):
-        return "both rates have other instants"
-    moves = np.ptp(flight.setpoint) > 0
-    try:
-        return measured_chain(
-            unfiltered, filtered, flight.dt, filters=chains,
-            names=(flight.names[1], flight.names[0]),
-            reference=flight.setpoint if moves else None,
-        )  # fmt: skip
-    except ValueError as error:
-        return str(error)
 
 
 Response = Complex[np.ndarray, " frequencies"]
@@ -291,11 +247,20 @@ def loop_of_law(
     )
     if not fit.identifiable:
         return LawLoop(measured, None, None, flown.unmodelled)
+    plant_at = lambda model, omega: model_response(as_sampled(model, frf), omega)[:, 0, 0]
     grid = np.geomspace(_LOWEST, _HIGHEST * 2 * np.pi / flown.law.dt / 2, _GRID)
-    response = _plant(frf, fit.model, grid)
-    none, every = np.zeros(grid.size), np.ones(grid.size)
-    model = BrokenLoop(grid, _law_at(flown, filters, grid, units[unit]).open(response), none, every)
-    return LawLoop(measured, model, _step(flown, fit, frf, filters, units[unit]), flown.unmodelled)
+    response = _law_at(flown, filters, grid, units[unit]).open(plant_at(fit.model, grid))
+    model = BrokenLoop(grid, response, np.zeros(grid.size), np.ones(grid.size))
+    # The step from set-point to rate, of plants that the fit leaves possible.
+    steps = StepGrid.of(flown.law.dt)
+    loop = _law_at(flown, filters, steps.omega, units[unit])
+    places, random = fit.parameters.places[: len(fit.names)], np.random.default_rng(_SEED)
+    values = random.multivariate_normal(fit.values, fit.covariance, _PLANTS, method="eigh")
+    sign = np.sign(fit.values)
+    values = np.where(sign * values > 0, values, 0.0 * sign)  # a parameter keeps its sign
+    plants = [plant_at(with_values(fit.model, places, x), steps.omega) for x in values]
+    step = steps.band(np.stack([loop.closed(plant) for plant in plants]))
+    return LawLoop(measured, model, step, flown.unmodelled)
 
 
 def _law_at(
@@ -305,23 +270,3 @@ def _law_at(
     law = flown.law.without_gyro_filters()  # the logged rate is behind them
     ahead, back = radians * law_responses(law, flown.axis, omega)
     return _Loop(omega, ahead, back, filter_response(filters, omega))
-
-
-def _plant(frf: FrequencyResponse, model: Model, omega: Frequencies) -> Response:
-    return model_response(as_sampled(model, frf), omega)[:, 0, 0]
-
-
-def _step(
-    flown: FlownLaw, fit: Fit, frf: FrequencyResponse, filters: Sequence[KnownFilter],
-    radians: float,
-) -> StepBand:  # fmt: skip
-    """From set-point to rate, of plants that the fit leaves possible."""
-    assert flown.law is not None
-    grid = StepGrid.of(flown.law.dt)
-    loop = _law_at(flown, filters, grid.omega, radians)
-    places, random = fit.parameters.places[: len(fit.names)], np.random.default_rng(_SEED)
-    values = random.multivariate_normal(fit.values, fit.covariance, _PLANTS, method="eigh")
-    sign = np.sign(fit.values)
-    values = np.where(sign * values > 0, values, 0.0 * sign)  # a parameter keeps its sign
-    plants = [_plant(frf, with_values(fit.model, places, plant), grid.omega) for plant in values]
-    return grid.band(np.stack([loop.closed(plant) for plant in plants]))

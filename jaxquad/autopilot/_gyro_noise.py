@@ -11,7 +11,7 @@ from jaxquad.spectra import find_line, SpectralLine
 
 from ._flight_channels import FlightChannels
 from ._law import RateLoop
-from ._rate_gains import cells_of, gains_of, gyro_chain_response, law_paths
+from ._rate_loops import cells_of, gains_of, gyro_chain_response, law_paths
 
 
 Frequencies = Float[np.ndarray, " frequencies"]

@@ -3,7 +3,7 @@
 import abc
 import dataclasses
 from collections.abc import Mapping
-from typing import ClassVar, Generic, NamedTuple, TypeVar
+from typing import ClassVar, Generic, NamedTuple, TYPE_CHECKING, TypeVar
 
 import equinox as eqx
 import jax
@@ -120,8 +120,12 @@ class RateLoop(FirmwareLoop):
     of_sticks: ClassVar[bool] = (
         False  # whether feed-forward is of the sticks, between their samples
     )
-    gyro: eqx.AbstractVar[FilterChain]
-    dt: eqx.AbstractVar[float]  # s
+    if TYPE_CHECKING:  # fields of each law, in its own order
+
+        @property
+        def gyro(self) -> FilterChain: ...
+        @property
+        def dt(self) -> float: ...  # s
 
     def interval(self) -> float:
         return self.dt

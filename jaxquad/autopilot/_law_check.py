@@ -1,11 +1,12 @@
-"""Whether a log's gains are those that flew: the law replayed on its set-point and its gyro.
+"""Whether gains, law and plant are those that flew: replayed, and flown again, on the log.
 
-Each term is compared with the logged one: by its size, and by what the replay leaves of it beyond
-what the log's rounding explains. Source: docs/autopilots.md, "Which gains flew".
+The law alone is replayed on set-point and gyro. Each term is compared with the logged one: by its
+size, and by what the replay leaves of it beyond what the log's rounding explains. Then law and
+plant are simulated in time, undisturbed. Source: docs/autopilots.md, "Which gains flew".
 """
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -16,7 +17,6 @@ from jaxquad.identify import filter_response, Fit, MISFIT, usable
 from jaxquad.records import Record
 from jaxquad.spectra import (
     frequency_response,
-    FrequencyResponse,
     JointInputOutput,
     LocalPolynomial,
 )
@@ -169,39 +169,36 @@ def _checked(law: FlownLoop, flight: FlightChannels, late: float) -> LawCheck:
     logged = {name: x for name, x in flight.terms.items() if name != "F" and np.any(x)}
     logged = logged if {"P", "I"} <= set(logged) else {}  # else the output alone
     forward, output = flight.terms.get("F"), flight.output
-    setpoint, rate = flight.setpoint, flight.rates[flight.axis]
-    roundings = np.random.default_rng(0)
+    roundings, many = np.random.default_rng(0), 1 + _COPIES
     of_rate, of_term = flight.resolution
     copies = lambda x, step: np.stack(
         [x, *(x + _rounding_error(x, step, roundings) for _ in range(_COPIES))], axis=1
     )
-    many = 1 + _COPIES
+    repeated = lambda x: np.repeat(x[:, None], many, axis=1)
     terms = replay_terms(
-        law, copies(setpoint, of_rate), copies(rate, of_rate), flight.followed, dt=flight.dt,
-        feed_forward=None if forward is None else np.repeat(forward[:, None], many, axis=1),
+        law, copies(flight.setpoint, of_rate), copies(flight.rates[flight.axis], of_rate),
+        flight.followed, dt=flight.dt, feed_forward=None if forward is None else repeated(forward),
         integral=copies(flight.terms["I"], of_term) if "I" in flight.terms else None,
         mixer_range=flight.mixer_range, late=late, restart=_WINDOW,
     )  # fmt: skip
     if flight.slewed is not None:
         terms |= {name: terms[name] * flight.slewed[:, None] for name in "PD"}
     if "I" in logged and any(text.kind == "anti-gravity" for text in law.unmodelled):
-        terms["I"] = np.repeat(logged.pop("I")[:, None], many, axis=1)  # not judged
+        terms["I"] = repeated(logged.pop("I"))  # not judged
     if forward is not None:
-        terms["F"] = np.repeat(forward[:, None], many, axis=1)
+        terms["F"] = repeated(forward)
     if output is not None:
-        logged["output"] = output if flight.injected is None else output - _late_by(flight, late)
+        if flight.injected is not None:  # without what was injected, when it acts
+            time = flight.dt * np.arange(flight.count)
+            output = output - np.interp(time - late, time, flight.injected)
+        logged["output"] = output
         terms["output"] = terms["P"] + terms["I"] + terms["D"] + terms["F"]
     slower = max(0.0, float(np.log2(flight.dt / law.law.interval())) - 2)
-    compared = {name: _compared(x, terms[name], name, flight, slower) for name, x in logged.items()}
+    compared = {}
+    for name, x in logged.items():
+        compared[name] = _compared(x, terms[name], name, flight)._replace(slower=slower)
     slewed = 0.0 if flight.slewed is None else float(1 - np.mean(flight.slewed))
     return LawCheck(compared, late, slewed=slewed)
-
-
-def _late_by(flight: FlightChannels, late: float) -> Samples:
-    """What was injected, when it acts."""
-    assert flight.injected is not None
-    time = flight.dt * np.arange(flight.count)
-    return np.interp(time - late, time, flight.injected)
 
 
 def _rounding_error(signal: Samples, step: float, random: np.random.Generator) -> Samples:
@@ -214,11 +211,22 @@ def _rounding_error(signal: Samples, step: float, random: np.random.Generator) -
 
 def _compared(
     logged: Samples, replayed: Float[np.ndarray, "samples copies"], name: str,
-    flight: FlightChannels, slower: float,
+    flight: FlightChannels,
 ) -> TermReplay:  # fmt: skip
     """Of I what it grows by from start to start; of the rest what is below a tenth of the rate."""
-    anchored, step = "I" in flight.terms, flight.resolution[1]
-    passed = _grown(flight.dt) if anchored and name == "I" else _filtered(flight.dt, not anchored)
+    from scipy.signal import butter, sosfiltfilt
+
+    dt, step, anchored = flight.dt, flight.resolution[1], "I" in flight.terms
+    # What drifts freely is compared without its slow part.
+    band, kind = (_BAND / dt, "lowpass") if anchored else ([_SLOWEST, _BAND / dt], "bandpass")
+    sections = butter(3, band, kind, fs=1 / dt, output="sos")
+    every = max(1, round(_WINDOW / dt))
+
+    def passed(x: np.ndarray) -> np.ndarray:
+        if anchored and name == "I":
+            return (x - x[every * (np.arange(len(x)) // every)])[every:]
+        return sosfiltfilt(sections, x, axis=0)[max(1, round(_SETTLED / dt)) :]
+
     x, copies = passed(logged), passed(replayed)
     rms = lambda x: float(np.sqrt(np.mean(x**2)))
     first, others = copies[:, 0], copies[:, 1:]
@@ -229,26 +237,8 @@ def _compared(
     independent = max(2 * _BAND * x.size, 1.0)  # samples of a signal in this band
     error = rms(x - first) / np.sqrt(power / x.size) / np.sqrt(independent)
     return TermReplay(
-        float(np.std(logged)), float(left), rounding, float(x @ first) / power, float(error), slower
+        float(np.std(logged)), float(left), rounding, float(x @ first) / power, float(error)
     )
-
-
-Passed = Callable[[np.ndarray], np.ndarray]
-
-
-def _filtered(dt: float, drifts: bool) -> Passed:
-    """Below a tenth of the log's rate; what drifts freely without its slow part."""
-    from scipy.signal import butter, sosfiltfilt
-
-    band = [_SLOWEST, _BAND / dt] if drifts else _BAND / dt
-    sections = butter(3, band, "bandpass" if drifts else "lowpass", fs=1 / dt, output="sos")
-    return lambda x: sosfiltfilt(sections, x, axis=0)[max(1, round(_SETTLED / dt)) :]
-
-
-def _grown(dt: float) -> Passed:
-    """By how much since its last start."""
-    every = max(1, round(_WINDOW / dt))
-    return lambda x: (x - x[every * (np.arange(len(x)) // every)])[every:]
 
 
 _CLOSE = 0.1  # relative misfit of the closed loop up to which plants are believed
@@ -389,22 +379,39 @@ def check_loop(
     forward, injected = flight.terms.get("F"), flight.injected
     added = flight.not_carried if injected is None else injected
     again = fly_again(
-        pick_axis(flown.loop, flown.axis), plant_of(plant.fit, _unit(plant)), flight.setpoint,
-        flight.followed, dt=flight.dt, late=law.late, feed_forward=forward, injected=added,
+        pick_axis(flown.loop, flown.axis),
+        plant_of(plant.fit, plant.records[0].output_units[0]), flight.setpoint, flight.followed,
+        dt=flight.dt, late=law.late, feed_forward=forward, injected=added,
     )  # fmt: skip
-    drive = flight.setpoint if injected is None else injected
-    response = _responses(plant, flight, drive, again)
-    omega = np.asarray(response.omega)
-    both = np.asarray(response.response)[:, :, 0]
-    passed = filter_response(flown.filters, omega)
+    drive, count = flight.setpoint if injected is None else injected, len(again)
+    time, rate = flight.start + flight.dt * np.arange(count), flight.rates[flown.axis]
+    external = flight.reference
+    record = Record(
+        time, drive, np.stack([flight.rates[flight.axis], again], axis=1), external,
+        input_names=["drive"], output_names=["logged", "again"],
+        reference_names=None if external is None else ["excitation"],
+    )  # fmt: skip
+    low, high = plant.band
+    omega = np.geomspace(low, min(high, 0.4 * 2 * np.pi / flight.dt), _POINTS)
+    estimator = LocalPolynomial() if external is None else JointInputOutput()
+    response = frequency_response(record, omega, estimator=estimator)
+    omega, both = np.asarray(response.omega), np.asarray(response.response)[:, :, 0]
     used = np.asarray(usable(response, None, _COHERENT))[:, 0, 0]
-    part, time = _liveliest(drive, flight.dt), flight.start + flight.dt * np.arange(len(drive))
-    chain = _filtered_loop(again, flown, flight.dt)
+    # The part with the most excitation, through the gyro's filters as the log has it.
+    size = min(int(_SHOWN / flight.dt), count)
+    power = np.cumsum(np.concatenate([[0.0], (drive - drive.mean()) ** 2]))
+    start = int(np.argmax(power[size:] - power[:-size]))
+    part = slice(start, start + size)
+    all_omega = 2 * np.pi * np.fft.rfftfreq(2 * count, flight.dt)
+    limited = np.minimum(all_omega, 0.499 * 2 * np.pi / flown.law.dt)
+    passed = filter_response(flown.filters, limited)
+    behind = np.fft.irfft(np.fft.rfft(again, 2 * count) * passed, 2 * count)
     return LoopCheck(
-        law, omega, both[:, 0], np.asarray(response.random_error)[:, 0, 0], both[:, 1] * passed,
+        law, omega, both[:, 0], np.asarray(response.random_error)[:, 0, 0],
+        both[:, 1] * filter_response(flown.filters, omega),
         used & np.isfinite(both).all(axis=1), float(np.mean(flight.limited)),
-        float(np.sqrt(plant.fit.chi_squared)), time[part],
-        flight.setpoint[part], flight.rates[flown.axis][part], chain[part],
+        float(np.sqrt(plant.fit.chi_squared)), time[part], flight.setpoint[part], rate[part],
+        behind[part],
     )  # fmt: skip
 
 
@@ -415,40 +422,3 @@ def plant_of(fit: Fit, unit: str) -> HeldPlant:
     return HeldPlant(
         per_radian * values["gain"], values["lag"], values["delay"], values.get("damping", 0.0)
     )
-
-
-def _unit(plant: IdentifiedPlant) -> str:
-    return plant.records[0].output_units[0]
-
-
-def _responses(
-    plant: IdentifiedPlant, flight: FlightChannels, drive: Samples, again: Samples
-) -> FrequencyResponse:
-    """From the excitation to the logged and to the simulated rate, with one estimator."""
-    rate = flight.rates[flight.axis]
-    external = flight.reference
-    record = Record(
-        flight.start + flight.dt * np.arange(len(drive)), drive, np.stack([rate, again], axis=1),
-        external, input_names=["drive"], output_names=["logged", "again"],
-        reference_names=None if external is None else ["excitation"],
-    )  # fmt: skip
-    low, high = plant.band
-    omega = np.geomspace(low, min(high, 0.4 * 2 * np.pi / flight.dt), _POINTS)
-    estimator = LocalPolynomial() if external is None else JointInputOutput()
-    return frequency_response(record, omega, estimator=estimator)
-
-
-def _liveliest(drive: Samples, dt: float) -> slice:
-    """The part of the flight with the most excitation."""
-    size = min(int(_SHOWN / dt), len(drive))
-    power = np.cumsum(np.concatenate([[0.0], (drive - drive.mean()) ** 2]))
-    start = int(np.argmax(power[size:] - power[:-size]))
-    return slice(start, start + size)
-
-
-def _filtered_loop(again: Samples, flown: FlownAutopilot, dt: float) -> Samples:
-    """Through the gyro's filters, as the log has it."""
-    omega = 2 * np.pi * np.fft.rfftfreq(2 * len(again), dt)
-    limited = np.minimum(omega, 0.499 * 2 * np.pi / flown.law.dt)
-    passed = filter_response(flown.filters, limited)
-    return np.fft.irfft(np.fft.rfft(again, 2 * len(again)) * passed, 2 * len(again))[: len(again)]

@@ -16,7 +16,6 @@ from jaxquad.identify import (
     GainOverThrottle,
     KnownFilter,
     throttle_levels,
-    ThrottleLevels,
     UndeterminedError,
 )
 from jaxquad.records import Proposal, Record, RecordWarning
@@ -27,7 +26,7 @@ from ._firmware import firmware_named
 from ._flight_channels import FlownAutopilot
 from ._identified import IdentifiedPlant
 from ._parameters import find_parameter
-from ._plants import PlantSource
+from ._rate_loops import PlantSource
 
 
 ReadBeside = Callable[[Mapping[str, Mapping[str, float]]], Sequence[Record]]
@@ -120,6 +119,41 @@ class ThrottleVerdict:
         }
 
 
+@dataclasses.dataclass(frozen=True)
+class _FlownCurve:
+    """The thrust curve that flew, and its parameter.
+
+    `kept` is whether the firmware inverts it for the axes alone, so that the motors get the
+    throttle itself.
+    """
+
+    name: str  # empty: the firmware has none
+    kind: CurveFirmware | None
+    value: float | None  # None where the log does not hold it
+    curve: float
+    kept: bool
+
+    @classmethod
+    def of(cls, flown: FlownAutopilot) -> "_FlownCurve":
+        firmware = firmware_named(flown.firmware)
+        if not (name := firmware.thrust_curve):
+            return cls("", None, None, 0.0, False)
+        kind = firmware.curve_kind(flown.version)
+        logged = float(flown.values[name]) if name in flown.values else None
+        assumed = find_parameter(flown.firmware, name).default if logged is None else logged
+        curve = curve_of_parameter(kind, assumed)
+        return cls(name, kind, logged, curve, firmware.keeps_throttle)
+
+    def thrust(self, channel: str, factor: float) -> dict[str, float]:
+        """What is asked for at a throttle, as a weighted sum of the channel and its square."""
+        f = self.curve if self.kept else 0.0
+        return {channel: (1 - f) * factor} | ({f"{channel}^2": f * factor**2} if f else {})
+
+    def as_logged(self, thrust: float) -> float:
+        """The throttle in the log that asks for a thrust."""
+        return float(actuator(thrust, self.curve)) if self.kept else float(thrust)
+
+
 def study_throttle(
     plant: IdentifiedPlant, proposal: Proposal, flown: FlownAutopilot, read: ReadBeside
 ) -> ThrottleVerdict:
@@ -132,90 +166,48 @@ def study_throttle(
             "it is not in the log, so the gains hold near what was flown: log it, and fly two or "
             "three levels between 0.2 and 0.8 for gains that hold at each of them"
         )
-    parameter = _flown_parameter(flown)
+    flown_curve, [(channel, factor)] = _FlownCurve.of(flown), proposal.setup.throttle.items()
     try:
-        records = _read(read, proposal, flown, parameter)
+        with warnings.catch_warnings():  # identification has said what there is
+            warnings.simplefilter("ignore", RecordWarning)
+            records = list(read({"throttle": flown_curve.thrust(channel, factor)}))
         levels = throttle_levels(records)
     except ValueError as error:  # of reading, too
         return ThrottleVerdict(f"gains hold for the throttles of the log taken together: {error}")
-    shown = lambda x: _as_logged(flown, float(x), parameter.curve)
+    shown = lambda x: flown_curve.as_logged(float(x))
     if levels.throttle.size == 1:
         return ThrottleVerdict(
             f"gains hold near throttle {shown(levels.throttle[0]):.2f}, the only level of the log: "
             f"{levels.what_to_fly()}, for gains that hold over the throttle"
         )
     announce("the gain over the throttle")
+    band = None
+    if plant.settings.band is not None:  # from 3 cycles of the shortest level, at least 1.5 Hz
+        low, high = plant.settings.band
+        low = max(low, 1.5, 3 / float(levels.seconds.min()))
+        band = (2 * np.pi * low, 2 * np.pi * min(high, 45.0)) if low < high else None
     try:
         gains = gain_over_throttle(
-            records, filters=flown.filters, flown_curve=parameter.curve,
-            band=_band(plant, levels),
-        )  # fmt: skip
+            records, filters=flown.filters, flown_curve=flown_curve.curve, band=band
+        )
         span = float(gains.low.min()), float(gains.high.max())
-        ratio = _ratio(gains, span)
+        ratio = value, least, most = _ratio(gains, span)
     except (UndeterminedError, ValueError) as error:
         return ThrottleVerdict(
             f"gains hold for the throttles of the log taken together, not for each: {error}"
         )
     ends = [shown(x) for x in span]
-    text = _in_words(gains, ends, ratio)
-    if firmware_named(flown.firmware).keeps_throttle and parameter.curve:
+    text = (
+        f"gains hold from throttle {ends[0]:.2f} to {ends[1]:.2f}, of which the log has "
+        f"{gains.throttle.size} levels: plants are drawn over all of it, and certified at both "
+        f"ends and between. The gain at the highest is {value:.2f} times that at the lowest "
+        f"(95 %: {least:.2f} .. {most:.2f})"
+    )
+    if flown_curve.kept and flown_curve.curve:
         text += ". Below, throttle is the thrust that the firmware makes of it, 0 to 1"
-    return ThrottleVerdict(
-        text, gains, span,
-        (ends[0], shown(sum(span) / 2), ends[1]), ratio, _curve_verdict(gains, flown, parameter),
-    )  # fmt: skip
-
-
-def _band(plant: IdentifiedPlant, levels: ThrottleLevels) -> tuple[float, float] | None:
-    """In rad/s, where one is known; from 3 cycles of the shortest level, at least 1.5 Hz."""
-    if plant.settings.band is None:
-        return None
-    low, high = plant.settings.band
-    low = max(low, 1.5, 3 / float(levels.seconds.min()))
-    return (2 * np.pi * low, 2 * np.pi * min(high, 45.0)) if low < high else None
-
-
-@dataclasses.dataclass(frozen=True)
-class _Parameter:
-    """The thrust curve's parameter as it flew."""
-
-    name: str
-    kind: CurveFirmware | None
-    value: float | None  # None where the log does not hold it
-    curve: float
-
-
-def _flown_parameter(flown: FlownAutopilot) -> _Parameter:
-    firmware = firmware_named(flown.firmware)
-    if not (name := firmware.thrust_curve):
-        return _Parameter("", None, None, 0.0)
-    kind = firmware.curve_kind(flown.version)
-    logged = float(flown.values[name]) if name in flown.values else None
-    assumed = find_parameter(flown.firmware, name).default if logged is None else logged
-    return _Parameter(name, kind, logged, curve_of_parameter(kind, assumed))
-
-
-def _read(
-    read: ReadBeside, proposal: Proposal, flown: FlownAutopilot, parameter: _Parameter
-) -> list[Record]:
-    """The records that were identified, with the thrust that the throttle asks for beside them.
-
-    Less is asked for where a firmware inverts a curve, but the motors get the throttle itself.
-    """
-    [(channel, factor)] = proposal.setup.throttle.items()
-    mix = {channel: factor}
-    if firmware_named(flown.firmware).keeps_throttle and parameter.curve:
-        f = parameter.curve
-        mix = {channel: (1 - f) * factor, f"{channel}^2": f * factor**2}
-    with warnings.catch_warnings():  # identification has said what there is; the throttle is slow
-        warnings.simplefilter("ignore", RecordWarning)
-        return list(read({"throttle": mix}))
-
-
-def _as_logged(flown: FlownAutopilot, thrust: float, curve: float) -> float:
-    """The throttle in the log that asks for a thrust."""
-    kept = firmware_named(flown.firmware).keeps_throttle
-    return float(actuator(thrust, curve)) if kept else float(thrust)
+    logged = ends[0], shown(sum(span) / 2), ends[1]
+    curve = _curve_verdict(gains, flown.firmware, flown_curve)
+    return ThrottleVerdict(text, gains, span, logged, ratio, curve)
 
 
 def _ratio(gains: GainOverThrottle, span: tuple[float, float]) -> tuple[float, float, float]:
@@ -233,27 +225,17 @@ def _ratio(gains: GainOverThrottle, span: tuple[float, float]) -> tuple[float, f
     return float(high / low), float(least), float(most)
 
 
-def _in_words(gains: GainOverThrottle, span: list[float], ratio: tuple[float, float, float]) -> str:
-    value, low, high = ratio
-    return (
-        f"gains hold from throttle {span[0]:.2f} to {span[1]:.2f}, of which the log has "
-        f"{gains.throttle.size} levels: plants are drawn over all of it, and certified at both "
-        f"ends and between. The gain at the highest is {value:.2f} times that at the lowest "
-        f"(95 %: {low:.2f} .. {high:.2f})"
-    )
-
-
 def _curve_verdict(
-    gains: GainOverThrottle, flown: FlownAutopilot, parameter: _Parameter
+    gains: GainOverThrottle, firmware: str, flown: _FlownCurve
 ) -> CurveVerdict | None:
-    name, value = parameter.name, parameter.value
-    if parameter.kind is None:
+    name, value = flown.name, flown.value
+    if flown.kind is None:
         return None
     verdict = lambda text, estimate=None, change=None: CurveVerdict(
         name, value, estimate, change, text
     )
     try:
-        estimate = gains.firmware_value(parameter.kind)
+        estimate = gains.firmware_value(flown.kind)
     except UndeterminedError as error:
         return verdict(str(error))
     low, high = estimate.interval
@@ -264,32 +246,27 @@ def _curve_verdict(
         return verdict(f"{name} {value:g} flew, and {shows}: it is kept", estimate)
     reason = f"proposal of its own: 95 % {low:.3g} .. {high:.3g}; all loops change with it"
     changes = propose_changes(
-        flown.firmware, {name: value}, {name: round(estimate.value, 3)}, reasons={name: reason}
+        firmware, {name: value}, {name: round(estimate.value, 3)}, reasons={name: reason}
     )
     if not changes:
         return verdict(f"{name} {value:g} flew, and {shows}, stored as the same", estimate)
-    text = (
-        f"{name} {value:g} flew, but {shows}. It is a proposal in files of its own, apart from "
-        f"the gains, which hold with the curve that flew: {_consequences(gains, flown)}. Load it "
-        "alone, fly, and tune the gains on that log"
-    )
-    return verdict(text, estimate, changes[0])
-
-
-def _consequences(gains: GainOverThrottle, flown: FlownAutopilot) -> str:
-    """Of inverting the curve: one gain at every throttle, and another throttle at hover."""
+    # One gain at every throttle, and another throttle at hover.
     straight, curve = gains.straight_gain, gains.curve
     if straight is None or curve is None:
         raise UndeterminedError(gains.what_to_fly())
     middle = float(np.median(gains.throttle))
     times = straight.value / float(gains.over(np.array([middle])).value[0])
-    at = _as_logged(flown, middle, gains.flown)
     moved = (
         f"with it the gain of all axes is the same at every throttle, {times:.2f} times that at "
-        f"{at:.2f}"
+        f"{flown.as_logged(middle):.2f}"
     )
-    if firmware_named(flown.firmware).keeps_throttle:
-        return moved
-    x = float(actuator(middle, gains.flown))
-    hover = curve.value * x**2 + (1 - curve.value) * x
-    return f"{moved}, and what throttle {middle:.2f} lifts then takes {hover:.2f}"
+    if not flown.kept:
+        x = float(actuator(middle, gains.flown))
+        hover = curve.value * x**2 + (1 - curve.value) * x
+        moved += f", and what throttle {middle:.2f} lifts then takes {hover:.2f}"
+    text = (
+        f"{name} {value:g} flew, but {shows}. It is a proposal in files of its own, apart from "
+        f"the gains, which hold with the curve that flew: {moved}. Load it alone, fly, and tune "
+        "the gains on that log"
+    )
+    return verdict(text, estimate, changes[0])

@@ -6,7 +6,6 @@ from typing import NamedTuple, TYPE_CHECKING, TypeVar
 import numpy as np
 from jaxtyping import Complex, Float
 
-from jaxquad._core import Number
 from jaxquad.plot import FlownAgain, Spectrum, StepBand
 from jaxquad.records import AXES
 from jaxquad.report import Cell, Headline, Provenance, reason_of, Table
@@ -18,8 +17,8 @@ from ._flight_channels import FlightChannels
 from ._gyro_noise import gyro_noise, GyroNoise
 from ._law import RateLoop
 from ._page import PilotPage
-from ._rate_gains import gains_in, gains_of, gyro_chain_response, law_paths
-from ._stages import limits_text, Stage
+from ._rate_loops import gains_in, gains_of, gyro_chain_response, law_paths
+from ._stages import limits_text
 
 
 if TYPE_CHECKING:
@@ -33,42 +32,88 @@ _NEAR = 0.005  # of a motor's range, from its ends
 _SLOWEST = 20.0  # Hz, below which motion is taken for noise
 
 
+Designs = Mapping[str, tuple[RateLoop, Float[np.ndarray, " gains"]]]
+Part = TypeVar("Part")
+VERDICTS = {
+    "proposed": ("good", "PROPOSED"), "kept": ("good", "WHAT FLEW IS KEPT"),
+    "cannot tell": ("bad", "THIS LOG CANNOT TELL"), "not to be flown": ("bad", "NOT TO BE FLOWN"),
+}  # fmt: skip
+
+
 def pilot_page(proposal: "AutopilotProposal", origin: Provenance, overview: str = "") -> PilotPage:
     """All that the page shows; what cannot be computed says why. `overview` is of all axes."""
-    flown, axis = proposal.flown, proposal.flown.axis
-    after, failures = _proposed_law(proposal), dict[str, str]()
-    noise = _tried(failures, "noise", lambda: _noise_shown(proposal), None)
-    designs = {"flown": (flown.law, gains_of(flown.law, axis))}
-    if after is not None:
-        designs["proposed"] = (after, gains_in(flown.law, axis, proposal.new))
-    spectra = lambda: ({}, {}) if noise is None else _spectra(noise, axis, designs)
-    gyro, derivative = _tried(failures, "noise", spectra, ({}, {}))
-    steps = lambda: _steps(proposal, designs) if proposal.identification.fit.identifiable else {}
-    terms, terms_are = _tried(
-        failures, "balance", lambda: _terms(proposal.flight, flown.law, axis), ({}, "")
+    flown, flight, new = proposal.flown, proposal.flight, proposal.new
+    law, axis, filters = flown.law, flown.axis, proposal.filters
+    failures: dict[str, str] = {}
+
+    def attempt(section: str, compute: Callable[[], Part], missing: Part) -> Part:
+        try:
+            return compute()
+        except Exception as error:  # the page holds the rest
+            failures[section] = reason_of(error)
+            return missing
+
+    def shown_noise() -> GyroNoise | None:
+        if proposal.noise is not None or flight is None:
+            return proposal.noise
+        noise = gyro_noise(flight, law, axis, _SLOWEST)
+        return noise if isinstance(noise, GyroNoise) else None
+
+    designs = {"flown": (law, gains_of(law, axis))}
+    if new:
+        changed = {} if filters is None else {name: new[name] for name in filters.flown}
+        after = flown.with_filters(changed) if changed else law
+        designs["proposed"] = (after, gains_in(law, axis, new))
+    noise = attempt("noise", shown_noise, None)
+    spectra = lambda: ({}, {}) if noise is None else noise_spectra(noise, axis, designs)
+    gyro, derivative = attempt("noise", spectra, ({}, {}))
+    steps = lambda: (
+        step_bands(proposal, designs) if proposal.identification.fit.identifiable else {}
     )
-    version, check = ".".join(map(str, flown.version)), proposal.reproduction
+    logged = flight is not None and {"P", "I"} <= set(flight.terms)
+    compute_terms = lambda: (
+        {} if flight is None else logged_terms(flight) if logged
+        else computed_terms(flight, law, axis)
+    )  # fmt: skip
+    terms = attempt("balance", compute_terms, {})
+    terms_are = "as logged" if logged else "computed by the law from set-point and rate"
+    headlines = [Headline(*VERDICTS[proposal.kind], proposal.verdict)]
+    check, throttle = proposal.reproduction, proposal.throttle
+    if check is not None and check.kind == "flown":  # else the verdict says it
+        headlines.append(Headline("good", "THE FLOWN LOOP AGAIN", check.verdict))
+    if filters is not None:
+        headlines.append(Headline("good" if filters.flown else "warn", "FILTERS", filters.text))
+    if throttle is not None:
+        level = "warn" if throttle.gains is None else "good"
+        headlines.append(Headline(level, "THROTTLE", throttle.text))
+        if throttle.curve is not None:
+            level = "warn" if throttle.curve.change else "good"
+            headlines.append(Headline(level, "THRUST CURVE", throttle.curve.text))
+    version = ".".join(map(str, flown.version))
     return PilotPage(
         title=f"{flown.firmware} {version}, rate loop of {AXES[axis]}".replace(" ,", ","),
-        headlines=_headlines(proposal),
+        headlines=headlines,
         remarks=[
             *(f"not modelled: {text}" for text in flown.unmodelled),
             *([flown.filters_text] if flown.filters_text else []),
-            *([limits_text(proposal.settings)] if proposal.new else []),
+            *([limits_text(proposal.settings)] if new else []),
         ],
-        filters=_filters(flown.law, after, axis),
+        filters={
+            name: chains_of(other, axis)
+            for name, (other, _) in designs.items() if name == "flown" or other is not law
+        },
         gyro=gyro,
         derivative=derivative,
         noise="" if noise is None else (
             f"Noise of {noise.source}, less what the set-point explains. Below "
             f"{noise.least_hz:.0f} Hz motion is taken for noise, so the level above is used."
         ),
-        steps=_tried(failures, "steps", steps, {}),
+        steps=attempt("steps", steps, {}),
         terms=terms,
         terms_are=terms_are,
-        motors=[] if proposal.flight is None else motor_rows(proposal.flight),
-        stages=_stage_rows(proposal) if proposal.stages else None,
-        changes=change_rows(proposal.changes) if proposal.new else None,
+        motors=[] if flight is None else motor_rows(flight),
+        stages=stage_rows(proposal) if proposal.stages else None,
+        changes=change_rows(proposal.changes) if new else None,
         text=str(proposal),
         unit=firmware_named(flown.firmware).unit,
         again=None if check is None else FlownAgain(
@@ -81,67 +126,6 @@ def pilot_page(proposal: "AutopilotProposal", origin: Provenance, overview: str 
     )  # fmt: skip
 
 
-Part = TypeVar("Part")
-
-
-def _tried(
-    failures: dict[str, str], section: str, compute: Callable[[], Part], missing: Part
-) -> Part:
-    """A section's content; why it could not be computed goes to `failures`."""
-    try:
-        return compute()
-    except Exception as error:  # the page holds the rest
-        failures[section] = reason_of(error)
-        return missing
-
-
-def _noise_shown(proposal: "AutopilotProposal") -> GyroNoise | None:
-    if proposal.noise is not None or proposal.flight is None:
-        return proposal.noise
-    noise = gyro_noise(proposal.flight, proposal.flown.law, proposal.flown.axis, _SLOWEST)
-    return noise if isinstance(noise, GyroNoise) else None
-
-
-VERDICTS = {
-    "proposed": ("good", "PROPOSED"), "kept": ("good", "WHAT FLEW IS KEPT"),
-    "cannot tell": ("bad", "THIS LOG CANNOT TELL"), "not to be flown": ("bad", "NOT TO BE FLOWN"),
-}  # fmt: skip
-
-
-def _headlines(proposal: "AutopilotProposal") -> list[Headline]:
-    headlines = [Headline(*VERDICTS[proposal.kind], proposal.verdict)]
-    again = proposal.reproduction
-    if again is not None and again.kind == "flown":  # else the verdict says it
-        headlines.append(Headline("good", "THE FLOWN LOOP AGAIN", again.verdict))
-    if proposal.filters is not None:
-        level = "good" if proposal.filters.flown else "warn"
-        headlines.append(Headline(level, "FILTERS", proposal.filters.text))
-    if proposal.throttle is not None:
-        level = "warn" if proposal.throttle.gains is None else "good"
-        headlines.append(Headline(level, "THROTTLE", proposal.throttle.text))
-        if proposal.throttle.curve is not None:
-            level = "warn" if proposal.throttle.curve.change else "good"
-            headlines.append(Headline(level, "THRUST CURVE", proposal.throttle.curve.text))
-    return headlines
-
-
-def _proposed_law(proposal: "AutopilotProposal") -> RateLoop | None:
-    """The law with the proposed filters; None where nothing is proposed."""
-    if not proposal.new:
-        return None
-    filters = {} if proposal.filters is None else dict(proposal.filters.flown)
-    if not filters:
-        return proposal.flown.law
-    return proposal.flown.with_filters({name: proposal.new[name] for name in filters})
-
-
-def _filters(law: RateLoop, after: RateLoop | None, axis: int) -> dict[str, Chains]:
-    before = chains_of(law, axis)
-    if after is None or after is law:
-        return {"flown": before}
-    return {"flown": before, "proposed": chains_of(after, axis)}
-
-
 def chains_of(law: RateLoop, axis: int) -> Chains:
     """The filters of the gyro and those of the D term alone."""
     gyro, slope = law.gyro_chains(), law.derivative_chain(axis)
@@ -151,10 +135,7 @@ def chains_of(law: RateLoop, axis: int) -> Chains:
     return chains
 
 
-Designs = Mapping[str, tuple[RateLoop, Float[np.ndarray, " gains"]]]
-
-
-def _spectra(
+def noise_spectra(
     noise: GyroNoise, axis: int, designs: Designs
 ) -> tuple[dict[str, Spectrum], dict[str, Spectrum]]:
     """Of gyro and D term: before all filters, then behind those of each design."""
@@ -171,24 +152,15 @@ def _spectra(
             gyro[name] = Spectrum(hertz, behind * changed)
         through = np.abs(its_gains[2] * law_paths(other, axis, omega)[0][2]) ** 2
         if name == "flown" and gains[2] > 0:
-            slope = _response(chains_of(law, axis).get("D term", ()), hertz)
-            open = before * through / np.abs(slope) ** 2
+            [slope] = chains_of(law, axis).get("D term", [FilterChain((), 1 / law.dt)])
+            open = before * through / np.abs(np.asarray(slope.response(hertz))) ** 2
             derivative["before the filters"] = Spectrum(hertz, open)
         if its_gains[2] > 0:
             derivative[name] = Spectrum(hertz, behind * changed * through)
     return gyro, derivative
 
 
-def _response(
-    chains: Sequence[FilterChain], hertz: Float[np.ndarray, " frequencies"]
-) -> Complex[np.ndarray, " frequencies"]:
-    response = np.ones(hertz.size, complex)
-    for chain in chains:
-        response = response * np.asarray(chain.response(hertz))
-    return response
-
-
-def _steps(proposal: "AutopilotProposal", designs: Designs) -> dict[str, StepBand]:
+def step_bands(proposal: "AutopilotProposal", designs: Designs) -> dict[str, StepBand]:
     """From set-point to rate, of plants drawn from the fit: by their responses."""
     flown, axis = proposal.flown, proposal.flown.axis
     grid, seed = StepGrid.of(flown.law.dt), proposal.settings.seed + _SEED
@@ -235,22 +207,14 @@ class StepGrid(NamedTuple):
         return StepBand(np.arange(shown) * self.dt, middle, low, high)
 
 
-def _terms(flight: FlightChannels | None, law: RateLoop, axis: int) -> tuple[dict[str, float], str]:
-    """Root mean squares of the terms, and where they are from."""
-    if flight is None:
-        return {}, ""
-    if {"P", "I"} <= set(flight.terms):
-        return logged_terms(flight), "as logged"
-    return _computed_terms(flight, law, axis), "computed by the law from set-point and rate"
-
-
 def logged_terms(flight: FlightChannels) -> dict[str, float]:
     """Root mean squares of P, I, D and F as they were logged, I without its mean."""
     moved = {name: x - x.mean() if name == "I" else x for name, x in flight.terms.items()}
     return {name: float(np.sqrt(np.mean(x**2))) for name, x in moved.items()}
 
 
-def _computed_terms(flight: FlightChannels, law: RateLoop, axis: int) -> dict[str, float]:
+def computed_terms(flight: FlightChannels, law: RateLoop, axis: int) -> dict[str, float]:
+    """Likewise, by the law from set-point and rate."""
     size = min(int(_WINDOW / flight.dt), len(flight.setpoint))
     hertz = np.fft.rfftfreq(size, flight.dt)
     inside = (hertz > 0) & (hertz < 0.4999 / law.dt)
@@ -281,18 +245,23 @@ def motor_rows(flight: FlightChannels) -> list[tuple[str, float, float]]:
     ]
 
 
-def _stage_rows(proposal: "AutopilotProposal") -> Table:
+def stage_rows(proposal: "AutopilotProposal") -> Table:
+    """What each set of gains gives on fresh plants."""
     names = ["what flew", "a third of the way", "all of it"]
     stages = list(proposal.stages)
     levels = () if proposal.throttle is None else proposal.throttle.logged
     if proposal.filters is not None and proposal.filters.flown and proposal.filters.gains_alone:
         names.append("gains alone, filters as flown")
         stages.append(proposal.filters.gains_alone)
+    further = lambda x: [  # with the integral held, and of the angle loop
+        *([] if x.relaxed is None else [f"{x.relaxed:.2f}"]),
+        *([] if x.angle is None else [f"{x.angle.peak:.2f}", f"{x.angle.resonance:.2f}"]),
+    ]
     rows: list[list[str | Cell]] = [
         [
             name, f"{100 * x.stable:.1f}", f"{x.peak:.2f}", f"{x.resonance:.2f}",
             f"{x.crossover / (2 * np.pi):.1f}", x.margin_text,
-            f"{x.rejection:.2f}", f"{x.noise:.2f}", *_further(x),
+            f"{x.rejection:.2f}", f"{x.noise:.2f}", *further(x),
             *(f"{peak:.2f}" for peak in x.peaks[: len(levels)]),
         ]
         for name, x in zip(names, stages, strict=True)
@@ -307,27 +276,14 @@ def _stage_rows(proposal: "AutopilotProposal") -> Table:
     return Table(f"On {proposal.settings.fresh} fresh plants", heads, rows)
 
 
-def _further(stage: Stage) -> list[str]:
-    """With the integral held, and of the angle loop, where there are such."""
-    relaxed = [] if stage.relaxed is None else [f"{stage.relaxed:.2f}"]
-    angle = stage.angle
-    return relaxed if angle is None else [*relaxed, f"{angle.peak:.2f}", f"{angle.resonance:.2f}"]
-
-
 def change_rows(changes: Sequence[ParameterChange], words: Sequence[WordChange] = ()) -> Table:
     """Old, new, unit, range and reason, for the page."""
     rows: list[list[str | Cell]] = [
         [
-            Cell(row.name), f"{old:.5g}", f"{new:.5g}", row.unit, _range(row.low, row.high), reason,
+            Cell(row.name), f"{old:.5g}", f"{new:.5g}", row.unit, row.range_text, reason,
         ]
         for row, old, new, reason in changes
     ]  # fmt: skip
     rows += [[Cell(word.name), word.old, word.new, "", "", word.reason] for word in words]
     heads = ("parameter", "old", "new", "unit", "range", "reason")
     return Table("From what flew to the proposal", heads, rows)
-
-
-def _range(low: Number, high: Number) -> str:
-    if not np.isfinite(low):
-        return "none documented"
-    return f"{low:g} to {high:g}" if np.isfinite(high) else f"{low:g} or above"

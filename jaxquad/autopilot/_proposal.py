@@ -27,8 +27,8 @@ from ._over_throttle import ThrottleVerdict
 from ._page import write_pilot_page
 from ._parameters import find_parameter
 from ._pilot_page import pilot_page
-from ._plants import PlantSource
 from ._rate_design import FilterVerdict, Kind
+from ._rate_loops import PlantSource
 from ._stages import limits_text, Stage
 
 

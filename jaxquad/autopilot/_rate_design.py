@@ -16,7 +16,7 @@ from ._gyro_noise import gyro_noise, GyroNoise, NoNoise
 from ._identified import DesignSettings, IdentifiedPlant
 from ._over_throttle import ThrottleVerdict
 from ._parameters import filter_choices, find_parameter
-from ._rate_gains import (
+from ._rate_loops import (
     ceiling_in,
     gains_in,
     gains_of,

@@ -11,7 +11,7 @@ from ._filters import FilterChain
 from ._firmware import FilterChoice, Parameter
 from ._gyro_noise import GyroNoise
 from ._law import RateLoop
-from ._rate_gains import (
+from ._rate_loops import (
     FIELDS,
     Filters,
     gain_row,

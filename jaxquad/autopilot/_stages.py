@@ -8,7 +8,7 @@ from jaxtyping import Float
 
 from ._firmware import OuterLoop
 from ._identified import DesignSettings
-from ._rate_gains import delay_margin, RateLoops, together
+from ._rate_loops import delay_margin, RateLoops, together
 
 
 class OuterStage(NamedTuple):

@@ -62,7 +62,7 @@ def channels(declared: argparse.ArgumentParser) -> Run:
             print_json([channel._asdict() for channel in listed])
             return 0
         heads = ("channel", "samples", "rate, Hz", "from, s", "to, s", "minimum", "maximum", "unit")
-        rows = [heads]
+        rows: list[tuple[str, ...]] = [heads]
         for c in listed:
             numbers = (f"{c.rate:.5g}", f"{c.start:.6g}", f"{c.stop:.6g}", f"{c.minimum:.4g}")
             rows.append((c.name, f"{c.samples}", *numbers, f"{c.maximum:.4g}", c.unit))

@@ -1,12 +1,148 @@
-"""The published flights as records, with the channels and the part of the flight that are meant."""
+"""The published flights: their files, where these come from, and records of them."""
 
-from typing import Literal
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Literal, NamedTuple
 
 import numpy as np
+import platformdirs
 
-from jaxquad.records import read, Record
+from jaxquad.records import read, ReadError, Record
 
-from ._files import FILES, locate
+
+_FOLDER = "JAXQUAD_DATA"
+_RAW = "https://raw.githubusercontent.com"
+
+
+class DataFile(NamedTuple):
+    """A published file.
+
+    **Arguments:**
+
+    - `folder`: of the data set, within the folder that `JAXQUAD_DATA` names.
+    - `name`: of the file in it.
+    - `origin`: where its publisher has it; an address that ends with the file can be downloaded.
+    - `sha256`: of its bytes; empty where nobody has taken it, and then it is not downloaded.
+    - `others`: names of the same flight in other formats, which count as well.
+    """
+
+    folder: str
+    name: str
+    origin: str
+    sha256: str = ""
+    others: tuple[str, ...] = ()
+
+
+_ANTX = "https://github.com/MattiaDiMauro/Model-identification-and-state-estimation-for-a-multirotor-UAV"
+_CRAZYFLIE = (
+    "arplaboratory/data-driven-system-identification/2d267dd07b4262f579ee223d20b26a6dc9d17147"
+)
+_BLACKBOX = "ilya-epifanov/fc-blackbox/de08350b2bd95f7af93b1b4adf0f27dc3dfd227a"
+_CESSNA = "xuhao1/pyAircraftIden/0aebfb7db67d1ccc258844914a56141242975ce6"
+_CRAZYPAD = "AerialRoboticsUUST/CrazyPAD/5448265fa1bbb3ce983a73a9336cc6e887886360"
+
+
+def _hover(name: str, sha256: str) -> DataFile:
+    path = f"{_CRAZYPAD}/data/controller_data/normal_flight/{name}"
+    return DataFile("crazypad_hover", name, f"{_RAW}/{path}", sha256)
+
+
+FILES: Mapping[str, DataFile] = {
+    "antx_pitch prbs": DataFile(
+        "antx_pitch",
+        "log_3_2024-5-22-17-30-40_2dd (1).mat",
+        _ANTX,
+        others=("antx_log3_prbs.npz",),
+    ),
+    "antx_pitch sweep": DataFile(
+        "antx_pitch",
+        "log_2_2024-5-22-17-28-50_2dd (1).mat",
+        _ANTX,
+        others=("antx_log2_sweep.npz",),
+    ),
+    "crazyflie_rollpitch": DataFile(
+        "crazyflie_rollpitch",
+        "log15",
+        f"{_RAW}/{_CRAZYFLIE}/logs_crazyflie/log15",
+        "364dea627205f4eee3e8d54f72b0ba8fd93442dcea9c8cc4a42b59004ecf3a31",
+    ),
+    "betaflight_ar8": DataFile(
+        "betaflight_ar8",
+        "LOG00037.BFL",
+        f"{_RAW}/{_BLACKBOX}/src/test-data/LOG00037.BFL",
+        "5fb78729580c414f41654d3b2103417088a972c9049ce873303835fc5c66c8f2",
+    ),
+    "cessna_xplane": DataFile(
+        "cessna_xplane",
+        "sweep_data_2017_12_10_19_05.npy",
+        f"{_RAW}/{_CESSNA}/data/sweep_data_2017_12_10_19_05.npy",
+        "8f64fc161750af94febf9f5da4cb5a1ecc47d09ce039e8c79e13aa8c8d85df38",
+    ),
+    "crazypad_hover E8_log00": _hover(
+        "E8_log00", "f53df39f807f3ffdeab37efa3a2a463a239a4d79703c92a8a93db1fe24001510"
+    ),
+    "crazypad_hover E8_log01": _hover(
+        "E8_log01", "fea67514d5960352ce7944dd7a07eff22aa19e9118446c39382b9f7d3ab53b70"
+    ),
+    "crazypad_hover E9_log00": _hover(
+        "E9_log00", "358100a9845755841fa0ab1febc8238e8d0a6515ff387b5b6a2bba0c3aaeb904"
+    ),
+}
+
+
+def locate(file: DataFile) -> Path:
+    """The path of a published file: on this machine, or after a download.
+
+    Looked for in the folder of the data set within `JAXQUAD_DATA`, then in the user's cache folder
+    (`jaxquad/datasets`). Otherwise it is downloaded into the latter (extra `datasets`), where its
+    SHA-256 is known, and refused if it is another one.
+
+    **Arguments:**
+
+    - `file`: one of `jq.datasets.FILES`, or of your own.
+
+    **Raises:**
+
+    - `ReadError`: the file is nowhere, cannot be downloaded, or is not what was published.
+    """
+    cache = Path(platformdirs.user_cache_dir("jaxquad")) / "datasets" / file.folder
+    data = os.environ.get(_FOLDER)
+    folders = ([Path(data) / file.folder] if data else []) + [cache]
+    for folder in folders:
+        for name in (*file.others, file.name):
+            if (folder / name).is_file() and (folder != cache or not file.sha256):
+                return folder / name
+    unset = "" if _FOLDER in os.environ else f" ({_FOLDER} is not set)"
+    missing = f"{file.name} is not in {' nor in '.join(map(str, folders))}{unset}"
+    if not file.sha256:
+        raise ReadError(
+            f"{missing}. It cannot be checked after a download, as no checksum of it "
+            f"is known: take it from {file.origin} and put it into {folders[0]}"
+        )
+    try:
+        import pooch
+    except ImportError as error:
+        raise ReadError(
+            f"{missing}, and pooch, which downloads it, is not installed: pip install "
+            f'"jaxquad[datasets]", or set {_FOLDER} to the folder that holds {file.folder}'
+        ) from error
+    pooch.get_logger().setLevel("WARNING")
+    try:  # a sound file in the cache stays as it is
+        path = pooch.retrieve(
+            file.origin, f"sha256:{file.sha256}", fname=file.name, path=cache, progressbar=False
+        )
+    except ValueError as error:
+        raise ReadError(
+            f"{file.origin} is not the file that was published: its SHA-256 differs from "
+            f"{file.sha256}. Nothing was kept; try again, or take the file from elsewhere"
+        ) from error
+    except OSError as error:
+        raise ReadError(
+            f"{missing}, and {file.origin} cannot be downloaded ({type(error).__name__}). Look at "
+            f"the connection, or set {_FOLDER} to the folder that holds {file.folder}"
+        ) from error
+    return Path(path)
 
 
 _RADIANS = np.pi / 180

@@ -90,9 +90,15 @@ def draw_members(
     """`n` members of an `Ensemble` around a `Loop`."""
     nominal, distributions = ensemble.resolve(loop)
     axes = count_axes(nominal)
-    rows = _count_rows(distributions, ensemble.independent, axes)
-    deviates = 0 if ensemble.plants is None else ensemble.plants.deviates
-    points = _points(distributions, rows, deviates, n, key, sampling)
+    # How many numbers each distribution draws for a member.
+    varying = {name: one for name, one in distributions.items() if one.varies}
+    rows = {name: axes if name in ensemble.independent else 1 for name in varying}
+    # Probabilities: of the distributions first, then of the posterior.
+    if sampling == "grid":
+        points = make_grid([varying[name] for name in rows for _ in range(rows[name])], n)
+    else:
+        deviates = 0 if ensemble.plants is None else ensemble.plants.deviates
+        points = draw_unit_points(sampling, key, sum(rows.values()) + deviates, n)
     drawn = _values(distributions, rows, points, axes)
     wide: Wide = lambda x: np.broadcast_to(x if x.ndim > 1 else x[:, None], (axes, n))
     plant, delay = nominal, np.atleast_1d(np.asarray(loop.delay))
@@ -122,31 +128,6 @@ def draw_members(
 
 
 Given = dict[str, Distribution]
-
-
-def _count_rows(distributions: Given, independent: tuple[str, ...], axes: int) -> dict[str, int]:
-    """How many numbers each distribution draws for a member."""
-    return {
-        name: axes if name in independent else 1
-        for name, one in distributions.items()
-        if one.varies
-    }
-
-
-def _points(
-    distributions: Given,
-    rows: dict[str, int],
-    deviates: int,
-    n: int,
-    key: Key[Array, ""],
-    sampling: str,
-) -> Shares:
-    """Probabilities: of the distributions first, then of the posterior."""
-    if sampling == "grid":
-        return make_grid(
-            [distributions[name] for name, count in rows.items() for _ in range(count)], n
-        )
-    return draw_unit_points(sampling, key, sum(rows.values()) + deviates, n)
 
 
 def _values(distributions: Given, rows: dict[str, int], points: Shares, axes: int) -> Drawn:

@@ -46,24 +46,19 @@ def describe(ensemble: "Ensemble") -> str:
     distributions = ensemble.distributions
     varies = {name: one for name, one in distributions.items() if one.varies}
     same = {
-        n: one for n, one in distributions.items() if n not in varies and _is_worth_a_line(n, one)
+        name: one
+        for name, one in distributions.items()
+        if name not in varies and not (name in FACTORS and np.all(one.support[0] == 1))
     }
     corner = f", gusts of {ensemble.gust_corner:.4g} rad/s" if ensemble.gust is not None else ""
     lines = [f"ensemble, {ensemble.sampling} sampling{corner}"]
     lines += [f"  plants {ensemble.plants}"] if ensemble.plants is not None else []
-    return "\n".join([*lines, *(_line(n, one, ensemble) for n, one in (varies | same).items())])
-
-
-def _is_worth_a_line(name: str, one: Distribution) -> bool:
-    """A factor of 1 is not."""
-    return not (name in FACTORS and np.all(one.support[0] == 1))
-
-
-def _line(name: str, one: Distribution, ensemble: "Ensemble") -> str:
-    relative = one.relative and name not in FACTORS
-    unit = "times the nominal" if relative else _UNITS[name]
-    alone = ", each axis by itself" if name in ensemble.independent else ""
-    return f"  {name:<15} {one.text:<32} {unit}{alone}"
+    for name, one in (varies | same).items():
+        relative = one.relative and name not in FACTORS
+        unit = "times the nominal" if relative else _UNITS[name]
+        alone = ", each axis by itself" if name in ensemble.independent else ""
+        lines.append(f"  {name:<15} {one.text:<32} {unit}{alone}")
+    return "\n".join(lines)
 
 
 _POSITIVE = {
@@ -99,18 +94,6 @@ def _check_ensemble(ensemble: "Ensemble") -> None:
         )
     require_all_positive(gust_corner=ensemble.gust_corner)
     distributions = ensemble.distributions
-    _check_names(ensemble, distributions)
-    for name, one in distributions.items():
-        if name in ensemble.independent and name in _ONE_FOR_ALL:
-            raise ValueError(f"{name} is the same for all axes: leave it out of independent=")
-        if name in FACTORS or not one.relative:
-            _check_support(name, one)
-    _check_payload(ensemble, distributions)
-    if ensemble.plants is not None:
-        ensemble.plants.require_determined(ensemble.replaced)
-
-
-def _check_names(ensemble: "Ensemble", distributions: dict[str, Distribution]) -> None:
     if ensemble.sampling not in SAMPLINGS:
         raise ValueError(f"sampling is {ensemble.sampling!r}: use one of {', '.join(SAMPLINGS)}")
     if ensemble.sampling == "grid" and ensemble.plants is not None:
@@ -122,6 +105,21 @@ def _check_names(ensemble: "Ensemble", distributions: dict[str, Distribution]) -
             f"independent is {names!r}: name quantities that vary, in brackets; here "
             f"{', '.join(varying) or 'none does'}"
         )
+    for name, one in distributions.items():
+        if name in ensemble.independent and name in _ONE_FOR_ALL:
+            raise ValueError(f"{name} is the same for all axes: leave it out of independent=")
+        if name in FACTORS or not one.relative:
+            _check_support(name, one)
+    if ensemble.payload is not None:
+        least = [distributions[name].support[0] for name in ("inertia", "payload added")]
+        if not sum(np.min(x) for x in least) > 0:
+            raise ValueError(
+                f"the payload adds {number(least[1])} and a member can start from "
+                f"{number(least[0])} times the nominal inertia, whose sum is not above 0: remove "
+                "less inertia"
+            )
+    if ensemble.plants is not None:
+        ensemble.plants.require_determined(ensemble.replaced)
 
 
 def _check_support(name: str, one: Distribution) -> None:
@@ -136,17 +134,6 @@ def _check_support(name: str, one: Distribution) -> None:
         raise ValueError(
             f"{name} is {one.text}, which reaches {least:.4g}, but it cannot be negative "
             f"({_NOT_NEGATIVE[name]}): narrow the distribution"
-        )
-
-
-def _check_payload(ensemble: "Ensemble", distributions: dict[str, Distribution]) -> None:
-    if ensemble.payload is None:
-        return
-    least = [distributions[name].support[0] for name in ("inertia", "payload added")]
-    if not sum(np.min(x) for x in least) > 0:
-        raise ValueError(
-            f"the payload adds {number(least[1])} and a member can start from {number(least[0])} "
-            "times the nominal inertia, whose sum is not above 0: remove less inertia"
         )
 
 

@@ -274,27 +274,23 @@ def _add_drawn(
     corner: float,
 ) -> dict[str, Float[Array, "samples axes members"]]:
     """The parts of the scenario that members add to, with what they add."""
+
+    def white(key: Key[Array, ""]) -> Array:
+        # In single precision, so that float32 and float64 fly through the same noise.
+        return jax.random.normal(jax.random.fold_in(key, 0), shape, jnp.float32)
+
+    def gusts(key: Key[Array, ""]) -> Array:
+        return gauss_markov(jax.random.fold_in(key, 1), shape, deviation=1.0, corner=corner, dt=dt)
+
+    of_members = lambda draw: jax.vmap(draw, out_axes=-1)(keys)
     drawn = {}
     if noise is not None:
-        drawn["noise"] = _white(keys, shape).astype(noise.dtype) * noise[None]
+        drawn["noise"] = of_members(white).astype(noise.dtype) * noise[None]
     if gust is not None:
-        drawn["disturbance"] = _gusts(keys, shape, corner, dt).astype(gust.dtype) * gust[None]
+        drawn["disturbance"] = of_members(gusts).astype(gust.dtype) * gust[None]
     if payload is not None:
         drawn["payload"] = payload.signal(shape[0], dt)
     return {name: _add(vars(scenario)[name], x) for name, x in drawn.items()}
-
-
-def _white(keys: Key[Array, " members"], shape: tuple[int, int]) -> Array:
-    # In single precision, so that float32 and float64 fly through the same noise.
-    draw = lambda key: jax.random.normal(jax.random.fold_in(key, 0), shape, jnp.float32)
-    return jax.vmap(draw, out_axes=-1)(keys)
-
-
-def _gusts(keys: Key[Array, " members"], shape: tuple[int, int], corner: float, dt: float) -> Array:
-    def draw(key: Key[Array, ""]) -> Array:
-        return gauss_markov(jax.random.fold_in(key, 1), shape, deviation=1.0, corner=corner, dt=dt)
-
-    return jax.vmap(draw, out_axes=-1)(keys)
 
 
 def _add(signal: Array | None, drawn: Float[Array, "samples axes members"]) -> Array:

@@ -271,14 +271,33 @@ class Posterior(eqx.Module):
     ) -> tuple[DecoupledAxes, Float[np.ndarray, "1 members"], float]:
         """Plants, their delays in s, and the longest that a loop of this `dt` reckons with."""
         plant, delay = self._drawn(scores)
-        longest = max(_whole_samples_above(x, dt) for x in (_ROOM * self.longest, np.max(delay)))
-        return plant, delay[None], longest
+        # Up to whole samples, so that other draws have the same.
+        longest = max(_ROOM * self.longest, float(np.max(delay)))
+        return plant, delay[None], float(np.ceil(longest / dt - 1e-9)) * dt
 
     def _drawn(
         self, scores: Float[np.ndarray, "parameters members"]
     ) -> tuple[DecoupledAxes, Float[np.ndarray, " members"]]:
-        plant, delay = _draw_plants(self.fit, self.build, scores)
-        _check_positive(plant)
+        """[axes, members] in every parameter; equally many at a time, by one program."""
+        count, parts = scores.shape[1], []
+        for first in range(0, count, _AT_ONCE):
+            some = scores[:, first : first + _AT_ONCE]
+            padded = np.pad(some, ((0, 0), (0, _AT_ONCE - some.shape[1])))
+            models = draw_models(self.fit, padded, hold_undetermined=True)
+            parts.append(_build_plants(self.build, models, self.fit.model, _AT_ONCE))
+        join = lambda *parts: np.concatenate(parts, axis=-1)[..., :count]
+        plant, delay = jax.tree.map(join, *parts)
+        for name, value in vars(plant).items():
+            if value is None or name not in ("torque_gain", "inertia", "lag"):
+                continue
+            values = np.asarray(value)
+            wrong = int(np.sum(np.any(~(values > 0), axis=0)))
+            if wrong:
+                raise ValueError(
+                    f"{name} is not above 0 in {wrong} of {values.shape[-1]} plants drawn from the "
+                    f"fit, the least is {np.min(values):.4g}: name it without jq.identify.Real in "
+                    "free=, which keeps its sign, or record more excitation"
+                )
         return plant, np.maximum(delay - self.held_back, 0.0)
 
     def require_nominal(self, plant: DecoupledAxes | Multirotor) -> None:
@@ -311,20 +330,6 @@ class Posterior(eqx.Module):
         return f"drawn from the covariance of a fit of {names}{remark}"
 
 
-def _draw_plants(
-    fit: Fit, build: Build, scores: Float[np.ndarray, "parameters members"]
-) -> tuple[DecoupledAxes, Float[np.ndarray, " members"]]:
-    """[axes, members] in every parameter of the plant; equally many at a time, by one program."""
-    count, parts = scores.shape[1], []
-    for first in range(0, count, _AT_ONCE):
-        some = scores[:, first : first + _AT_ONCE]
-        padded = np.pad(some, ((0, 0), (0, _AT_ONCE - some.shape[1])))
-        models = draw_models(fit, padded, hold_undetermined=True)
-        parts.append(_build_plants(build, models, fit.model, _AT_ONCE))
-    join = lambda *parts: np.concatenate(parts, axis=-1)[..., :count]
-    return jax.tree.map(join, *parts)
-
-
 @eqx.filter_jit
 def _build_plants(
     build: Build, models: PyTree, one: PyTree, count: int
@@ -332,11 +337,6 @@ def _build_plants(
     place = lambda drawn, one: -1 if eqx.is_array(drawn) and drawn.ndim > one.ndim else None
     axes = jax.tree.map(place, models, one)
     return eqx.filter_vmap(build, in_axes=(axes,), out_axes=-1, axis_size=count)(models)
-
-
-def _whole_samples_above(delay: float, dt: float) -> float:
-    """`delay` in s, up to whole samples, so that other draws have the same."""
-    return float(np.ceil(delay / dt - 1e-9)) * dt
 
 
 def _require_determined(fit: Fit, build: Build, replaced: tuple[str, ...]) -> None:
@@ -386,17 +386,3 @@ def _refusal(fit: Fit, lost: list[str]) -> str:
         f"determine ({undetermined}): give {'; or '.join(remedies)}; or fit with a "
         "jq.identify.Prior or a second record"
     )
-
-
-def _check_positive(plant: DecoupledAxes) -> None:
-    for name, value in vars(plant).items():
-        if value is None or name not in ("torque_gain", "inertia", "lag"):
-            continue
-        values = np.asarray(value)
-        wrong = int(np.sum(np.any(~(values > 0), axis=0)))
-        if wrong:
-            raise ValueError(
-                f"{name} is not above 0 in {wrong} of {values.shape[-1]} plants drawn from the "
-                f"fit, the least is {np.min(values):.4g}: name it without jq.identify.Real in "
-                "free=, which keeps its sign, or record more excitation"
-            )

@@ -6,6 +6,12 @@ from ._excitation import (
     Guideline as Guideline,
     Guidelines as Guidelines,
 )
-from ._multisine import check_lines as check_lines, harmonics as harmonics, multisine as multisine
-from ._pulse import doublet as doublet, three_two_one_one as three_two_one_one
-from ._sweep import sweep as sweep, sweep_frequency as sweep_frequency
+from ._signals import (
+    check_lines as check_lines,
+    doublet as doublet,
+    harmonics as harmonics,
+    multisine as multisine,
+    sweep as sweep,
+    sweep_frequency as sweep_frequency,
+    three_two_one_one as three_two_one_one,
+)

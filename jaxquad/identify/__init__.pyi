@@ -27,7 +27,6 @@ from ._thrust_curve import (
     ThrottleLevels as ThrottleLevels,
 )
 from .batch._fit_batch import BatchFit as BatchFit, fit_batch as fit_batch
-from .frequency_domain._condition import Changed as Changed
 from .frequency_domain._cost import (
     coherence_weight as coherence_weight,
     CoherenceWeighted as CoherenceWeighted,
@@ -39,8 +38,8 @@ from .frequency_domain._cost import (
     WIDER_BAND as WIDER_BAND,
 )
 from .frequency_domain._fit import fit as fit, guess_lagged_integrator as guess_lagged_integrator
-from .frequency_domain._held import as_sampled as as_sampled
 from .frequency_domain._parameters import (
+    Changed as Changed,
     Free as Free,
     name_places as name_places,
     Parameters as Parameters,
@@ -62,6 +61,7 @@ from .frequency_domain._refits import (
     Explanation as Explanation,
 )
 from .frequency_domain._result import Fit as Fit
+from .frequency_domain._sampled import as_sampled as as_sampled
 from .frequency_domain._solve import least_squares as least_squares
 from .frequency_domain._starts import (
     Minimum as Minimum,
@@ -106,14 +106,18 @@ from .uncertainty._curves import (
     step_response as step_response,
     StepBand as StepBand,
 )
-from .uncertainty._derived import Tied as Tied
-from .uncertainty._discrepancy import Discrepancy as Discrepancy
+from .uncertainty._derived import (
+    Factor as Factor,
+    Factors as Factors,
+    factors as factors,
+    Tied as Tied,
+)
 from .uncertainty._draw_models import (
     check_drawable as check_drawable,
     draw_models as draw_models,
     known_covariance as known_covariance,
 )
-from .uncertainty._factors import Factor as Factor, Factors as Factors, factors as factors
+from .uncertainty._error_budget import Discrepancy as Discrepancy
 from .uncertainty._fit_remarks import MISFIT as MISFIT
 from .uncertainty._verdict import (
     Bound as Bound,

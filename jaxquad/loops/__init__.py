@@ -10,8 +10,15 @@ from ._analysis import (
     LoopNumbers as LoopNumbers,
     LoopResponse as LoopResponse,
 )
+from ._bandwidth import attitude_bandwidth as attitude_bandwidth, Bandwidth as Bandwidth
 from ._gain_window import gain_window as gain_window, GainWindow as GainWindow
 from ._loop import Loop as Loop
+from ._margins import (
+    disturbance_rejection as disturbance_rejection,
+    Margins as Margins,
+    margins as margins,
+    Rejection as Rejection,
+)
 from ._protocols import (
     after_drive as after_drive,
     CarriesPayload as CarriesPayload,
@@ -25,10 +32,4 @@ from ._protocols import (
     Sensor as Sensor,
     signals_of as signals_of,
 )
-from .qualities._bandwidth import attitude_bandwidth as attitude_bandwidth, Bandwidth as Bandwidth
-from .qualities._margins import Margins as Margins, margins as margins
-from .qualities._rejection import (
-    disturbance_rejection as disturbance_rejection,
-    Rejection as Rejection,
-)
-from .qualities._rms import rms_response as rms_response, RmsResponse as RmsResponse
+from ._rms import rms_response as rms_response, RmsResponse as RmsResponse

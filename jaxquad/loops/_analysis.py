@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool, Complex, Float
 
 from jaxquad._compile import brief_options, Jit
 
+from ._curve import decibels, degrees, lines, shown
 from ._linear_loop import (
     axis_index,
     close,
@@ -22,10 +23,8 @@ from ._linear_loop import (
     OpenLoop,
 )
 from ._loop import Loop
+from ._margins import disturbance_rejection, margins
 from ._spectrum import abscissa, noise_gain, powers, sharpest
-from .qualities._basis import decibels, degrees, lines, shown
-from .qualities._margins import margins
-from .qualities._rejection import disturbance_rejection
 
 
 _LOWEST, _BEYOND, _POINTS = 1e-5, 1.0005, 500  # of pi / dt; a crossing may lie at pi / dt itself
@@ -52,16 +51,14 @@ def linear_numbers(
     loop; the peak is then where a parabola through three neighbouring values of |1 + L|^2 is least.
     """
     parts, ensemble = linear_parts(loop, axes)
-    numbers = jax.vmap(lambda one: _of_one(one, tuple(wanted), smoothing, smooth))(parts)
+
+    def of_one(one: LinearParts) -> dict[str, Float[Array, ""]]:
+        plant, controller = one.sampled()
+        closed = close(plant, controller, one.memory).balanced()
+        return numbers_of(join(plant, controller), closed, wanted, smoothing, smooth=smooth)
+
+    numbers = jax.vmap(of_one)(parts)
     return {name: x.reshape(len(axes), *ensemble) for name, x in numbers.items()}
-
-
-def _of_one(
-    parts: LinearParts, wanted: tuple[str, ...], smoothing: float, smooth: bool
-) -> dict[str, Float[Array, ""]]:
-    plant, controller = parts.sampled()
-    closed = close(plant, controller, parts.memory).balanced()
-    return numbers_of(join(plant, controller), closed, wanted, smoothing, smooth=smooth)
 
 
 def numbers_of(

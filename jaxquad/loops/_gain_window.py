@@ -1,19 +1,17 @@
-from collections.abc import Callable
 from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import DTypeLike
 from jaxtyping import Array, Float
 
 from jaxquad.control import LinearController
 
+from ._curve import first
 from ._linear_loop import axis_index, close, linear_parts, LinearParts, SampledAxis
 from ._loop import Loop
 from ._spectrum import abscissa, growth, powers, sharpest
-from .qualities._curve import first
 
 
 _REACH = 1e4  # of the search, as a factor and its inverse
@@ -84,7 +82,21 @@ def _window(parts: LinearParts) -> GainWindow:
         matrix = _closed(plant, controller, factor, parts.memory)
         return abscissa(matrix, ladder(matrix), parts.dt, sharp)
 
-    factors = _candidates(rate, plant.fresh.dtype)
+    def newton_step(root: Float[Array, ""]) -> Float[Array, ""]:
+        """`root` a Newton step on, with its derivatives by the implicit function theorem."""
+        place = jnp.where(jnp.isnan(root), 1.0, root)
+        value, slope = jax.jvp(slowest, (place,), (jnp.ones_like(place),))
+        slope = jax.lax.stop_gradient(slope)
+        return root - value / jnp.where(slope == 0, 1.0, slope)
+
+    # Closer looks at the most stable gain, for windows that a coarse search steps over.
+    factors = jnp.asarray(np.geomspace(1 / _REACH, _REACH, _COARSE), plant.fresh.dtype)
+    share = jnp.linspace(0, 1, _FINE + 2, dtype=plant.fresh.dtype)[1:-1]
+    for _ in range(_ROUNDS):
+        best = jnp.argmin(rate(factors))
+        ends = [factors[jnp.clip(best + k, 0, factors.size - 1)] for k in (-1, 1)]
+        closer = ends[0] * (ends[1] / ends[0]) ** share
+        factors = jnp.sort(jnp.concatenate([factors, closer]))
     rates = rate(factors)
     # The stable neighbours of the plant's own gain, or of the most stable one.
     unity = jnp.argmin(jnp.abs(jnp.log(factors)))
@@ -95,18 +107,10 @@ def _window(parts: LinearParts) -> GainWindow:
 
     crossed = jnp.stack([~inside[:-1] & inside[1:], inside[:-1] & ~inside[1:]])
     roots = jax.lax.stop_gradient(jax.vmap(lambda where: first(rate, factors, where))(crossed))
-    edges = jax.vmap(lambda root: _newton_step(root, slowest))(roots)
+    edges = jax.vmap(newton_step)(roots)
     is_open = jnp.stack([inside[0], inside[-1]])
     edges = jnp.where(is_open, jnp.array([0.0, jnp.inf], edges.dtype), edges) * ratio
     return GainWindow(*jnp.where(exists, edges, jnp.nan))
-
-
-def _newton_step(root: Float[Array, ""], rate: Callable[[Array], Array]) -> Float[Array, ""]:
-    """`root` a Newton step on, with its derivatives by the implicit function theorem."""
-    place = jnp.where(jnp.isnan(root), 1.0, root)
-    value, slope = jax.jvp(rate, (place,), (jnp.ones_like(place),))
-    slope = jax.lax.stop_gradient(slope)
-    return root - value / jnp.where(slope == 0, 1.0, slope)
 
 
 def _closed(
@@ -114,15 +118,3 @@ def _closed(
 ) -> Float[Array, "states states"]:
     scaled = plant._replace(fresh=plant.fresh * factor, stale=plant.stale * factor)
     return close(scaled, controller, memory).balanced().matrix
-
-
-def _candidates(rate: Callable[[Array], Array], dtype: DTypeLike) -> Float[Array, " points"]:
-    # Closer looks at the most stable gain, for windows that a coarse search steps over.
-    factors = jnp.asarray(np.geomspace(1 / _REACH, _REACH, _COARSE), dtype)
-    share = jnp.linspace(0, 1, _FINE + 2, dtype=dtype)[1:-1]
-    for _ in range(_ROUNDS):
-        best = jnp.argmin(rate(factors))
-        ends = [factors[jnp.clip(best + k, 0, factors.size - 1)] for k in (-1, 1)]
-        closer = ends[0] * (ends[1] / ends[0]) ** share
-        factors = jnp.sort(jnp.concatenate([factors, closer]))
-    return factors

@@ -39,7 +39,12 @@ class SampledAxis(NamedTuple):
 
 def sample_axis(axis: LinearAxis, delay: Float[Array, ""] | None, dt: float) -> SampledAxis:
     """The axis between samples `dt` seconds apart, its command `delay` seconds late."""
-    flow, command, torque = _in_samples(axis, dt)
+    # Time in samples, so that the entries have one size whatever the sample interval.
+    unit = np.ones(len(axis.command))
+    unit[1] = dt  # of the rate
+    inputs = jnp.asarray(dt * unit, axis.A.dtype)
+    flow = axis.A * jnp.asarray(dt * unit[:, None] / unit[None], axis.A.dtype)
+    command, torque = axis.command * inputs, axis.torque * inputs
     augmented = _propagate(flow, jnp.stack([command, torque], axis=1), jnp.ones((), flow.dtype))
     states = len(flow)
     transition, driven, push = augmented[:, :states], augmented[:, states], augmented[:, states + 1]
@@ -48,17 +53,6 @@ def sample_axis(axis: LinearAxis, delay: Float[Array, ""] | None, dt: float) -> 
     shift, late = split_delay(delay, dt)
     fresh = _propagate(flow, command[:, None], 1 - late)[:, states]
     return SampledAxis(transition, fresh, driven - fresh, push, shift)
-
-
-def _in_samples(
-    axis: LinearAxis, dt: float
-) -> tuple[Float[Array, "states states"], Float[Array, " states"], Float[Array, " states"]]:
-    # Time in samples, so that the entries have one size whatever the sample interval.
-    unit = np.ones(len(axis.command))
-    unit[1] = dt  # of the rate
-    entries = jnp.asarray(dt * unit[:, None] / unit[None], axis.A.dtype)
-    inputs = jnp.asarray(dt * unit, axis.A.dtype)
-    return axis.A * entries, axis.command * inputs, axis.torque * inputs
 
 
 def _propagate(
@@ -70,9 +64,6 @@ def _propagate(
     states, columns = inputs.shape
     both = jnp.concatenate([flow, inputs], axis=1) * time
     return matrix_exponential(jnp.pad(both, ((0, columns), (0, 0))))[:states]
-
-
-Place = tuple[Int[Array, ""], ...]  # of a member
 
 
 class LinearParts(eqx.Module):
@@ -129,23 +120,22 @@ def linear_parts(
     ensemble = ensemble_shape(loop)
     if member is not None:
         member = member if isinstance(member, tuple) else (member,)
-        _require_member(member, ensemble)
-    places = _places_of(ensemble, member)
+        if len(member) != len(ensemble) or not all(
+            0 <= m < n for m, n in zip(member, ensemble, strict=True)
+        ):
+            raise ValueError(
+                f"member is {member}, but the ensemble has the shape {ensemble}: give one index "
+                "each"
+            )
+    # The indices of the members, one array for each axis of the ensemble.
+    places = [x.ravel() for x in np.indices(ensemble)] if ensemble else []
+    places = tuple(places if member is None else [np.array([k]) for k in member])
     dt, delay = loop.dt, loop.delay if loop.memory else None
     physical, sampled, late, ratio = _linearised(
         plant, controller, delay, tuple(axes), places, states, dt
     )
     parts = LinearParts(physical, sampled, late, ratio, loop.memory, dt)
     return parts, () if member is not None else ensemble
-
-
-def _places_of(
-    ensemble: tuple[int, ...], member: tuple[int, ...] | None
-) -> tuple[Int[np.ndarray, " members"], ...]:
-    """The indices of the members, one array for each axis of the ensemble."""
-    if member is not None:
-        return tuple(np.array([k]) for k in member)
-    return tuple(x.ravel() for x in np.indices(ensemble)) if ensemble else ()
 
 
 @ft.partial(Jit, options=brief_options)
@@ -164,7 +154,11 @@ def _linearised(
         linear, b0 = plant.linearise(axis), jnp.asarray(assumed_gain(controller, axis))
 
         def of_member(*place: Int[Array, ""]) -> tuple:
-            at = lambda x, rank: _at(x, rank, place)
+            def at(x: Array, rank: int) -> Array:
+                """Of an array whose ensemble axes follow the first `rank`."""
+                sizes = zip(place, x.shape[rank:], strict=False)
+                return x[(slice(None),) * rank + tuple(0 if n == 1 else p for p, n in sizes)]
+
             physical = LinearAxis(
                 at(linear.A, 2), at(linear.command, 1), at(linear.torque, 1), at(linear.gain, 0)
             )
@@ -174,10 +168,14 @@ def _linearised(
                 if isinstance(controller, LinearController)
                 else controller.linear(axis, place[:rank] if rank else None)
             )
-            _require_interval(sampled, dt)
+            if not math.isclose(sampled.dt, dt, rel_tol=1e-6):
+                raise ValueError(
+                    f"the controller's linear form is for samples of {sampled.dt} s, the loop's "
+                    f"are {dt} s: give the loop dt={sampled.dt}"
+                )
             return (
                 physical,
-                _padded(_without_idle_states(sampled), states),
+                _with_states(sampled, states),
                 late,
                 at(linear.gain, 0) / (at(b0.astype(linear.gain.dtype), 0)),
             )
@@ -187,14 +185,6 @@ def _linearised(
         return jax.vmap(of_member)(*(jnp.asarray(x) for x in places))
 
     return jax.tree.map(lambda *rows: jnp.concatenate(rows), *(of_axis(k) for k in axes))
-
-
-def _require_interval(controller: LinearController, dt: float) -> None:
-    if not math.isclose(controller.dt, dt, rel_tol=1e-6):
-        raise ValueError(
-            f"the controller's linear form is for samples of {controller.dt} s, the loop's are "
-            f"{dt} s: give the loop dt={controller.dt}"
-        )
 
 
 def axis_index(axis: int | str) -> int:
@@ -208,41 +198,24 @@ def axis_index(axis: int | str) -> int:
     return AXES.index(axis)
 
 
-def _require_member(member: tuple[int, ...], ensemble: tuple[int, ...]) -> None:
-    if len(member) != len(ensemble) or not all(
-        0 <= m < n for m, n in zip(member, ensemble, strict=True)
-    ):
-        raise ValueError(
-            f"member is {member}, but the ensemble has the shape {ensemble}: give one index each"
-        )
+def _with_states(controller: LinearController, states: int) -> LinearController:
+    """With further states that nothing drives and nothing reads.
 
-
-def _without_idle_states(controller: LinearController) -> LinearController:
-    # A state that nothing drives, as the integral of a PID with ki = 0, stays at 0: it is no mode.
+    A state that nothing drives, as the integral of a PID with ki = 0, stays at 0: it is no mode.
+    """
     A = controller.A
     others = jnp.where(jnp.eye(len(A), dtype=bool), 0, A)
     inputs = (controller.measurement_in != 0) | (controller.reference_in != 0)
     driven = jnp.any(others != 0, axis=1) | inputs
-    return dataclasses.replace(controller, A=jnp.where(driven[:, None], A, 0))
-
-
-def _padded(controller: LinearController, states: int) -> LinearController:
-    """With further states that nothing drives and nothing reads."""
     extra = max(0, states - len(controller.C))
     longer = lambda x: jnp.pad(x, (0, extra))
     return dataclasses.replace(
         controller,
-        A=jnp.pad(controller.A, ((0, extra), (0, extra))),
+        A=jnp.pad(jnp.where(driven[:, None], A, 0), ((0, extra), (0, extra))),
         reference_in=longer(controller.reference_in),
         measurement_in=longer(controller.measurement_in),
         C=longer(controller.C),
     )
-
-
-def _at(x: Array, rank: int, place: Place) -> Array:
-    """The value of a member, of an array whose ensemble axes follow the first `rank`."""
-    fixed = (slice(None),) * rank
-    return x[fixed + tuple(0 if n == 1 else p for p, n in zip(place, x.shape[rank:], strict=False))]
 
 
 class Rational(NamedTuple):

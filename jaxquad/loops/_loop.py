@@ -32,6 +32,33 @@ class DelayQueue(NamedTuple):
     traced: bool  # its value was not known when the loop was built
     fewest: int = 0  # whole samples by which every member's input is late
 
+    @classmethod
+    def of(cls, delay: ArrayLike, dt: float, longest: float | None) -> "DelayQueue":
+        """The queue of a delay in s. Raises ValueError for a delay that makes no sense."""
+        if isinstance(delay, Tracer):
+            if longest is None or not 0 < longest < math.inf:
+                raise ValueError(
+                    f"the delay is traced by jit, vmap or grad, and longest_delay is {longest}: "
+                    "give longest_delay=, the longest delay in s that can occur"
+                )
+            return cls(math.floor(longest / dt * (1 + 1e-9)) + 1, True, True)
+        values = np.asarray(delay, dtype=float)
+        if not np.all(np.isfinite(values) & (values >= 0)):
+            raise ValueError(f"delay is {delay} s, but it must be 0 or above and finite")
+        greatest = float(np.max(values, initial=0.0))
+        if longest is not None and not 0 <= longest < math.inf:
+            raise ValueError(f"longest_delay is {longest} s, but it must be 0 or above and finite")
+        if longest is not None and greatest > longest * (1 + 1e-9):
+            raise ValueError(
+                f"delay is {delay} s, above longest_delay = {longest} s: raise the latter"
+            )
+        samples = np.asarray(values / dt)
+        nearest = np.round(samples)
+        is_integer = bool(np.all(np.abs(samples - nearest) < 1e-9 * np.maximum(nearest, 1)))
+        samples = nearest if is_integer else np.floor(samples)
+        most, fewest = (int(f(samples)) if samples.size else 0 for f in (np.max, np.min))
+        return cls(most if is_integer else most + 1, not is_integer, False, fewest)
+
 
 class Loop(eqx.Module):
     """A plant, its sampled controller, and all that is between them.
@@ -88,7 +115,7 @@ class Loop(eqx.Module):
         _require_positive_number(dt, f"dt is {dt} s: give a sample interval above 0")
         self.plant, self.controller, self.drive, self.encoder = plant, controller, drive, encoder
         self.dt, self.substeps, self.bound = float(dt), substeps, float(bound)
-        self.queue, self.longest_delay = _queue_of(delay, self.dt, longest_delay), longest_delay
+        self.queue, self.longest_delay = DelayQueue.of(delay, self.dt, longest_delay), longest_delay
         self.delay = as_float(delay)
 
     def __check_init__(self):
@@ -139,31 +166,3 @@ class Loop(eqx.Module):
 def _require_positive_number(value: float, message: str) -> None:
     if not (value > 0 and math.isfinite(value)):
         raise ValueError(message)
-
-
-def _queue_of(delay: ArrayLike, dt: float, longest: float | None) -> DelayQueue:
-    """The queue of a delay in s. Raises ValueError for a delay that makes no sense."""
-    if isinstance(delay, Tracer):
-        if longest is None or not 0 < longest < math.inf:
-            raise ValueError(
-                f"the delay is traced by jit, vmap or grad, and longest_delay is {longest}: give "
-                "longest_delay=, the longest delay in s that can occur"
-            )
-        return DelayQueue(math.floor(longest / dt * (1 + 1e-9)) + 1, True, True)
-    values = np.asarray(delay, dtype=float)
-    if not np.all(np.isfinite(values) & (values >= 0)):
-        raise ValueError(f"delay is {delay} s, but it must be 0 or above and finite")
-    greatest = float(np.max(values, initial=0.0))
-    if longest is not None and not 0 <= longest < math.inf:
-        raise ValueError(f"longest_delay is {longest} s, but it must be 0 or above and finite")
-    if longest is not None and greatest > longest * (1 + 1e-9):
-        raise ValueError(f"delay is {delay} s, above longest_delay = {longest} s: raise the latter")
-    return _queue_for(np.asarray(values / dt))
-
-
-def _queue_for(samples: Float[np.ndarray, "..."]) -> DelayQueue:
-    nearest = np.round(samples)
-    is_integer = bool(np.all(np.abs(samples - nearest) < 1e-9 * np.maximum(nearest, 1)))
-    samples = nearest if is_integer else np.floor(samples)
-    most, fewest = (int(f(samples)) if samples.size else 0 for f in (np.max, np.min))
-    return DelayQueue(most if is_integer else most + 1, not is_integer, False, fewest)

@@ -1,13 +1,16 @@
-from ._allocation import Allocation as Allocation
-from ._attitude import Attitude as Attitude
+from ._attitude import (
+    Attitude as Attitude,
+    DecoupledAxes as DecoupledAxes,
+    LinearAxis as LinearAxis,
+)
 from ._convert import (
     from_control as from_control,
     realise as realise,
     series as series,
     state_space as state_space,
 )
-from ._decoupled import DecoupledAxes as DecoupledAxes, LinearAxis as LinearAxis
 from ._multirotor import (
+    Allocation as Allocation,
     CRAZYFLIE as CRAZYFLIE,
     crazyflie as crazyflie,
     MotorLag as MotorLag,

@@ -1,11 +1,17 @@
+"""Attitude dynamics: a rigid body that turns about all axes, and axes without coupling."""
+
+from collections.abc import Sequence
+
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float
 
 from jaxquad._core import (
     align,
     as_float,
     as_float_or_none,
+    on_host,
     per_member,
     require_finite,
     require_nonnegative,
@@ -17,7 +23,7 @@ from jaxquad._core import (
 _CREEP = 0.01  # rad/s, at which the torque reaches 76 % of its level
 
 
-def friction(
+def _friction(
     coulomb: Float[Array, "..."], rate: Float[Array, " axes *ensemble"]
 ) -> Float[Array, " axes *ensemble"]:
     """Dry-friction torque in N m at `rate` in rad/s, smoothed so that it has a gradient."""
@@ -84,7 +90,7 @@ class Attitude(eqx.Module):
         down = align(jnp.array([0, 0, 1], dtype=rate.dtype), rate)
         momentum = inertia * rate - rotors * down  # anticlockwise from above points up
         if self.coulomb is not None:
-            torque = torque + friction(self.coulomb, rate)
+            torque = torque + _friction(self.coulomb, rate)
         return (torque - damping * rate - jnp.cross(rate, momentum, axis=0)) / inertia
 
     def restoring_torque(self, euler: Float[Array, " 3 *ensemble"]) -> Float[Array, " 3 *ensemble"]:
@@ -92,3 +98,179 @@ class Attitude(eqx.Module):
         if self.stiffness is None:
             return jnp.zeros_like(euler)
         return -align(self.stiffness, euler) * euler
+
+
+def _per_axis(x: ArrayLike | Sequence) -> Array:
+    x = as_float(x)
+    return x if x.ndim else as_float(on_host(x)[None])
+
+
+def _per_axis_or_none(x: ArrayLike | Sequence | None) -> Array | None:
+    return None if x is None else _per_axis(x)
+
+
+class LinearAxis(eqx.Module):
+    """One axis of a plant about rest: x' = A x + command u + torque d, angle = x[0].
+
+    The states are the angle in rad, its rate in rad/s and, after these, those of the motors in
+    units of the command u; d is a disturbance torque in N m. All may have an ensemble on trailing
+    axes.
+    """
+
+    A: Float[Array, "states states *ensemble"] = per_member(rank=2)
+    command: Float[Array, " states *ensemble"] = per_member(rank=1)
+    torque: Float[Array, " states *ensemble"] = per_member(rank=1)
+    gain: Float[Array, "*ensemble"] = per_member(rank=0)  # rad/s^2 per unit of a steady command
+
+
+class AxesState(eqx.Module):
+    """The state of `DecoupledAxes`, or its time derivative."""
+
+    angle: Float[Array, " axes *ensemble"]  # rad
+    rate: Float[Array, " axes *ensemble"]  # rad/s
+    motor: Float[Array, " axes *ensemble"] | None  # effective command; None without a lag
+
+
+class DecoupledAxes(eqx.Module):
+    """Axes without coupling: J angle'' = torque_gain u_m - friction + disturbance.
+
+    Friction is damping * rate + coulomb * tanh(rate / 0.01 rad/s) + stiffness * angle, and the
+    motors follow the command u by a first-order lag, u_m' = (u - u_m) / lag.
+    Source: Eq. (28) of the paper, with the terms that it neglects.
+
+    !!! example
+
+        ```python
+        plant = jq.DecoupledAxes(torque_gain=[0.0468], inertia=[0.0552], lag=0.02)
+        ```
+
+    **Arguments:** (one value for all axes, one per axis, or `[axes, *ensemble]`)
+
+    - `torque_gain`: in N m per unit of command. On the Quanser Hover it is L K_f = 0.0234 N m/V for
+        u = V4 - V2, and twice that for +u and -u on two motors.
+    - `inertia`: in kg m^2.
+    - `lag`: of the motors in s; None leaves it out.
+    - `damping`: in N m s/rad; `stiffness`: in N m/rad; `coulomb`: in N m, None leaves it out.
+
+    **Raises:**
+
+    - `ValueError`: an inertia, torque gain or lag is not positive, friction is not finite, or the
+        shapes do not match.
+    """
+
+    torque_gain: Float[Array, "axes ..."] = per_member(rank=1, converter=_per_axis)
+    inertia: Float[Array, "axes ..."] = per_member(rank=1, converter=_per_axis)
+    lag: Float[Array, "axes ..."] | None = per_member(
+        rank=1, converter=_per_axis_or_none, default=None
+    )
+    damping: Float[Array, "axes ..."] = per_member(rank=1, converter=_per_axis, default=0.0)
+    stiffness: Float[Array, "axes ..."] = per_member(rank=1, converter=_per_axis, default=0.0)
+    coulomb: Float[Array, "axes ..."] | None = per_member(
+        rank=1, converter=_per_axis_or_none, default=None
+    )
+
+    def __check_init__(self):
+        _ = self.shape
+        remedy = "give N m per unit of command, with the command's sign chosen to make it positive"
+        require_positive("torque_gain", self.torque_gain, remedy)
+        require_positive("inertia", self.inertia, "give kg m^2, about 0.005 to 0.1 on a quadrotor")
+        if self.lag is not None:
+            require_positive("lag", self.lag, "give seconds; for motors without lag, lag=None")
+        require_finite("damping", self.damping)
+        require_finite("stiffness", self.stiffness)
+        if self.coulomb is not None:
+            require_nonnegative("coulomb", self.coulomb, "friction acts against the motion")
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """(axes, *ensemble), as the parameters ask for together."""
+        shapes = {f"{name} {x.shape}": x.shape for name, x in vars(self).items() if x is not None}
+        longest = max(len(shape) for shape in shapes.values())
+        try:
+            return np.broadcast_shapes(*(s + (1,) * (longest - len(s)) for s in shapes.values()))
+        except ValueError:
+            raise ValueError(
+                f"the parameters have shapes that do not match, {', '.join(shapes)}: give each one "
+                "value per axis, and per member of an ensemble along a last axis"
+            ) from None
+
+    @property
+    def gain(self) -> Float[Array, " axes *ensemble"]:
+        """b, the acceleration that a unit of command causes: rad/s^2 per unit."""
+        return _align_to(self.torque_gain, self.inertia) / _align_to(self.inertia, self.torque_gain)
+
+    def init(
+        self, euler: ArrayLike | Sequence | None = None, *, ensemble: tuple[int, ...] = ()
+    ) -> AxesState:
+        """At rest at the angles `euler` in rad, 0 if None, with the motors stopped.
+
+        The state is as wide as `ensemble`, the parameters and `euler` ask for together.
+        """
+        dtype = self.inertia.dtype
+        angle = jnp.zeros(1, dtype) if euler is None else jnp.asarray(euler, dtype)
+        axes, *members = self.shape
+        shape = jnp.broadcast_shapes(tuple(members), ensemble, angle.shape[1:])
+        still = jnp.zeros((max(axes, angle.shape[0]), *shape), dtype)
+        angle = jnp.broadcast_to(align(angle, still), still.shape)
+        return AxesState(angle, still, None if self.lag is None else still)
+
+    def derivative(
+        self,
+        state: AxesState,
+        inputs: Float[Array, " axes *ensemble"],
+        disturbance: Float[Array, " axes *ensemble"],
+    ) -> AxesState:
+        """Time derivative of `state` under the command `inputs` and a `disturbance` in N m."""
+        angle, rate = state.angle, state.rate
+        motor = inputs if state.motor is None else state.motor
+        torque = align(self.torque_gain, rate) * motor + disturbance
+        torque = torque - align(self.damping, rate) * rate - align(self.stiffness, rate) * angle
+        if self.coulomb is not None:
+            torque = torque + _friction(self.coulomb, rate)
+        lagging = None if self.lag is None else (inputs - motor) / align(self.lag, rate)
+        return AxesState(rate, torque / align(self.inertia, rate), lagging)
+
+    def measure(self, state: AxesState) -> Float[Array, " axes *ensemble"]:
+        """The angles in rad."""
+        return state.angle
+
+    def linearise(self, axis: int) -> LinearAxis:
+        """One axis about rest, without its dry friction, which has no linear part.
+
+        **Raises:** ValueError for an axis that the plant does not have.
+        """
+        axes, *ensemble = self.shape
+        if not 0 <= axis < axes:
+            has = f"axes 0 to {axes - 1}" if axes > 1 else "one axis only, number 0 (roll)"
+            raise ValueError(f"axis is {axis}, but the plant has {has}")
+
+        def of_axis(x: Array) -> Array:  # for each member; where all axes share a value, that one
+            value = x[axis if x.shape[0] > 1 else 0]
+            one_each = value.shape + (1,) * (len(ensemble) - value.ndim)
+            return jnp.broadcast_to(value.reshape(one_each), tuple(ensemble))
+
+        inertia, lag = of_axis(self.inertia), None if self.lag is None else of_axis(self.lag)
+        one, zero = jnp.ones_like(inertia), jnp.zeros_like(inertia)
+        gain = of_axis(self.torque_gain) / inertia
+        pull, brake = -of_axis(self.stiffness) / inertia, -of_axis(self.damping) / inertia
+        rows, command, torque = [[zero, one], [pull, brake]], [zero, gain], [zero, 1 / inertia]
+        if lag is not None:
+            rows = [[zero, one, zero], [pull, brake, gain], [zero, zero, -1 / lag]]
+            command, torque = [zero, zero, 1 / lag], [*torque, zero]
+        return LinearAxis(jnp.array(rows), jnp.array(command), jnp.array(torque), gain)
+
+    def with_added_inertia(self, inertia: Float[ArrayLike, "..."]) -> "DecoupledAxes":
+        """The same axes carrying a known extra `inertia` in kg m^2, such as a payload."""
+        return eqx.tree_at(lambda p: p.inertia, self, add_inertia(self.inertia, inertia))
+
+
+def add_inertia(inertia: Float[Array, "axes ..."], extra: Float[ArrayLike, "..."]) -> Array:
+    """The sum, in the precision of `inertia`, where either may have a trailing ensemble axis."""
+    extra = jnp.atleast_1d(jnp.asarray(extra, inertia.dtype))
+    total = _align_to(inertia, extra) + _align_to(extra, inertia)
+    require_positive("the inertia with what was added", total, "add kg m^2 that leave it above 0")
+    return total
+
+
+def _align_to(x: Array, other: Array) -> Array:
+    return x if x.ndim >= other.ndim else align(x, other)

@@ -192,7 +192,15 @@ def from_control(system: HasCoefficients | HasMatrices) -> TransferFunction | St
         parts, D = [], np.zeros((outputs, inputs))
         for row in range(outputs):  # a bank of all pairs
             for column in range(inputs):
-                A, b, c, D[row, column] = _companion(above[row][column], below[row][column])
+                pair = TransferFunction(above[row][column], below[row][column])
+                A, b, c = np.zeros((0, 0)), np.zeros(0), np.zeros(0)
+                if np.any(pair.numerator):  # no states for a response of 0
+                    # The controllable canonical form.
+                    over, under = above[row][column], below[row][column]
+                    a, states = under[1:] / under[0], under.size - 1
+                    over = np.concatenate([np.zeros(under.size - over.size), over]) / under[0]
+                    b, D[row, column] = np.eye(states, 1)[:, 0], float(over[0])
+                    A, c = np.eye(states, k=-1) - np.outer(b, a), over[1:] - over[0] * a
                 unit_in, unit_out = np.eye(inputs)[column], np.eye(outputs)[row]
                 parts.append((A, np.outer(b, unit_in), np.outer(unit_out, c)))
         from scipy.linalg import block_diag
@@ -204,20 +212,6 @@ def from_control(system: HasCoefficients | HasMatrices) -> TransferFunction | St
     if hasattr(system, "frdata"):
         remedy += "; data go to jq.spectra.FrequencyResponse.from_table(system, random_error=0.02)"
     raise ValueError(f"from_control cannot convert a {type(system).__name__}: give a {remedy}.")
-
-
-def _companion(
-    above: Float[np.ndarray, " zeros"], below: Float[np.ndarray, " poles"]
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
-    """A, b, c, d of one pair: the controllable canonical form; no states for a response of 0."""
-    model = TransferFunction(above, below)
-    if not np.any(model.numerator):
-        return np.zeros((0, 0)), np.zeros(0), np.zeros(0), 0.0
-    a, states = below[1:] / below[0], below.size - 1
-    b = np.concatenate([np.zeros(below.size - above.size), above]) / below[0]
-    first = np.eye(states, 1)[:, 0]
-    A = np.eye(states, k=-1) - np.outer(first, a)
-    return A, first, b[1:] - b[0] * a, float(b[0])
 
 
 def _with_passage(

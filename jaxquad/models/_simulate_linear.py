@@ -172,18 +172,6 @@ def _recursion(
     return jnp.swapaxes(within + carried, 0, 1).reshape(chunks * length, states)[:samples]
 
 
-def _free_motion(
-    rows: Float[Array, "outputs states"], A: Float[Array, "states states"], samples: int
-) -> Float[Array, "samples outputs states"]:
-    """`rows` A^k for each sample k."""
-    length = _chunk(samples)
-    steps, over = _powers(A, length)
-    chunks = _powers(over, -(-samples // length))[0]
-    starts = jnp.einsum("oi,cij->coj", rows, chunks, precision="highest")
-    motion = jnp.einsum("coi,lij->cloj", starts, steps, precision="highest")
-    return motion.reshape(len(chunks) * length, *rows.shape)[:samples]
-
-
 def _powers(
     A: Float[Array, "states states"], count: int
 ) -> tuple[Float[Array, "count states states"], Float[Array, "states states"]]:
@@ -385,7 +373,12 @@ def _free_outputs(
     if plant.output_delay is not None:
         back = jax.vmap(lambda delay: matrix_exponential(-delay * block))(plant.output_delay)
         rows = jnp.einsum("oi,oij->oj", rows, back, precision="highest")
-    motion = _free_motion(rows, matrix_exponential(block * dt), samples)
+    length = _chunk(samples)  # rows A^k for each sample k, from powers of powers
+    steps, over = _powers(matrix_exponential(block * dt), length)
+    chunks = _powers(over, -(-samples // length))[0]
+    starts = jnp.einsum("oi,cij->coj", rows, chunks, precision="highest")
+    motion = jnp.einsum("coi,lij->cloj", starts, steps, precision="highest")
+    motion = motion.reshape(len(chunks) * length, *rows.shape)[:samples]
     return motion[:, :, :states], motion[:, :, states:]
 
 

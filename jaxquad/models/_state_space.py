@@ -79,7 +79,11 @@ class StateSpace(eqx.Module):
             "input_delay": (inputs,),
             "output_delay": (outputs,),
         }
-        arrays = _arrays(self)
+        arrays = {
+            "F": F, "G": G, "H0": H0, "H1": self.H1, "M": self.M,
+            "input_delay": self.input_delay, "output_delay": self.output_delay,
+        }  # fmt: skip
+        arrays = {name: x for name, x in arrays.items() if x is not None}
         for name, shape in shapes.items():
             if name in arrays and arrays[name].shape != shape:
                 raise ValueError(
@@ -230,15 +234,6 @@ def _rational(model: StateSpace, pade: int | None) -> Explicit:
     by_input, by_output = late(model.input_delay, inputs), late(model.output_delay, outputs)
     check_order(np.concatenate([by_input, by_output]), pade)
     return plain if pade is None else without_delays(plain, by_input, by_output, pade)
-
-
-def _arrays(model: StateSpace) -> dict[str, Array]:
-    """What is not left out, by name."""
-    arrays = {
-        "F": model.F, "G": model.G, "H0": model.H0, "H1": model.H1, "M": model.M,
-        "input_delay": model.input_delay, "output_delay": model.output_delay,
-    }  # fmt: skip
-    return {name: x for name, x in arrays.items() if x is not None}
 
 
 def _check_names(names: Sequence[tuple[str, str]], arrays: dict[str, Array]) -> None:

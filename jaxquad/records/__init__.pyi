@@ -1,3 +1,4 @@
+from ._channel import Channel as Channel, resample as resample
 from ._clock import clock_start as clock_start, show_times as show_times
 from ._edit import detrend as detrend, mix as mix, select as select, trim as trim
 from ._errors import (
@@ -13,7 +14,6 @@ from ._read import (
     Settings as Settings,
 )
 from ._record import Record as Record
-from ._resample import Channel as Channel, resample as resample
 from ._segments import (
     Mix as Mix,
     MixError as MixError,

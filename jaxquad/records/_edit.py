@@ -6,10 +6,10 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 
+from ._channel import within
 from ._clock import Number, Times, window
 from ._errors import RecordError
 from ._record import as_tuple, assemble, Record
-from ._repair import within
 
 
 Channels = Float[np.ndarray, "samples channels"]

@@ -41,3 +41,13 @@ def firmware_log(name: str) -> "FirmwareLog | None":
 def registered_logs() -> "Iterator[FirmwareLog]":
     """Those from outside of the package."""
     return (log for log in tuple(_OFFERED.values()) if not isinstance(log, str))
+
+
+def axis_of_rate(name: str) -> int | None:
+    """0, 1 or 2 for a channel that is a rate behind the gyro's filters of a firmware."""
+    for log in map(firmware_log, firmware_names()):
+        if log is not None and log.gyro_cutoffs:
+            for axis, rate in enumerate(log.rates):
+                if name == rate or name.endswith(f".{rate}"):
+                    return axis
+    return None

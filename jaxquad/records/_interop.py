@@ -6,11 +6,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ._channel import Channel, repair_values, resample
 from ._clock import dates_in_seconds, doubt_of_seconds, Number, PER_SECOND, Times, TimeUnit
 from ._errors import ReadError, RecordError, unknown_name
 from ._record import as_tuple, assemble, check_distinct, Hold, Names, Record
-from ._repair import repair_values
-from ._resample import Channel, resample
 from .formats import load_log
 
 
@@ -156,8 +155,23 @@ _SAVE = "s = get(z); save('z.mat', 's', '-v7')"
 def from_iddata(path: str | Path, variable: str | None, references: Names) -> Record:
     """`Record.from_iddata`, where the arguments are described."""
     fields = _fields(path, variable)
-    y, u = (_matrix(path, fields, *names) for names in (("y", "OutputData"), ("u", "InputData")))
-    time, dt = _uniform_time(path, fields, len(y))
+    y = _matrix(path, fields, "y", "OutputData")
+    u = _matrix(path, fields, "u", "InputData")
+    unit = str(fields.get("TimeUnit", "seconds"))
+    if unit not in _UNITS:
+        raise ReadError(f"{path}: TimeUnit is {unit!r}: use one of {', '.join(_UNITS)}")
+    stamps, interval, start = (
+        np.atleast_1d(np.asarray(fields.get(name, []), np.float64))
+        for name in ("SamplingInstants", "Ts", "Tstart")
+    )
+    if stamps.size == len(y):
+        time, dt = _UNITS[unit] * stamps, float(np.mean(np.diff(stamps))) * _UNITS[unit]
+    elif interval.size == 1 and interval[0] > 0:
+        first = float(start[0]) if start.size else 0.0
+        time = _UNITS[unit] * (first + interval[0] * np.arange(len(y)))
+        dt = float(_UNITS[unit] * interval[0])
+    else:
+        raise ReadError(f"{path}: Ts is {interval.tolist()}: give the sample interval, in {unit}")
     inputs = _labels(fields, "InputName", u, "u")
     input_units = _labels(fields, "InputUnit", u, "")
     outer = as_tuple(references or ())
@@ -225,23 +239,6 @@ def _matrix(path: str | Path, fields: Mapping, *names: str) -> np.ndarray:
             "getexp(z, 1)"
         )
     return array.reshape(len(array), -1).astype(np.float64)
-
-
-def _uniform_time(path: str | Path, fields: Mapping, samples: int) -> tuple[np.ndarray, float]:
-    """Time stamps and the sample interval, both in s."""
-    unit = str(fields.get("TimeUnit", "seconds"))
-    if unit not in _UNITS:
-        raise ReadError(f"{path}: TimeUnit is {unit!r}: use one of {', '.join(_UNITS)}")
-    stamps, dt, start = (
-        np.atleast_1d(np.asarray(fields.get(name, []), np.float64))
-        for name in ("SamplingInstants", "Ts", "Tstart")
-    )
-    if stamps.size == samples:
-        return _UNITS[unit] * stamps, float(np.mean(np.diff(stamps))) * _UNITS[unit]
-    if dt.size != 1 or not dt[0] > 0:
-        raise ReadError(f"{path}: Ts is {dt.tolist()}: give the sample interval, in {unit}")
-    first = float(start[0]) if start.size else 0.0
-    return _UNITS[unit] * (first + dt[0] * np.arange(samples)), float(_UNITS[unit] * dt[0])
 
 
 def _texts(fields: Mapping, name: str) -> list[str]:

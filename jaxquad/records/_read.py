@@ -6,14 +6,21 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ._channel import (
+    Channel,
+    check_ranges,
+    repair_values,
+    resample,
+    Valid,
+    within,
+    without_turns,
+)
 from ._clock import clock_start, JITTER, nonuniformity, Number, show_times, TimeUnit, window
 from ._edit import combine
 from ._errors import located, ReadError, RecordError, RecordWarning, unknown_name
 from ._firmwares import firmware_log
 from ._log import known_unit
 from ._record import as_tuple, assemble, check_distinct, Hold, Record
-from ._repair import check_ranges, repair_values, Valid, within, without_turns
-from ._resample import Channel, resample
 from ._timebase import Timebases
 from .formats import load_log, load_signals
 
@@ -179,12 +186,24 @@ def read(
     for channel in logged:
         limits = (valid or {}).get(channel.name)
         values, times = repair_values(channel.name, channel.time, channel.values, limits, max_gap)
-        values = _continuous(channel, values)
+        unit = known_unit(channel.unit) or channel.unit
+        values, jumps, period = without_turns(values, unit)
+        if jumps:
+            turn = "360" if period == 360 else "2 pi"
+            count = "once" if jumps == 1 else f"{jumps} times"
+            warnings.warn(
+                f"channel {channel.name!r} jumps by {turn} {count}, as an angle does at the end of "
+                f"its range: it is taken as one that goes on.",
+                RecordWarning,
+                stacklevel=2,
+            )
         channels.append(Channel(channel.name, channel.time, values, channel.unit))
         repaired[channel.name] = times
-    span = _shared_grid(channels, start, stop) if sample_rate is None else None
-    if span is not None:
-        stamps = channels[0].time[span]
+    stamps, span = channels[0].time, None
+    if sample_rate is None and all(np.array_equal(stamps, c.time) for c in channels):
+        span = window(stamps, start, stop)
+    if span is not None and nonuniformity(stamps[span]) <= JITTER:
+        stamps = stamps[span]
         table = np.stack([channel.values[span] for channel in channels], axis=1)
     else:
         slowest = min(channel.rate for channel in channels)
@@ -213,32 +232,6 @@ def _mixes(selection: Selection) -> Mixes:
     names = as_tuple(selection)
     check_distinct(names)
     return {name: {name: 1.0} for name in names}
-
-
-def _continuous(channel: Channel, values: np.ndarray) -> np.ndarray:
-    """The values of an angle without its jumps of a turn, of another channel as they are."""
-    values, jumps, period = without_turns(values, known_unit(channel.unit) or channel.unit)
-    if jumps:
-        turn = "360" if period == 360 else "2 pi"
-        times = "once" if jumps == 1 else f"{jumps} times"
-        warnings.warn(
-            f"channel {channel.name!r} jumps by {turn} {times}, as an angle does at the end of its "
-            f"range: it is taken as one that goes on.",
-            RecordWarning,
-            stacklevel=3,
-        )
-    return values
-
-
-def _shared_grid(
-    channels: Sequence[Channel], start: Number | None, stop: Number | None
-) -> slice | None:
-    """The samples between `start` and `stop` where all channels share one uniform time base."""
-    time = channels[0].time
-    if not all(np.array_equal(time, channel.time) for channel in channels):
-        return None
-    span = window(time, start, stop)
-    return span if nonuniformity(time[span]) <= JITTER else None
 
 
 def _units(units: Mapping[str, str], logged: Mapping[str, str], mixes: Mixes) -> dict[str, str]:

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
+from ._channel import as_float64, check_ranges, repair_values, Valid
 from ._clock import (
     check_increasing,
     check_uniform,
@@ -24,7 +25,6 @@ from ._clock import (
     TimeUnit,
 )
 from ._errors import mend_holes, RecordError, RecordWarning, unknown_name
-from ._repair import as_float64, check_ranges, repair_values, Valid
 
 
 if TYPE_CHECKING:
@@ -133,7 +133,13 @@ class Record:
         put("hold", None if hold is None else float(hold))
         check_distinct(self.names)
         earlier = {name: np.asarray(times, np.float64) for name, times in (repaired or {}).items()}
-        put("repaired", earlier | _repair_in_place(self, valid or {}, max_gap))
+        check_ranges(valid or {}, self.names)
+        for name, values in zip(self.names, _all_channels(self), strict=True):
+            limits = (valid or {}).get(name)
+            values[:], times = repair_values(name, self.time, values, limits, max_gap)
+            if times.size:
+                earlier[name] = times
+        put("repaired", earlier)
         _check_channels(self)
         if self.hold is not None and self.hold > _CHANGES * self.dt:
             # A hold during which an input changes all the time.
@@ -378,19 +384,6 @@ def _columns(role: str, values: ArrayLike, rows: int) -> Float[np.ndarray, "samp
     if array.shape[1] == 0 and role != "references":
         raise RecordError(f"{role} has no channel: a record needs at least one input and output.")
     return array
-
-
-def _repair_in_place(
-    record: Record, valid: Valid, max_gap: Number | None
-) -> dict[str, Float[np.ndarray, " repaired"]]:
-    """Repairs the columns of a record that is being built; returns when, by channel."""
-    check_ranges(valid, record.names)
-    times = {}
-    for name, values in zip(record.names, _all_channels(record), strict=True):
-        values[:], filled = repair_values(name, record.time, values, valid.get(name), max_gap)
-        if filled.size:
-            times[name] = filled
-    return times
 
 
 def _check_channels(record: Record) -> None:

@@ -1,6 +1,7 @@
 """Records of the segments of a file, from weighted sums of channels and of their powers."""
 
 import functools as ft
+import itertools
 import re
 import warnings
 from collections.abc import Callable, Mapping, Sequence
@@ -8,11 +9,11 @@ from pathlib import Path
 
 import numpy as np
 
+from ._channel import Valid
 from ._clock import clock_start, Number, show_times, TimeUnit
 from ._errors import GapError, RecordError, RecordWarning
 from ._read import read
 from ._record import assemble, Hold, Record
-from ._repair import Valid
 
 
 Mix = dict[str, dict[str, float]]  # name -> channel, or its power `m1^2`, -> weight
@@ -110,7 +111,20 @@ def read_segments(
         than 30 gaps in one of them.
     - `ReadError`: as `read` raises it.
     """
-    _check_segments(segments)
+    if len(segments) > 1:
+        for begin, end in segments:
+            if begin is None or end is None or not begin < end:
+                raise RecordError(
+                    f"the segment {begin} .. {end} s is empty: give START:STOP with START before "
+                    f"STOP."
+                )
+        ordered = sorted((begin, end) for begin, end in segments if begin is not None)
+        for (begin, end), (after, last) in itertools.pairwise(ordered):
+            if end is not None and after < end:
+                raise RecordError(
+                    f"the segments {begin:.6g} .. {end:.6g} s and {after:.6g} .. {last:.6g} s "
+                    f"overlap, so samples would count twice. Choose segments that do not overlap."
+                )
     roles = (inputs, outputs, references or {})
     select = ft.partial(
         read,
@@ -141,23 +155,6 @@ def read_segments(
     for warning in {str(warning.message): warning for warning in caught}.values():
         warnings.warn(str(warning.message), warning.category, stacklevel=2)
     return records
-
-
-def _check_segments(segments: Sequence[Segment]) -> None:
-    if len(segments) < 2:
-        return
-    for start, stop in segments:
-        if start is None or stop is None or not start < stop:
-            raise RecordError(
-                f"the segment {start} .. {stop} s is empty: give START:STOP with START before STOP."
-            )
-    ordered = sorted((start, stop) for start, stop in segments if start is not None)
-    for (start, stop), (after, end) in zip(ordered, ordered[1:], strict=False):
-        if stop is not None and after < stop:
-            raise RecordError(
-                f"the segments {start:.6g} .. {stop:.6g} s and {after:.6g} .. {end:.6g} s overlap, "
-                f"so samples would count twice. Choose segments that do not overlap."
-            )
 
 
 def _without_gaps(

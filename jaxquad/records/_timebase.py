@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool
 
+from ._channel import Channel
 from ._clock import (
     check_unit,
     doubt_of_seconds,
@@ -19,7 +20,6 @@ from ._clock import (
 )
 from ._errors import listed, ReadError, RecordError, RecordWarning, unknown_name
 from ._log import Signal, Signals
-from ._resample import Channel
 
 
 _SHARED = ("t", "time", "time_s", "timestamp", "Time", "Timestamp", "TIME")

@@ -2,6 +2,7 @@
 
 from ._clock import FEWEST as FEWEST
 from ._firmwares import (
+    axis_of_rate as axis_of_rate,
     firmware_log as firmware_log,
     firmware_names as firmware_names,
     register_log as register_log,

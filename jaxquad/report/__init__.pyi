@@ -1,22 +1,21 @@
-from ._attempt import (
-    attempt as attempt,
-    FAILED as FAILED,
-    PageWarning as PageWarning,
-    reason_of as reason_of,
-)
-from ._figure import embed_figure as embed_figure, Section as Section
 from ._fit import compare_fits as compare_fits
 from ._loop import LawLoop as LawLoop
 from ._page import (
     Cell as Cell,
+    embed_figure as embed_figure,
     Headline as Headline,
     render_page as render_page,
+    Section as Section,
     Table as Table,
 )
 from ._provenance import (
+    attempt as attempt,
+    FAILED as FAILED,
+    PageWarning as PageWarning,
     Provenance as Provenance,
     provenance as provenance,
     provenance_section as provenance_section,
+    reason_of as reason_of,
     sha256_of as sha256_of,
     Source as Source,
 )

@@ -19,8 +19,8 @@ from jaxquad.plot import COHERENT
 from jaxquad.records import Record
 from jaxquad.spectra import FrequencyResponse
 
-from ._figure import Section
-from ._record import GOOD_TIC
+from ._measured import GOOD_TIC
+from ._page import Section
 
 
 Grid = Float[np.ndarray, " frequencies"]
@@ -31,7 +31,7 @@ _LOUDER = 2.0  # times the amplitude that is advised at most: linear ranges are 
 _LONGER = 2.0  # times the duration
 _CYCLES = 5  # of the lowest frequency: Tischler & Remple, sec. 5.4
 _SHORTEST = 20.0  # s, of a sweep
-_SEEN = 0.3  # of the largest share, where a parameter shows itself apart from the others
+_SHOWS = 0.3  # of the largest share, where a parameter has an effect that no other has
 _SAME = 1e-4  # share of a parameter's effect that no other can make, below which none can be seen
 
 
@@ -125,14 +125,8 @@ def _ends(frf: FrequencyResponse, where: Bool[np.ndarray, " frequencies"]) -> tu
     return float(omega[0]), float(omega[-1])
 
 
-def _measured(frf: FrequencyResponse) -> tuple[float, float]:
+def _measured_band(frf: FrequencyResponse) -> tuple[float, float]:
     return _ends(frf, np.ones(frf.omega.size, bool))
-
-
-def _beyond(frf: FrequencyResponse) -> tuple[float, float]:
-    """From half to twice the measured band."""
-    low, high = _measured(frf)
-    return low / 2, high * 2
 
 
 def _reach(fit: Fit, k: int) -> float:
@@ -144,8 +138,8 @@ def _reach(fit: Fit, k: int) -> float:
 def _loose(fit: Fit) -> list[int]:
     """Parameters that are not determined, or known to 20 % only."""
     limits = [bound.name for bound in fit.verdict.bounds]
-    known = [not fit.determined[k] or _reach(fit, k) > _LOOSE for k in range(len(fit.names))]
-    return [k for k, is_loose in enumerate(known) if is_loose and fit.names[k] not in limits]
+    loose = [not fit.determined[k] or _reach(fit, k) > _LOOSE for k in range(len(fit.names))]
+    return [k for k, is_loose in enumerate(loose) if is_loose and fit.names[k] not in limits]
 
 
 def _can(fit: Fit, frf: FrequencyResponse, checks: Mapping[str, Verification]) -> list[str]:
@@ -158,16 +152,17 @@ def _can(fit: Fit, frf: FrequencyResponse, checks: Mapping[str, Verification]) -
             f"{np.degrees(error):.2g} deg of phase (median standard error)."
         )
     if fit.verdict.fitted:
-        known = fit.parameter_units or ("",) * len(fit.names)
-        units = [f" {unit}" if unit else "" for unit in known]
+        units = [
+            f" {unit}" if unit else "" for unit in fit.parameter_units or [""] * len(fit.names)
+        ]
         answers += [
             f"{name}: {fit.values[k]:.4g}{units[k]} \u00b1 {100 * _reach(fit, k):.2g} % (95 %)."
             for k, name in enumerate(fit.names)
             if fit.determined[k] and _reach(fit, k) <= _LOOSE
         ]
         answers += [
-            f"{each.name}: {each.value:.4g}{f' {each.unit}' if each.unit else ''}."
-            for each in fit.combinations
+            f"{one.name}: {one.value:.4g}{f' {one.unit}' if one.unit else ''}."
+            for one in fit.combinations
         ]
     answers += [
         f"What happens in {name}: predicted, TIC {c.tic:.3f}."
@@ -186,8 +181,8 @@ def _cannot(
     omega, lacks = np.asarray(frf.omega), []
     for k in _loose(fit) if fit.verdict.fitted else []:
         name = fit.names[k]
-        known = f"only to \u00b1 {100 * _reach(fit, k):.2g} % (95 %)"
-        lacks.append(f"{name}: {known if fit.determined[k] else 'not by itself'}.")
+        reach = f"only to \u00b1 {100 * _reach(fit, k):.2g} % (95 %)"
+        lacks.append(f"{name}: {reach if fit.determined[k] else 'not by itself'}.")
     if _is_of_controller(frf):
         lacks.append(
             f"How {', '.join(frf.output_names)} answers to {', '.join(frf.input_names)}: the "
@@ -230,19 +225,30 @@ def next_flight(
     grows with amplitude and with the root of time. A poor band asks for the amplitude that brings
     its coherence to 0.8. With every parameter known, a 3-2-1-1 verifies the model.
     """
-    poor = _needs_of_bands(frf)
-    needs = _needs_of_parameters(fit, frf) if _is_usable(fit) else poor
+    omega, poor = np.asarray(frf.omega), []
+    for low, high in poor_bands(frf):
+        inside = (omega >= low) & (omega <= high)
+        level = float(np.median(np.asarray(frf.coherence)[inside]))
+        factor = np.sqrt(_AIM / (1 - _AIM) * (1 - level) / max(level, _FAINT))
+        text = f"the coherence is {level:.2g} from {in_both(low, high)}; {_AIM:g} is the aim"
+        poor.append(_Need(low, high, float(factor), text))
+    usable = fit.verdict.kind in ("identifiable", "not identifiable")
+    needs = _needs_of_parameters(fit, frf) if usable else poor
     if _is_of_controller(frf):
-        needs = [_Need(*_measured(frf), _LOUDER, _UNEXCITED)]
+        needs = [_Need(*_measured_band(frf), _LOUDER, _UNEXCITED)]
     if not fit.identifiable and not needs and not fit.verdict.remedies:
-        low, high = _beyond(frf)
-        needs = [_Need(low, high, _LOUDER, "the band of this record does not determine the model")]
+        low, high = _measured_band(frf)
+        needs = [
+            _Need(
+                low / 2, 2 * high, _LOUDER, "the band of this record does not determine the model"
+            )
+        ]
     if needs:
         return _sweep([*needs, *poor], frf, record)
     if not fit.identifiable and fit.verdict.remedies:
         what = "No further flight of the same kind helps. " + _sentence(fit.verdict.remedies[0])
-        return Flight(what, {}, [_sentence(each) for each in fit.verdict.remedies[1:]])
-    wished = [f"Only if you need it: {_sweep([each], frf, record).what}" for each in poor]
+        return Flight(what, {}, [*map(_sentence, fit.verdict.remedies[1:])])
+    wished = [f"Only if you need it: {_sweep([need], frf, record).what}" for need in poor]
     failed = [name for name, c in checks.items() if not c.tic < GOOD_TIC]
     if failed:
         what = (
@@ -253,9 +259,8 @@ def next_flight(
         return Flight(what, {}, wished)
     if checks:
         what = "None for this model: tune with it, then fly the tuned gains."
-        return Flight(what, {}, [*(_sentence(each.why) for each in poor), *wished])
-    found = _verification(frf, record)
-    return found._replace(why=[*found.why, *wished])
+        return Flight(what, {}, [*(_sentence(need.why) for need in poor), *wished])
+    return _verification(frf, record, wished)
 
 
 _UNEXCITED = (
@@ -268,129 +273,96 @@ def _sentence(text: str) -> str:
     return f"{text[:1].upper()}{text[1:]}."
 
 
-def _is_usable(fit: Fit) -> bool:
-    return fit.verdict.kind in ("identifiable", "not identifiable")
-
-
-def _needs_of_bands(frf: FrequencyResponse) -> list[_Need]:
-    omega, needs = np.asarray(frf.omega), []
-    for low, high in poor_bands(frf):
-        inside = (omega >= low) & (omega <= high)
-        level = float(np.median(np.asarray(frf.coherence)[inside]))
-        factor = np.sqrt(_AIM / (1 - _AIM) * (1 - level) / max(level, _FAINT))
-        text = f"the coherence is {level:.2g} from {in_both(low, high)}; {_AIM:g} is the aim"
-        needs.append(_Need(low, high, float(factor), text))
-    return needs
-
-
 def _needs_of_parameters(fit: Fit, frf: FrequencyResponse) -> list[_Need]:
     loose = _loose(fit)
     if not loose:
         return []
-    omega, apart = _apart(fit, frf)
+    omega, unshared = _unshared_effects(fit, frf)
+    low_end, high_end = _measured_band(frf)
     needs = []
     for k in loose:
-        if not apart[k].any():
+        if not unshared[k].any():
             continue
-        seen = omega[apart[k] >= np.sqrt(_SEEN) * apart[k].max()]
-        low, high = _towards(float(omega[apart[k].argmax()]), seen, frf)
-        reach = _reach(fit, k)
+        # The band in which it shows leaves the measured one on the side of its peak only.
+        peak = float(omega[unshared[k].argmax()])
+        shows = omega[unshared[k] >= np.sqrt(_SHOWS) * unshared[k].max()]
+        low, high = float(shows[0]), float(shows[-1])
+        if peak > np.sqrt(low_end * high_end):
+            low = max(low_end, low)
+        else:
+            high = min(high_end, high)
         by_noise = float(np.diff(fit.interval(fit.names[k], model_error=False))[0] / 2)
         by_noise /= max(abs(float(fit.values[k])), 1e-300)
         factor = by_noise / _LOOSE if np.isfinite(by_noise) else np.inf
-        known = (
-            f"is known to \u00b1 {100 * reach:.2g} %" if fit.determined[k] else "is not determined"
-        )
-        text = f"the parameter {fit.names[k]} {known}, and shows itself from {in_both(low, high)}"
+        reach = f"is known to \u00b1 {100 * _reach(fit, k):.2g} %"
+        if not fit.determined[k]:
+            reach = "is not determined"
+        text = f"the parameter {fit.names[k]} {reach}, and shows itself from {in_both(low, high)}"
         needs.append(_Need(low, high, max(factor, 1.0), text))
     return needs
-
-
-def _towards(peak: float, seen: Grid, frf: FrequencyResponse) -> tuple[float, float]:
-    """The band of what is seen, which leaves the measured one on the side of the peak only."""
-    low, high = _measured(frf)
-    if peak > np.sqrt(low * high):
-        return max(low, float(seen[0])), float(seen[-1])
-    return float(seen[0]), min(high, float(seen[-1]))
 
 
 _STEP = 1e-4  # relative, of a parameter
 _NONE = 1e-3  # of a parameter's start, below which it has run to zero
 
 
-def _apart(
+def _unshared_effects(
     fit: Fit, frf: FrequencyResponse
 ) -> tuple[Grid, Float[np.ndarray, "parameters frequencies"]]:
     """What each parameter does to ln G that no other does, from half to twice the measured band.
 
-    Zero where the others make the same.
+    Zero where the others make the same. What ran to zero, where it does nothing, is at its start.
     """
-    omega = np.geomspace(*_beyond(frf), 200)
+    low, high = _measured_band(frf)
+    omega = np.geomspace(low / 2, high * 2, 200)
     places = fit.parameters.places[: len(fit.names)]
-    values, size = _beside_zero(fit)
+    values = np.asarray(fit.values, float)
+    start = np.asarray(fit.parameters.scale)[: values.size]
+    values = np.where(np.abs(values) < _NONE * np.abs(start), start, values)
 
     def response(moved: Float[np.ndarray, " parameters"]) -> np.ndarray:
         model = with_values(fit.model, places, moved)
         return model_response(as_sampled(model, frf), omega).reshape(omega.size, -1)
 
     columns = []
-    for step in _STEP * np.diag(size):
+    for step in _STEP * np.diag(np.abs(values)):
         change = np.log(response(values + step) / response(values - step)) / (2 * _STEP)
         columns.append(np.stack([change.real, change.imag]).ravel())
     effects = np.array(columns).T
-    rests = _rests(effects)
-    sizes = [np.linalg.norm(each, axis=0) for each in (rests, effects)]
+    rests = effects.copy()
+    for k in range(len(values)):
+        others = np.delete(effects, k, axis=1)
+        rests[:, k] -= others @ np.linalg.lstsq(others, effects[:, k], rcond=None)[0]
+    sizes = [np.linalg.norm(part, axis=0) for part in (rests, effects)]
     rests[:, sizes[0] < _SAME * sizes[1]] = 0.0
     rests = rests.reshape(2, omega.size, -1, len(values))
     per_second = np.sqrt(omega / omega[0])  # high frequencies take less time
     return omega, np.sqrt(np.sum(rests**2, axis=(0, 2))).T * per_second
 
 
-def _beside_zero(
-    fit: Fit,
-) -> tuple[Float[np.ndarray, " parameters"], Float[np.ndarray, " parameters"]]:
-    """The values and their sizes; what ran to zero, where it does nothing, is at its start."""
-    values = np.asarray(fit.values, float)
-    start = np.asarray(fit.parameters.scale)[: values.size]
-    values = np.where(np.abs(values) < _NONE * np.abs(start), start, values)
-    return values, np.abs(values)
-
-
-def _rests(columns: Float[np.ndarray, "points parameters"]) -> np.ndarray:
-    """What of each column no other makes."""
-    rests = columns.copy()
-    for k in range(columns.shape[1]):
-        others = np.delete(columns, k, axis=1)
-        rests[:, k] -= others @ np.linalg.lstsq(others, columns[:, k], rcond=None)[0]
-    return rests
-
-
 def _sweep(needs: Sequence[_Need], frf: FrequencyResponse, record: Record | None) -> Flight:
-    measured = _measured(frf)
-    low = min(each.low for each in needs)
-    high = max(each.high for each in needs)
+    measured = _measured_band(frf)
+    low = min(need.low for need in needs)
+    high = max(need.high for need in needs)
     low, high = min(low, measured[1] / 10), max(high, measured[0] * 10)  # at least a decade
-    factor = max(each.factor for each in needs)
+    factor = max(need.factor for need in needs)
     louder = float(np.clip(factor, 1.0, _LOUDER))
     longer = min(factor / louder, _LONGER**0.5) ** 2
     now = 0.0 if record is None else record.duration
     seconds = max(now * longer, _CYCLES * 2 * np.pi / low, _SHORTEST)
+    seconds = float(np.ceil(seconds / 5) * 5)
     source, text = _amplitude(frf, record, louder)
     facts = {
         "axis": f"{', '.join(frf.output_names)}, by {source}",
         "frequencies": f"sweep from {in_both(low, high)}",
         "amplitude": text,
-        "seconds": f"{_rounded(seconds):g}" + (f" (now {now:.3g})" if now else ""),
+        "seconds": f"{seconds:g}" + (f" (now {now:.3g})" if now else ""),
     }
     what = (
         f"Sweep the channel {source} from {low / (2 * np.pi):.2g} to {high / (2 * np.pi):.2g} Hz, "
-        f"{text.split(' (')[0]}, for {_rounded(seconds):g} s."
+        f"{text.split(' (')[0]}, for {seconds:g} s."
     )
-    return Flight(what, facts, [_sentence(each.why) for each in needs])
-
-
-def _rounded(seconds: float) -> float:
-    return float(np.ceil(seconds / 5) * 5)
+    return Flight(what, facts, [_sentence(need.why) for need in needs])
 
 
 def _amplitude(frf: FrequencyResponse, record: Record | None, louder: float) -> tuple[str, str]:
@@ -407,7 +379,7 @@ def _amplitude(frf: FrequencyResponse, record: Record | None, louder: float) -> 
     return name, f"{text} (as in this record)"
 
 
-def _verification(frf: FrequencyResponse, record: Record | None) -> Flight:
+def _verification(frf: FrequencyResponse, record: Record | None, wished: Sequence[str]) -> Flight:
     """A 3-2-1-1 whose spectrum peaks in the middle of the band."""
     good = _good(frf)
     low, high = _ends(frf, good if good.any() else np.ones_like(good))
@@ -425,4 +397,5 @@ def _verification(frf: FrequencyResponse, record: Record | None) -> Flight:
         f"A 3-2-1-1 on the channel {source} with a shortest pulse of {width:.2g} s, to verify the "
         "model on a flight that it was not fitted to."
     )
-    return Flight(what, facts, ["The log determines this model: what is missing is a check."])
+    why = "The log determines this model: what is missing is a check."
+    return Flight(what, facts, [why, *wished])

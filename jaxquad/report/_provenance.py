@@ -1,12 +1,14 @@
-"""Where a result comes from: the files, the versions, and the command that makes it again."""
+"""Where a result comes from; and why a part of it is missing, which costs no other part."""
 
 import hashlib
 import platform
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from datetime import datetime, UTC
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, ParamSpec, TypeVar
+
+from jaxquad._core import is_ours, marked_text, Message
 
 
 _PACKAGES = ("jaxquad", "jax", "jaxlib", "numpy", "scipy", "equinox", "optimistix")
@@ -53,22 +55,28 @@ def provenance(
     **Raises:** OSError for a file that cannot be read.
     """
     moment = (date or datetime.now(UTC)).astimezone(UTC)
+    versions = {"python": platform.python_version()}
+    for name in _PACKAGES:
+        try:
+            versions[name] = version(name)
+        except PackageNotFoundError:
+            versions[name] = "not installed"
+    sizes = [sum(file.stat().st_size for file in _files(Path(path))) for path in paths]
     return Provenance(
-        files=tuple(_source(Path(path)) for path in paths),
+        files=tuple(
+            Source(Path(path).name, size, sha256_of(path))
+            for path, size in zip(paths, sizes, strict=True)
+        ),
         command=command,
         settings={name: str(value) for name, value in (settings or {}).items()},
-        versions=_versions(),
+        versions=versions,
         date=moment.isoformat(timespec="seconds"),
     )
 
 
-def _source(path: Path) -> Source:
-    return Source(path.name, sum(each.stat().st_size for each in _files(path)), sha256_of(path))
-
-
 def _files(path: Path) -> list[Path]:
     if path.is_dir():
-        return sorted(each for each in path.rglob("*") if each.is_file())
+        return sorted(file for file in path.rglob("*") if file.is_file())
     return [path]
 
 
@@ -78,25 +86,45 @@ def sha256_of(path: str | Path) -> str:
     **Raises:** OSError for a file that cannot be read.
     """
     digest = hashlib.sha256()
-    for each in _files(Path(path)):
-        with each.open("rb") as file:
+    for part in _files(Path(path)):
+        with part.open("rb") as file:
             while block := file.read(_BLOCK):
                 digest.update(block)
     return digest.hexdigest()
 
 
-def _versions() -> dict[str, str]:
-    found = {"python": platform.python_version()}
-    for name in _PACKAGES:
-        try:
-            found[name] = version(name)
-        except PackageNotFoundError:
-            found[name] = "not installed"
-    return found
-
-
-def provenance_section(known: Provenance) -> dict[str, object]:
+def provenance_section(origin: Provenance) -> dict[str, object]:
     """Files, command, versions and date, for a page."""
-    versions = ", ".join(f"{name} {text}" for name, text in known.versions.items())
-    facts = known.settings | {"versions": versions, "date": known.date}
-    return {"files": known.files, "command": known.command, "facts": facts}
+    versions = ", ".join(f"{name} {text}" for name, text in origin.versions.items())
+    facts = origin.settings | {"versions": versions, "date": origin.date}
+    return {"files": origin.files, "command": origin.command, "facts": facts}
+
+
+Arguments = ParamSpec("Arguments")
+Part = TypeVar("Part")
+FAILED = "failed"  # key of the reason, in what templates show instead of a section
+
+
+class PageWarning(UserWarning):
+    """A part of a result could not be computed; the rest is written."""
+
+    def __init__(self, reason: str):
+        super().__init__(Message(reason))
+
+
+def reason_of(error: Exception) -> Message:
+    """Why something could not be computed: the text of our errors, with the kind of all others."""
+    text = " ".join(marked_text(error).split())
+    if text and is_ours(type(error)):
+        return Message(text)
+    return Message(f"{type(error).__name__}{f': {text}' if text else ''}")
+
+
+def attempt(
+    compute: Callable[Arguments, Part], *args: Arguments.args, **named: Arguments.kwargs
+) -> Part | dict[str, str]:
+    """What `compute` returns, or the reason why it raised, which the page shows in its place."""
+    try:
+        return compute(*args, **named)
+    except Exception as error:
+        return {FAILED: reason_of(error)}

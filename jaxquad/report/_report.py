@@ -13,13 +13,17 @@ from jaxquad.records import Record
 from jaxquad.spectra import FrequencyResponse
 
 from ._answers import answer_section
-from ._attempt import attempt
 from ._fit import identifiability_section, parameter_section
-from ._loop import LawLoop
+from ._loop import LawLoop, loop_section, step_section
+from ._measured import (
+    check_section,
+    GOOD_TIC,
+    record_section,
+    response_section,
+    spectrum_section,
+)
 from ._page import Headline, render_page
-from ._provenance import Provenance, provenance_section
-from ._record import check_section, GOOD_TIC
-from ._sections import shown_of
+from ._provenance import attempt, Provenance, provenance_section
 
 
 if TYPE_CHECKING:
@@ -46,7 +50,7 @@ def write_report(
     law: LawLoop | None = None,
     checks: Verification | Mapping[str, Verification] | None = None,
     derived: Sequence[Combination] = (),
-    beside: Mapping[str, str] | None = None,
+    texts: Mapping[str, str] | None = None,
     tuned: "Tuned | Certificate | None" = None,
     flights: "Mapping[str, Simulation] | None" = None,
     provenance: Provenance | None = None,
@@ -76,7 +80,7 @@ def write_report(
     - `filters`: of the outputs, up to whose inputs response and model are.
     - `law`: the flown loop where its law is known, which is shown instead of an estimate.
     - `derived`: rows below the parameters, see `Fit.derived`.
-    - `beside`: texts below them by title, such as `Fit.bands` and `Fit.explain` in print.
+    - `texts`: what stands below them by title, such as `Fit.bands` and `Fit.explain` in print.
     - `tuned`: gains with their certificate, or a certificate alone.
     - `flights`: of these gains, by name, see `jaxquad.tuning.worst_flights`.
     - `provenance`: where the result comes from, see `jaxquad.report.provenance`.
@@ -87,32 +91,49 @@ def write_report(
 
     **Raises:** ValueError for no response, and for `models` whose names no response has.
     """
-    shown = shown_of(fit, frf, models, others, record, spectrum, filters, law)
-    found = {"verification": checks} if isinstance(checks, Verification) else dict(checks or {})
-    remarks = remarks_of(fit, found)
+    frfs = {"response": frf} if isinstance(frf, FrequencyResponse) else dict(frf)
+    if not frfs:
+        raise ValueError("frf is empty: give the response that was fitted, or several by name")
+    records = {"record": record} if isinstance(record, Record) else dict(record or {})
+    verified = {"verification": checks} if isinstance(checks, Verification) else dict(checks or {})
+    drawn: dict[str, Model] = dict(models or {})
+    unknown = [name for name in drawn if name not in frfs]
+    if unknown:
+        raise ValueError(f"models of no response: {unknown}; the responses are {list(frfs)}")
+    if fit.verdict.fitted:
+        drawn = {name: fit.model for name in frfs} | drawn
+    first = next(iter(frfs.values()))  # of the responses that were fitted
+    names = (first.output_names[0], first.input_names[0])
+    channels = {*first.input_names, *first.output_names}
+    flown = next((one for one in records.values() if channels <= {*one.names}), None)
+    first_record = next(iter(records.values()), None)
+    sections: dict[str, object] = {
+        "answers": attempt(answer_section, fit, first, first_record, verified),
+        "identifiability": attempt(identifiability_section, fit),
+    }
+    if fit.verdict.fitted:
+        sections["parameters"] = attempt(parameter_section, fit, derived, texts or {})
+    if provenance is not None:
+        sections["provenance"] = attempt(provenance_section, provenance)
+    remarks = remarks_of(fit, verified)
     headlines = [fit_headline(fit, len(remarks))]
-    headlines += [check_headline(name, check, fit) for name, check in found.items()]
+    headlines += [check_headline(name, check, fit) for name, check in verified.items()]
     if tuned is not None:
-        from ._tuned import verdict_headlines  # the room of tuning takes 0.2 s
+        from ._tuned import tuned_section, verdict_headlines  # the room of tuning takes 0.2 s
 
         headlines += verdict_headlines(tuned)
-    first = shown.first
-    names = (first.output_names[0], first.input_names[0])
-    record_asked = next(iter(shown.records.values()), None)
-    texts = attempt(parameter_section, fit, derived, beside or {}) if fit.verdict.fitted else None
-    sections = {
-        "answers": attempt(answer_section, fit, first, record_asked, found),
-        "parameters": texts,
-        "identifiability": attempt(identifiability_section, fit),
-        "provenance": attempt(provenance_section, provenance) if provenance is not None else None,
-    }
-    if tuned is not None:
-        from ._tuned import tuned_section
-
         sections["tuned"] = attempt(tuned_section, tuned, flights or {})
-    sections |= shown.draw()
-    if found:
-        sections["verification"] = attempt(check_section, found)
+    sections["response"] = attempt(response_section, frfs, drawn, others or {})
+    if flown is not None:
+        computed = None if law is None else law.step
+        sections["step"] = attempt(step_section, fit, first, flown, tuple(filters), computed)
+        sections["loop"] = attempt(loop_section, first, flown, law)
+    if (shown := flown if spectrum is None else spectrum) is not None:
+        sections["spectrum"] = attempt(spectrum_section, first, shown)
+    if records:
+        sections["record"] = attempt(record_section, records)
+    if verified:
+        sections["verification"] = attempt(check_section, verified)
     text = render_page(
         "report.html",
         title=f"{headlines[0].word}: {title or ' / '.join(names)}",
@@ -132,28 +153,24 @@ def fit_headline(fit: Fit, remarks: int) -> Headline:
         return Headline("bad", fit.verdict.kind.upper(), fit.verdict.summary)
     if not fit.identifiable:
         return Headline("bad", "NOT IDENTIFIABLE", fit.verdict.summary)
+    numbers = []
+    units = fit.parameter_units or ("",) * len(fit.names)
+    for name, value, unit in zip(fit.names, fit.values, units, strict=True):
+        low, high = fit.interval(name)
+        number = f"{value:.4g} \u00b1 {(high - low) / 2:.2g}"
+        if low == 0 or high == 0:  # it keeps its sign: no symmetrical interval
+            number = f"{low:.2g} .. {high:.2g}"
+        numbers.append(f"{name} = {number} {unit}".rstrip())
+    more = f" and {len(numbers) - 6} more" if len(numbers) > 6 else ""
+    reason = f"{', '.join(numbers[:6])}{more} (95 % intervals)"
     if fit.chi_squared > MISFIT**2:
         ratio = np.sqrt(fit.chi_squared)
         word = f"IDENTIFIED, but the misfit is {ratio:.1f} times the random error"
-        return Headline("warn", word, _numbers(fit))
+        return Headline("warn", word, reason)
     if remarks:
         word = f"IDENTIFIED, with {remarks} remark{'s' * (remarks > 1)}"
-        return Headline("warn", word, _numbers(fit))
-    return Headline("good", "IDENTIFIED", _numbers(fit))
-
-
-def _numbers(fit: Fit) -> str:
-    units = fit.parameter_units or ("",) * len(fit.names)
-    shown = [_number(fit, *each) for each in zip(fit.names, fit.values, units, strict=True)]
-    more = f" and {len(shown) - 6} more" if len(shown) > 6 else ""
-    return f"{', '.join(shown[:6])}{more} (95 % intervals)"
-
-
-def _number(fit: Fit, name: str, value: float, unit: str) -> str:
-    low, high = fit.interval(name)
-    if low == 0 or high == 0:  # it keeps its sign: no symmetrical interval
-        return f"{name} = {low:.2g} .. {high:.2g} {unit}".rstrip()
-    return f"{name} = {value:.4g} \u00b1 {(high - low) / 2:.2g} {unit}".rstrip()
+        return Headline("warn", word, reason)
+    return Headline("good", "IDENTIFIED", reason)
 
 
 def check_headline(name: str, check: Verification, fit: Fit) -> Headline:
@@ -170,8 +187,8 @@ def check_headline(name: str, check: Verification, fit: Fit) -> Headline:
 
 def remarks_of(fit: Fit, checks: Mapping[str, Verification]) -> list[str]:
     """Of the fit, with those of its responses that concern it, and of its checks, each once."""
-    found = list(fit.remarks)
+    remarks: list[str] = [*fit.remarks]
     for name, check in checks.items():
         if not np.isfinite(check.tic):
-            found.append(f"{name}: the simulation diverges, so it verifies nothing")
-    return list(dict.fromkeys(found))
+            remarks.append(f"{name}: the simulation diverges, so it verifies nothing")
+    return list(dict.fromkeys(remarks))

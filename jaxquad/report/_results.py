@@ -50,34 +50,28 @@ def write_results(
 
     **Raises:** TypeError for an `extra` that JSON cannot hold.
     """
-    content: dict[str, object] = {"jaxquad_version": _version(), "fit": fit.to_dict()}
-    content |= {"response": _response(frf)} if frf is not None else {}
+    try:
+        jaxquad_version = version("jaxquad")
+    except PackageNotFoundError:
+        jaxquad_version = None
+    content: dict[str, object] = {"jaxquad_version": jaxquad_version, "fit": fit.to_dict()}
+    if frf is not None:
+        content["response"] = {
+            "method": frf.method,
+            "inputs": frf.input_names,
+            "outputs": frf.output_names,
+            "input_units": frf.input_units,
+            "output_units": frf.output_units,
+            "omega_rad_per_s": frf.omega,
+            "magnitude_db": frf.magnitude_db,
+            "phase_deg": frf.phase_deg,
+            "coherence": frf.coherence,
+            "random_error": frf.random_error,
+            "remarks": tuple(frf.remarks),
+        }
     content |= {"verification": verification_content(check)} if check is not None else {}
     content |= dict(extra or {})
     return write_json(Path(folder) / "result.json", content)
-
-
-def _version() -> str | None:
-    try:
-        return version("jaxquad")
-    except PackageNotFoundError:
-        return None
-
-
-def _response(frf: FrequencyResponse) -> dict[str, object]:
-    return {
-        "method": frf.method,
-        "inputs": frf.input_names,
-        "outputs": frf.output_names,
-        "input_units": frf.input_units,
-        "output_units": frf.output_units,
-        "omega_rad_per_s": frf.omega,
-        "magnitude_db": frf.magnitude_db,
-        "phase_deg": frf.phase_deg,
-        "coherence": frf.coherence,
-        "random_error": frf.random_error,
-        "remarks": tuple(frf.remarks),
-    }
 
 
 def verification_content(check: Verification) -> dict[str, object]:
@@ -94,10 +88,10 @@ def verification_content(check: Verification) -> dict[str, object]:
     }
 
 
-def _measures(found: Verification | Agreement) -> dict[str, object]:
+def _measures(agreement: Verification | Agreement) -> dict[str, object]:
     return {
-        "rms": found.rms,
-        "tic": found.tic,
-        "fit_percent": found.fit_percent,
-        "variance_percent": found.variance_percent,
+        "rms": agreement.rms,
+        "tic": agreement.tic,
+        "fit_percent": agreement.fit_percent,
+        "variance_percent": agreement.variance_percent,
     }

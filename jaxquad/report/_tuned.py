@@ -8,9 +8,8 @@ from jaxquad.plot import certificate_figure, convergence_figure, flight
 from jaxquad.simulation import Simulation
 from jaxquad.tuning import Certificate, KNOWN_INERTIA, QUANTITIES, Tuned
 
-from ._figure import embed_figure, Image
 from ._fit import count_starts
-from ._page import Cell, Headline, Table
+from ._page import Cell, embed_figure, Headline, Table
 
 
 _DRAWN = 7  # designs that can be distinguished in a figure
@@ -34,24 +33,21 @@ def tuned_section(
     tuned: Tuned | Certificate, flights: Mapping[str, Simulation]
 ) -> dict[str, object]:
     """The verdicts, the gains, how the tune went, how they fly, and the certificate."""
-    certificate = tuned.certificate if isinstance(tuned, Tuned) else tuned
+    certificate, image = tuned.certificate if isinstance(tuned, Tuned) else tuned, None
+    if flights:
+        image = embed_figure(
+            lambda: flight(flights),
+            alt="Angle with its set-point, command and disturbing torque over time: "
+            f"{', '.join(flights)}.",
+            caption="The tuned gains in flight, with the members of the certificate that do worst.",
+        )
     return {
         "verdicts": [str(verdict) for verdict in tuned.verdicts],
         "gains": _gains(tuned) if isinstance(tuned, Tuned) else None,
-        "flight": _flight(flights) if flights else None,
+        "flight": image,
         "certificate": None if certificate is None else _certificate(certificate),
         "text": str(tuned),
     }
-
-
-def _flight(flights: Mapping[str, Simulation]) -> Image:
-    """Closed-loop step, command and disturbance."""
-    names = ", ".join(flights)
-    return embed_figure(
-        lambda: flight(flights),
-        alt=f"Angle with its set-point, command and disturbing torque over time: {names}.",
-        caption="The tuned gains in flight, with the members of the certificate that do worst.",
-    )
 
 
 def _gains(tuned: Tuned) -> dict[str, object]:
@@ -75,7 +71,12 @@ def _gains(tuned: Tuned) -> dict[str, object]:
 
 
 def _certificate(certificate: Certificate) -> dict[str, object]:
-    quantities = [q for q in ("itae", "sensitivity_peak") if _is_known(certificate, q)]
+    every = certificate.designs.values()
+    quantities = [
+        quantity
+        for quantity in ("itae", "sensitivity_peak")
+        if all(quantity in x.by_axis and np.isfinite(x.of(quantity)).any() for x in every)
+    ]
     designs = tuple(certificate.designs)[:_DRAWN]
     image = embed_figure(
         lambda: certificate_figure(certificate, quantities=quantities, designs=designs),
@@ -92,21 +93,16 @@ def _certificate(certificate: Certificate) -> dict[str, object]:
     }
 
 
-def _is_known(certificate: Certificate, quantity: str) -> bool:
-    designs = certificate.designs.values()
-    return all(quantity in d.by_axis and np.isfinite(d.of(quantity)).any() for d in designs)
-
-
 def _designs(certificate: Certificate) -> Table:
     """Designs side by side, by every quantity that was evaluated."""
-    found = certificate.summaries
+    summaries = certificate.summaries
     percent = lambda x: "n/a" if x is None else f"{100 * x:.3g}"
     share = lambda row: None if row.unstable is None else row.unstable / row.members
-    rows = [["unstable, %", "found", *(percent(share(row)) for row in found.values())]]
+    rows = [["unstable, %", "found", *(percent(share(row)) for row in summaries.values())]]
     if certificate.independent:
-        bounds = [percent(row.unstable_at_most) for row in found.values()]
+        bounds = [percent(row.unstable_at_most) for row in summaries.values()]
         rows.append(["unstable, % (95 % confidence)", "at most", *bounds])
-    diverged = [percent(row.diverged / row.members) for row in found.values()]
+    diverged = [percent(row.diverged / row.members) for row in summaries.values()]
     rows.append(["diverged, %", "found", *diverged])
     for quantity in certificate.design.by_axis:
         shown = QUANTITIES[quantity]
@@ -116,9 +112,9 @@ def _designs(certificate: Certificate) -> Table:
                 shown.text(row.statistics[quantity]._asdict()[which], unit=False)
                 if quantity in row.statistics
                 else "n/a"
-                for row in found.values()
+                for row in summaries.values()
             ]
             rows.append([title, which, *cells])
-    heads = ("quantity", "of the members", *map(Cell, found))
+    heads = ("quantity", "of the members", *map(Cell, summaries))
     title = f"{certificate.name} and other designs on {certificate.members} members"
     return Table(title, heads, rows, texts=2)

@@ -32,11 +32,9 @@ from ._hardware import (
 from ._memory import in_slices as in_slices
 from ._metrics import Metrics as Metrics, Spread as Spread, Summary as Summary
 from ._parallel import (
-    asked_devices as asked_devices,
     Devices as Devices,
     devices_for as devices_for,
     loop_over_devices as loop_over_devices,
-    may_be_several as may_be_several,
     over_cores as over_cores,
     over_devices as over_devices,
     placed as placed,

@@ -100,11 +100,15 @@ def find_authority(
     if not isinstance(plant, HasTorqueGain):
         return None
     gain = jnp.atleast_1d(as_float(plant.torque_gain))
-    limits = [_limit_of(x) for x in (controller, drive)]
+    limit_of = lambda part: part.limit if isinstance(part, HasLimit) else jnp.inf
+    limits = [jnp.atleast_1d(as_float(limit_of(part))) for part in (controller, drive)]
     axes = max(len(x) for x in (gain, *limits))
     gain = jnp.broadcast_to(gain, (axes, *gain.shape[1:]))
     command = jnp.minimum(*_same(_drive_limit(drive, gain), limits[0]))
-    limits = (command, _forward_limit(drive, gain))
+    forward = jnp.full_like(gain, jnp.inf)  # the command at which the first motor stops
+    if isinstance(drive, HasForwardLimit):
+        forward = drive.forward_limit(axes).astype(gain.dtype)
+    limits = (command, forward)
     return Authority(gain, command, *(jnp.multiply(*_same(gain, x)) for x in limits))
 
 
@@ -146,11 +150,6 @@ def beyond_authority(drive_authority: Authority | None, scenario: Scenario) -> l
     return messages
 
 
-def _limit_of(part: object | None) -> Float[Array, "axes ..."]:
-    """Of the command, by a controller or a drive; infinite without one."""
-    return jnp.atleast_1d(as_float(part.limit if isinstance(part, HasLimit) else jnp.inf))
-
-
 def _drive_limit(
     drive: Drive | None, like: Float[Array, " axes *ensemble"]
 ) -> Float[Array, "axes ..."]:
@@ -166,15 +165,6 @@ def _drive_limit(
         limits.append(jnp.minimum(*(jnp.abs(x) for x in both)))
     most = jnp.stack(limits)
     return jnp.where(most < 0.99 * _ALL, most, jnp.inf)
-
-
-def _forward_limit(
-    drive: Drive | None, like: Float[Array, " axes *ensemble"]
-) -> Float[Array, "axes ..."]:
-    """The command of each axis alone at which the first motor stops."""
-    if not isinstance(drive, HasForwardLimit):
-        return jnp.full_like(like, jnp.inf)
-    return drive.forward_limit(like.shape[0]).astype(like.dtype)
 
 
 def _same(a: Array, b: Array) -> tuple[Array, Array]:

@@ -6,7 +6,6 @@ from jaxtyping import Array, ArrayLike, Float, Key
 
 from jaxquad._core import (
     as_float,
-    Number,
     require_all_positive,
     require_finite,
     require_nonnegative,
@@ -78,10 +77,15 @@ class Pulse(Signal):
             raise ValueError("a pulse has either a width in s or a share of its period: give one")
         if self.period is not None:
             require_all_positive(period=self.period)
-        if self.share is not None:
-            _check_share(self.share, self.period)
-        if self.width is not None:
-            _check_width(self.width, self.period)
+        share, width, period = self.share, self.width, self.period
+        if share is not None and period is None:
+            raise ValueError(f"share is {share} of a period: give the period in s, or a width")
+        if share is not None and not 0 < share <= 1:
+            raise ValueError(f"share is {share}: a pulse lasts between 0 and 1 of its period")
+        if width is not None:
+            require_all_positive(width=width)
+            if period is not None and width > period:
+                raise ValueError(f"a pulse of {width} s is longer than its period of {period} s")
 
     def sample(self, clock: Clock, key: Key[Array, ""] | None) -> Motion:
         since = clock.since(self.at)
@@ -182,16 +186,3 @@ def _needed(key: Key[Array, ""] | None) -> Key[Array, ""]:
     if key is None:
         raise ValueError("a gust or noise is drawn at random: give a key=jax.random.key(0)")
     return key
-
-
-def _check_share(share: Number, period: Number | None) -> None:
-    if period is None:
-        raise ValueError(f"share is {share} of a period: give the period in s, or a width")
-    if not 0 < share <= 1:
-        raise ValueError(f"share is {share}: a pulse lasts between 0 and 1 of its period")
-
-
-def _check_width(width: Number, period: Number | None) -> None:
-    require_all_positive(width=width)
-    if period is not None and width > period:
-        raise ValueError(f"a pulse of {width} s is longer than its period of {period} s")

@@ -221,12 +221,8 @@ def _of_age(queue: Float[Array, "ages ..."], age: Array) -> Array:
     # A mask, not a gather, whose reverse would be a scatter.
     ages = jnp.arange(len(queue)).reshape((-1,) + (1,) * (queue.ndim - 1))
     age = age.reshape((1,) * (queue.ndim - age.ndim) + age.shape)
-    return _sum_of_rows(jnp.where(ages == age, queue, 0))
-
-
-def _sum_of_rows(rows: Float[Array, "rows ..."]) -> Array:
-    """By halves: a kernel cannot hold a reduction of many numbers."""
-    while len(rows) > 1:
+    rows = jnp.where(ages == age, queue, 0)
+    while len(rows) > 1:  # a sum by halves: a kernel cannot hold a reduction of many numbers
         half = len(rows) // 2
         total, odd = rows[:half] + rows[half : 2 * half], rows[2 * half :]
         rows = jnp.concatenate([total, odd]) if len(odd) else total

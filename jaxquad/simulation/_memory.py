@@ -1,6 +1,5 @@
 """What an ensemble needs, held against what there is, before an allocation fails."""
 
-import functools as ft
 from collections.abc import Callable
 from pathlib import Path
 from typing import Protocol, runtime_checkable
@@ -94,19 +93,20 @@ def in_slices(
     if members < 1 or at_once < 1:
         raise ValueError(f"{members} members, {at_once} at once: give 1 or more of both")
     at_once = min(members, at_once)
+
+    def part_of(x: ArrayLike, left: int) -> np.ndarray:
+        values = np.asarray(x)
+        if values.shape[-1:] != (at_once,):
+            raise ValueError(
+                f"a result has the shape {values.shape}, but the {at_once} members of a slice "
+                "belong on its last axis: return what each member gives, and nothing that they "
+                "share"
+            )
+        return values[..., :left]
+
     parts = []
     for first in range(0, members, at_once):
         indices = np.minimum(np.arange(first, first + at_once), members - 1)
         part = function(jnp.asarray(indices))
-        parts.append(jax.tree.map(ft.partial(_of_slice, at_once, members - first), part))
+        parts.append(jax.tree.map(lambda x, left=members - first: part_of(x, left), part))
     return jax.tree.map(lambda *xs: jnp.asarray(np.concatenate(xs, axis=-1)), *parts)
-
-
-def _of_slice(at_once: int, left: int, x: ArrayLike) -> np.ndarray:
-    values = np.asarray(x)
-    if values.shape[-1:] != (at_once,):
-        raise ValueError(
-            f"a result has the shape {values.shape}, but the {at_once} members of a slice belong "
-            "on its last axis: return what each member gives, and nothing that they share"
-        )
-    return values[..., :left]

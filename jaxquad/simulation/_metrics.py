@@ -271,24 +271,14 @@ def _text(x: float) -> str:
 
 def remarks(metrics: "Metrics") -> list[str]:
     """Why a number is missing, who diverged, and what the drive cannot do."""
-    names = axis_names(metrics.itae.shape[0])
-    texts = _divergence(metrics) + _steps(metrics, names)
-    return texts + _estimate(metrics) + _torque(metrics, names)
-
-
-def _divergence(metrics: "Metrics") -> list[str]:
+    names, texts = axis_names(metrics.itae.shape[0]), []
     count, members = int(np.sum(metrics.diverged)), metrics.diverged.size
-    if not count:
-        return []
-    who = f"{count} of {members} members ({count / members:.1%})" if members > 1 else "the loop"
-    return [f"{who} diverged: the numbers count its angle as held where it left the bound"]
-
-
-def _steps(metrics: "Metrics", names: tuple[str, ...]) -> list[str]:
+    if count:
+        who = f"{count} of {members} members ({count / members:.1%})" if members > 1 else "the loop"
+        texts.append(f"{who} diverged: the numbers count its angle as held where it left the bound")
     stepped = _flat(metrics.stepped)
     missing = ~stepped.any(axis=1) & ~at_rest(metrics)
     without = [name for name, there in zip(names, missing, strict=True) if there]
-    texts = []
     if without:
         texts.append(
             f"{', '.join(without)}: the reference makes no step that it holds, hence no "
@@ -299,28 +289,16 @@ def _steps(metrics: "Metrics", names: tuple[str, ...]) -> list[str]:
         ("settling_time", "is outside 2 % of the step at the end"),
     ):
         never = np.isnan(_flat(vars(metrics)[field])) & stepped
-        texts += _shares(names, never.mean(axis=1), what, never.shape[1])
-    return texts
-
-
-def _shares(names: tuple[str, ...], shares: np.ndarray, what: str, members: int) -> list[str]:
-    where = [(name, share) for name, share in zip(names, shares, strict=True) if share]
-    if members == 1:
-        return [f"{name} {what}" for name, _ in where]
-    return [f"{name}: {share:.1%} of the members: the angle {what}" for name, share in where]
-
-
-def _estimate(metrics: "Metrics") -> list[str]:
-    if not np.isnan(np.asarray(metrics.disturbance_rmse)).all():
-        return []
-    return [
-        "no error of the disturbance estimate: the controller makes none, or the plant's torque "
-        "per unit of command is not known (give torque_gain)"
-    ]
-
-
-def _torque(metrics: "Metrics", names: tuple[str, ...]) -> list[str]:
-    texts = []
+        of_many = never.shape[1] > 1
+        for name, share in zip(names, never.mean(axis=1), strict=True):
+            if share:
+                who = f"{name}: {share:.1%} of the members: the angle" if of_many else name
+                texts.append(f"{who} {what}")
+    if np.isnan(np.asarray(metrics.disturbance_rmse)).all():
+        texts.append(
+            "no error of the disturbance estimate: the controller makes none, or the plant's "
+            "torque per unit of command is not known (give torque_gain)"
+        )
     for field, what in (
         ("beyond_authority", "exceed the torque of the drive"),
         ("reversing", "need motors that turn backwards"),

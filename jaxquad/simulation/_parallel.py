@@ -63,7 +63,7 @@ def over_devices(
     members on the last axis.
     """
     count = _members_of(members, "members")
-    places = devices_for(count, asked_devices(devices))
+    places = devices_for(count, devices)
     if len(places) < 2:
         return function(members, shared)
     return _split(function, members, shared, count, places)
@@ -99,9 +99,12 @@ def loop_over_devices(
 def _split(
     function: Callable, members: PyTree, shared: PyTree, count: int, places: Devices
 ) -> PyTree:
-    (members, shared), static = eqx.partition((members, shared), _is_array)
+    is_array = lambda x: isinstance(x, jax.Array | np.ndarray)
+    (members, shared), static = eqx.partition((members, shared), is_array)
     per_device = -(-count // len(places))
-    padded = jax.tree.map(lambda x: _lengthened(x, per_device * len(places) - count), members)
+    more = per_device * len(places) - count  # the last member is repeated
+    longer = lambda x: jnp.concatenate([x, *[x[..., -1:]] * more], axis=-1) if more else x
+    padded = jax.tree.map(lambda x: longer(jnp.asarray(x)), members)
     local = lambda *arrays: function(*eqx.combine(arrays, static))
     few = jax.tree.map(
         lambda x: jax.ShapeDtypeStruct((*x.shape[:-1], per_device), x.dtype), members
@@ -123,18 +126,8 @@ def _split(
     return jax.tree.map(lambda x: x[..., :count], out)
 
 
-def _is_array(x: object) -> bool:
-    return isinstance(x, jax.Array | np.ndarray)
-
-
 def _on_last(x: Array | jax.ShapeDtypeStruct) -> PartitionSpec:
     return PartitionSpec(*(None,) * (len(x.shape) - 1), _AXIS)
-
-
-def _lengthened(x: Array, more: int) -> Array:
-    """With the last member repeated `more` times."""
-    x = jnp.asarray(x)
-    return jnp.concatenate([x, *[x[..., -1:]] * more], axis=-1) if more else x
 
 
 def _members_of(tree: PyTree, name: str) -> int:
@@ -152,7 +145,16 @@ def asked_devices(devices: int | Sequence | None) -> Devices | None:
     if devices is None:
         return None
     if isinstance(devices, int | np.integer):
-        return _first(int(devices))
+        local = jax.local_devices()
+        if 1 <= devices <= len(local):
+            return tuple(local[: int(devices)])
+        most = max(int(devices), 1)
+        raise ValueError(
+            f"devices is {devices}, but JAX has {len(local)} here ({local[0].platform}): give 1 to "
+            f"{len(local)}. More of a CPU's cores become devices by "
+            f'jax.config.update("jax_num_cpu_devices", {most}) before the first computation, '
+            f"or by JAX_NUM_CPU_DEVICES={most} in the environment: it has no effect later"
+        )
     if devices and all(isinstance(device, jax.Device) for device in devices):
         return tuple(devices)
     raise ValueError(
@@ -160,20 +162,9 @@ def asked_devices(devices: int | Sequence | None) -> Devices | None:
     )
 
 
-def _first(count: int) -> Devices:
-    local = jax.local_devices()
-    if 1 <= count <= len(local):
-        return tuple(local[:count])
-    raise ValueError(
-        f"devices is {count}, but JAX has {len(local)} here ({local[0].platform}): give 1 to "
-        f"{len(local)}. More of a CPU's cores become devices by "
-        f'jax.config.update("jax_num_cpu_devices", {max(count, 1)}) before the first computation, '
-        f"or by JAX_NUM_CPU_DEVICES={max(count, 1)} in the environment: it has no effect later"
-    )
-
-
-def devices_for(members: int, chosen: Devices | None) -> Devices:
-    """The `asked` devices, or as many of this process's as gain from so many members."""
+def devices_for(members: int, devices: DeviceChoice) -> Devices:
+    """Those that a user names, or as many of this process's as gain from so many members."""
+    chosen = asked_devices(devices)
     if jax.sharding.get_abstract_mesh().manual_axes:  # already within a split computation
         return ()
     if chosen is not None:
@@ -220,7 +211,7 @@ def is_concrete_array(x: object) -> TypeGuard[jax.Array]:
 
 
 def _unbound(x: jax.Array) -> jax.Array:
-    if jnp.issubdtype(x.dtype, jax.dtypes.prng_key):
+    if _is_key(x):
         return jax.random.wrap_key_data(
             _unbound(jax.random.key_data(x)), impl=jax.random.key_impl(x)
         )
@@ -234,7 +225,8 @@ def require_same(parts: dict[str, PyTree], places: Devices | None) -> None:
     """
     if places is None or len({place.process_index for place in places}) < jax.process_count():
         return
-    if jax.process_count() == 1 or not _are_concrete(parts):
+    arrays = [x for x in jax.tree.leaves(parts) if isinstance(x, jax.Array)]
+    if jax.process_count() == 1 or not all(map(is_concrete_array, arrays)):
         return
     from jax.experimental.multihost_utils import process_allgather
 
@@ -249,27 +241,18 @@ def require_same(parts: dict[str, PyTree], places: Devices | None) -> None:
         )
 
 
-def _are_concrete(tree: PyTree) -> bool:
-    arrays = (x for x in jax.tree.leaves(tree) if isinstance(x, jax.Array))
-    return all(is_concrete_array(x) for x in arrays)
-
-
 def _digest(tree: PyTree) -> int:
     leaves, structure = jax.tree.flatten(tree)
-    words = re.sub("0x[0-9a-f]+", "", str(structure))  # without addresses, which differ
-    digest = zlib.crc32(words.encode())
+    words = lambda x: re.sub("0x[0-9a-f]+", "", str(x)).encode()  # without addresses, which differ
+    digest = zlib.crc32(words(structure))
     for leaf in leaves:
-        digest = zlib.crc32(_bytes(leaf), digest)
+        if isinstance(leaf, jax.Array | np.ndarray):
+            array = np.ascontiguousarray(jax.random.key_data(leaf) if _is_key(leaf) else leaf)
+            content = f"{array.shape}{array.dtype}".encode() + array.tobytes()
+        else:
+            content = words(repr(leaf))
+        digest = zlib.crc32(content, digest)
     return digest
-
-
-def _bytes(leaf: object) -> bytes:
-    if isinstance(leaf, jax.Array) and jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
-        leaf = jax.random.key_data(leaf)
-    if isinstance(leaf, jax.Array | np.ndarray):
-        array = np.ascontiguousarray(leaf)
-        return f"{array.shape}{array.dtype}".encode() + array.tobytes()
-    return re.sub("0x[0-9a-f]+", "", repr(leaf)).encode()
 
 
 _VECTOR, _FEWEST_OF_PART, _USUAL = 16, 32, 128  # members that are computed at once, and of a part
@@ -293,7 +276,9 @@ def over_cores(
     """
     part, args = None, (*run, *further, devices)
     leaves, structure = jax.tree.flatten(args)
-    members = _members(run, leaves)
+    # A single loop is seen by its leaves sooner than by its ensemble.
+    widest = max((getattr(x, "shape", None) or (0,))[-1] for x in leaves)
+    members = 1 if widest <= SINGLE else (1, *ensemble_shape(*run))[-1]
     if members >= 2 * _FEWEST_OF_PART:
         part = _part(program, run, further, devices)
     if are_few(members if part is None else part.width):
@@ -327,10 +312,8 @@ class _Part(NamedTuple):
     def cut(self, run: Run, first: int) -> Run:
         """The same for the members of a part."""
         leaves, structure = jax.tree.flatten(run)
-        theirs = slice(first, first + self.width)
-        few = [
-            _cut(x, theirs) if varies else x for x, varies in zip(leaves, self.varies, strict=True)
-        ]
+        cut = lambda x: jax.device_put(np.asarray(x)[..., first : first + self.width])
+        few = [cut(x) if varies else x for x, varies in zip(leaves, self.varies, strict=True)]
         return jax.tree.unflatten(structure, few)
 
 
@@ -342,42 +325,22 @@ def _part(program: Jit, run: Run, further: tuple, devices: Devices | None) -> _P
         return None
     leaves, ensemble = jax.tree.leaves(run), ensemble_shape(*run)
     members, size = (1, *ensemble)[-1], len(run[1].reference) * math.prod(ensemble)
-    width, varies = _width(members, cores), jax.tree.leaves(mark_members(run, ensemble))
+    # Whole vectors of members; the usual number, or a power of two times it, of a large ensemble:
+    # so ensembles of many sizes share a program.
+    share = -(-members // (cores * _VECTOR)) * _VECTOR
+    usual = _USUAL
+    while usual * _MOST_PARTS < members:
+        usual *= 2
+    width = min(members, max(min(share, usual), _FEWEST_OF_PART))
+    varies = jax.tree.leaves(mark_members(run, ensemble))
     keys = any(mine and _is_key(x) for x, mine in zip(leaves, varies, strict=True))
     if width == members or size * width < _LEAST * members or keys:
         return None
     return _Part(members, width, varies) if program.is_outermost(*run, *further) else None
 
 
-def _members(run: Run, leaves: list) -> int:
-    """On the last axis; 1 for a single loop, which its leaves show sooner than an ensemble."""
-    few = max(map(_last_axis, leaves)) <= SINGLE
-    return 1 if few else (1, *ensemble_shape(*run))[-1]
-
-
-def _last_axis(x: object) -> int:
-    shape = getattr(x, "shape", ())
-    return shape[-1] if shape else 0
-
-
-def _is_key(x: jax.Array) -> bool:
+def _is_key(x: jax.Array | np.ndarray) -> bool:
     return jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
-
-
-def _width(members: int, cores: int) -> int:
-    """Whole vectors of members; the usual number, or a power of two times it, of a large ensemble.
-
-    So ensembles of many sizes share a program.
-    """
-    share = -(-members // (cores * _VECTOR)) * _VECTOR
-    usual = _USUAL
-    while usual * _MOST_PARTS < members:
-        usual *= 2
-    return min(members, max(min(share, usual), _FEWEST_OF_PART))
-
-
-def _cut(x: jax.Array, theirs: slice) -> jax.Array:
-    return jax.device_put(np.asarray(x)[..., theirs])
 
 
 class _Joined:
@@ -402,16 +365,17 @@ class _Joined:
         return jax.tree.unflatten(self._structure, jax.device_put(self._room))
 
     def _make_room(self, leaves: list[jax.Array]) -> list[np.ndarray | jax.Array]:
-        shapes = [self._shape(x) for x in leaves]
+        """For all members; a leaf itself where it does not have them."""
+        width, members = self._part.width, self._part.members
+        shapes = [
+            jax.ShapeDtypeStruct((*x.shape[:-1], members), x.dtype)
+            if x.shape[-1:] == (width,)
+            else x
+            for x in leaves
+        ]
         if self._check is not None:
             self._check(jax.tree.unflatten(self._structure, shapes))
         return [_aligned(x) if isinstance(x, jax.ShapeDtypeStruct) else x for x in shapes]
-
-    def _shape(self, leaf: jax.Array) -> jax.Array | jax.ShapeDtypeStruct:
-        """Of all members; the leaf itself where it does not have them."""
-        if leaf.shape[-1:] != (self._part.width,):
-            return leaf
-        return jax.ShapeDtypeStruct((*leaf.shape[:-1], self._part.members), leaf.dtype)
 
 
 def _aligned(shape: jax.ShapeDtypeStruct) -> np.ndarray:

@@ -174,13 +174,19 @@ def _names(axes: int | Sequence[str]) -> tuple[str, ...]:
 def _sampled(
     name: str, part: Given, names: tuple[str, ...], clock: Clock, key: Key[Array, ""] | None
 ) -> list[Motion | None]:
+    def motion(axis: str, one: One, key: Key[Array, ""] | None) -> Motion:
+        try:
+            return as_signal(one).sample(clock, key)
+        except ValueError as error:
+            raise ValueError(f"{name} of {axis}: {error}") from error
+
     if part is not None and not isinstance(part, Mapping):
         part = dict.fromkeys(names, part)
     signals = {_place(name, axis, names): x for axis, x in (part or {}).items()}
     if len(signals) < len(part or {}):
         raise ValueError(f"{name}: an axis is given twice, by name and by number")
     return [
-        _motion(f"{name} of {axis}", signals[k], clock, _fold(key, k)) if k in signals else None
+        motion(axis, signals[k], _fold(key, k)) if k in signals else None
         for k, axis in enumerate(names)
     ]
 
@@ -197,13 +203,6 @@ def _place(name: str, axis: str | int, names: tuple[str, ...]) -> int:
 
 def _fold(key: Key[Array, ""] | None, k: int) -> Key[Array, ""] | None:
     return None if key is None else jax.random.fold_in(key, k)
-
-
-def _motion(what: str, one: One, clock: Clock, key: Key[Array, ""] | None) -> Motion:
-    try:
-        return as_signal(one).sample(clock, key)
-    except ValueError as error:
-        raise ValueError(f"{what}: {error}") from error
 
 
 def _stack(
@@ -250,18 +249,6 @@ def excite(
     """
     if axis not in AXES:
         raise ValueError(f"axis {axis!r}: choose one of {', '.join(AXES)}")
-    _check_excitation(signal, dt, torque_noise, torque_corner, sensor_noise)
-    levels = as_float([torque_noise, torque_corner, sensor_noise])
-    return _excited(as_float(signal), key, levels, float(dt), AXES.index(axis))
-
-
-def _check_excitation(
-    signal: Float[ArrayLike, " samples *ensemble"],
-    dt: float,
-    torque_noise: float,
-    torque_corner: float,
-    sensor_noise: float,
-) -> None:
     shape = np.shape(signal)
     if not shape or shape[0] < 2 or not np.all(np.isfinite(np.asarray(signal))):
         raise ValueError(
@@ -277,6 +264,8 @@ def _check_excitation(
         if not least < value < np.inf:
             bound = "above 0" if least == 0 else "0 or above"
             raise ValueError(f"{name} is {value}: it is {bound} and finite")
+    levels = as_float([torque_noise, torque_corner, sensor_noise])
+    return _excited(as_float(signal), key, levels, float(dt), AXES.index(axis))
 
 
 @ft.partial(Jit, options=brief_options)

@@ -211,30 +211,23 @@ def check_run(loop: Loop, scenario: Scenario) -> None:
             f"the scenario is sampled every {scenario.dt} s, but the loop runs every {loop.dt} s: "
             f"give jq.scenario(..., dt={loop.dt}), or a loop with dt={scenario.dt}"
         )
-    if scenario.payload is not None:
-        _check_payload(loop.plant, scenario.payload)
+    plant, payload = loop.plant, scenario.payload
+    if payload is not None:
+        if not isinstance(plant, CarriesPayload):
+            raise ValueError(
+                f"the scenario has a payload, but {type(plant).__name__} has no "
+                "with_added_inertia(inertia) to carry it: add that method, or leave the payload "
+                "None"
+            )
+        if is_concrete(payload):  # the plant refuses one that leaves it without inertia
+            plant.with_added_inertia(np.min(np.asarray(payload), axis=0))
     for name, part in scenario.parts.items():
-        if is_concrete(part):
-            _check_numbers(name, part)
-
-
-def _check_payload(plant: Plant, payload: Float[Array, "samples axes ..."]) -> None:
-    if not isinstance(plant, CarriesPayload):
-        raise ValueError(
-            f"the scenario has a payload, but {type(plant).__name__} has no "
-            "with_added_inertia(inertia) to carry it: add that method, or leave the payload None"
-        )
-    if is_concrete(payload):  # the plant refuses one that leaves it without inertia
-        plant.with_added_inertia(np.min(np.asarray(payload), axis=0))
-
-
-def _check_numbers(name: str, part: Float[Array, "samples axes ..."]) -> None:
-    finite = np.isfinite(np.asarray(part))
-    if not finite.all():
-        bad = np.flatnonzero(~finite.all(axis=tuple(range(1, part.ndim))))
-        raise ValueError(
-            f"the scenario's {name} is not finite at sample {bad[0]}: look for the nan or inf in it"
-        )
+        if is_concrete(part) and not (finite := np.isfinite(np.asarray(part))).all():
+            bad = np.flatnonzero(~finite.all(axis=tuple(range(1, part.ndim))))
+            raise ValueError(
+                f"the scenario's {name} is not finite at sample {bad[0]}: look for the nan or inf "
+                "in it"
+            )
 
 
 @runtime_checkable

@@ -186,7 +186,9 @@ class LoopStep(eqx.Module):
             saturated=_falls_short(requested, achieved),
             injection=happens.injection,
             disturbance=happens.disturbance,
-            signals={name: _wide_signal(x, angle) for name, x in signals.items()},
+            signals={
+                name: jnp.broadcast_to(align(x, angle), angle.shape) for name, x in signals.items()
+            },
             running=fine,
         )
         # Unchanged, but batched by `jax.vmap` where `fine` is, because the derivatives of `guarded`
@@ -202,7 +204,11 @@ class LoopStep(eqx.Module):
     ) -> tuple[PyTree, Array, Array, Array, Array]:
         """The controller's memory, what it asked for, what the drive makes of it, who is fine."""
         memory, command = self.controller.step(carry.memory, _setpoint(happens), measurement)
-        _require_shape(command, measurement)
+        if command.shape != measurement.shape:
+            raise ValueError(
+                f"the controller's command has the shape {command.shape}, but {measurement.shape} "
+                "is expected: make its fields that differ between members by jq.loops.per_member"
+            )
         fine = fine & are_tame(command, self.ensemble)
         requested = jnp.where(fine, command, 0) + happens.injection
         inputs, achieved = self._driven(requested)
@@ -279,18 +285,6 @@ def make_step(loop: Loop, ensemble: tuple[int, ...]) -> LoopStep:
         bound=loop.bound,
         ensemble=ensemble,
     )
-
-
-def _require_shape(command: Array, like: Float[Array, " axes *ensemble"]) -> None:
-    if command.shape != like.shape:
-        raise ValueError(
-            f"the controller's command has the shape {command.shape}, but {like.shape} is "
-            "expected: make its fields that differ between members by jq.loops.per_member"
-        )
-
-
-def _wide_signal(x: Array, like: Float[Array, " axes *ensemble"]) -> Array:
-    return jnp.broadcast_to(align(x, like), like.shape)
 
 
 def _setpoint(happens: Scenario) -> Reference:

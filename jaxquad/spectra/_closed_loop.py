@@ -224,7 +224,7 @@ def deembed(
             f"than {_AMPLIFIED:g} times there. Leave these frequencies out, or inject the signal "
             "at the plant input"
         )
-        remarks.append(Remark(text, lost))
+        remarks.append(Remark(text, lost, kind="amplified errors"))
     errors = closed.errors.scaled(jnp.asarray(slope[:, 0, 0]))
     return dataclasses.replace(
         closed,

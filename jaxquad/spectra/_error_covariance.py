@@ -135,7 +135,8 @@ class ErrorCovariance:
                 yield effect.reshape(-1, effect.shape[3]).T @ along
             return
         effect, reach, driven = np.asarray(self.effect), self._reach, self._driven
-        values, moved, drive = drawn.reshape(*effect.shape[:2], -1), None, None
+        values, moved = drawn.reshape(*effect.shape[:2], -1), np.zeros((0, columns.shape[3]))
+        drive = np.zeros((0, 0, 0), complex)
         begin, end = int(np.min(reach.first)), int(np.max(reach.last))
         if self.sensitivity is not None and self.drive is not None:
             slope, drive = np.asarray(self.sensitivity), np.asarray(self.drive)
@@ -144,7 +145,7 @@ class ErrorCovariance:
         for low in range(begin, end, _ATOMS):
             part = np.zeros((min(_ATOMS, end - low), values.shape[2]), complex)
             add_effects(part, low, effect, reach, values)
-            if drive is not None:
+            if drive.size:
                 taken = slice(*np.searchsorted(driven, (low, low + len(part))))
                 both = np.einsum("nac,np->acp", drive[:, taken], moved)
                 part[driven[taken] - low] += both.reshape(len(both), part.shape[1])
@@ -259,15 +260,16 @@ class ErrorCovariance:
 
     def _parameters(self) -> Float[np.ndarray, "parameters parameters"]:
         """Covariance of the real parameters."""
-        drive = np.ascontiguousarray(self.drive)
+        drive = np.ascontiguousarray(np.asarray(self.drive))
         parts = drive.reshape(len(drive), -1).view(float)  # real and imaginary ones in turn
         return 0.5 * (parts @ parts.T)
 
     def _with_parameters(self) -> Complex[np.ndarray, "frequencies outputs inputs parameters"]:
         """Twice the covariance of what atoms do to each response with the real parameters."""
         effect, reach, driven = np.asarray(self.effect), self._reach, self._driven
-        parameters, _, roots = np.shape(self.drive)
-        rows = np.conj(np.swapaxes(np.asarray(self.drive), 0, 1))
+        drive = np.asarray(self.drive)
+        parameters, _, roots = drive.shape
+        rows = np.conj(np.swapaxes(drive, 0, 1))
         rows = np.ascontiguousarray(rows).reshape(driven.size, -1)
         crossed = np.zeros((*effect.shape[:2], parameters * roots), complex)
         begins, ends = np.searchsorted(driven, reach.first), np.searchsorted(driven, reach.last)

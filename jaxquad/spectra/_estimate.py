@@ -186,4 +186,4 @@ def _remarks_on_length(
         f"{least_cycles:.0f}): 95 % intervals are too narrow there. Record at least {needed:.2g} "
         f"s, or a wider band"
     )
-    return (Remark(remark, omega[used]),)
+    return (Remark(remark, omega[used], kind="short record"),)

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Complex, Float, Int
+from jaxtyping import Bool, Complex, Float, Int
 
 from jaxquad._core import require_x64
 
@@ -78,8 +78,10 @@ def fourier_sums(
         if blocks is None or length < _SHORT:
             _sum_directly(rows, angle, length, starts, mine, detrend)
             continue
+        placed = _place_windows(blocks, length, starts)
         for c, channel in enumerate(running):
-            channel.sum_windows(length, starts, [(s, x[:, c]) for s, x in mine if c < x.shape[1]])
+            few = [(shape, part[:, c]) for shape, part in mine if c < part.shape[1]]
+            channel.sum_windows(placed, few)
     if origin:
         turn = np.exp(-1j * origin * angle)[:, None, None]
         for part in (part for parts in sums for part in parts):
@@ -188,63 +190,55 @@ class _Channel:
         functions = _block_functions(blocks.size, blocks.reach)
         self.coefficients = [function.T @ self.blocks.T for function in functions]
         still = _block_waves(blocks, 0.0)
-        self.still = still.sums(self.coefficients) * still.phase
+        self.still = np.zeros((len(still.even), blocks.count + 1), complex)  # running sums
+        np.cumsum(still.sums(self.coefficients) * still.phase, axis=1, out=self.still[:, 1:])
         time = np.arange(row.size) - row.size / 2
         moments = [row, row * time][: self.trends]
         self.moments = [np.concatenate([[0.0], np.cumsum(part)]) for part in moments]
 
     def sum_windows(
         self,
-        length: int,
-        starts: tuple[int, ...],
+        windows: "_Windows",
         into: Sequence[tuple[str, Complex[np.ndarray, "frequencies windows"]]],
     ) -> None:
         """Fill in the sums behind each taper."""
-        start, shift = np.array(starts), 2 * np.pi / length
-        still, below, above = self._plain(start, length, shift)
-        turn = np.exp(1j * shift * start)
-        below, above = below * turn.conj(), above * turn
-        angle = np.array(self.shared.angle)
-        middle = np.exp(-1j * angle[:, None] * (start + length / 2))
-        trends = self._trends(start, length)
+        still, below, above = self._plain(windows)
+        below, above = below * windows.turn.conj(), above * windows.turn
+        trends = self._trends(windows.start, windows.length)
+        both, odd = below + above, 0.5j * (below - above)
         for shape, sums in into:
             level, cosine, sine = waves(shape)
-            sums[...] = level * still - cosine / 2 * (below + above)
+            np.multiply(both, -cosine / 2, out=sums)
+            if level:
+                sums += level * still
             if sine:
-                sums += 0.5j * sine * (below - above)
+                sums += sine * odd
             if self.trends:
-                sums -= _trend_sums(self.shared.angle, length, shape, self.trends) @ trends * middle
+                angle = self.shared.angle
+                coefficients = _trend_sums(angle, windows.length, shape, self.trends)
+                sums -= coefficients @ trends * windows.middle
 
-    def _plain(
-        self, start: Int[np.ndarray, " windows"], length: int, shift: float
-    ) -> Complex[np.ndarray, "3 frequencies windows"]:
+    def _plain(self, windows: "_Windows") -> Complex[np.ndarray, "3 frequencies windows"]:
         """Sums without a taper: at all frequencies, at these less the shift, and more."""
-        still, shifted = (_block_waves(self.shared, d) for d in (0.0, shift))
-        ends, back = np.unique(
-            np.concatenate([start, start + length]) + self.shared.lead, return_inverse=True
-        )
-        place, beyond = np.divmod(ends, self.shared.size)
-        blocks, again = np.unique(place, return_inverse=True)
-        used = slice(blocks[0], blocks[-1])
-        moving = shifted.sums([rows[:, used] for rows in self.coefficients])
-        moving *= shifted.phase[:, used]
-        running = np.zeros((3 * len(still.even), blocks.size), complex)
-        if blocks.size > 1:
-            sums = np.concatenate([self.still[:, used], moving])
-            sums = np.add.reduceat(sums, blocks[:-1] - blocks[0], axis=1)
-            np.cumsum(sums, axis=1, out=running[:, 1:])
-        running = running[:, again]
-        part = np.flatnonzero(beyond)
-        if part.size:  # ends within a block
-            inside = np.arange(self.shared.size) < beyond[part, None]
-            samples = (self.blocks[place[part]] * inside).T
+        count, place, used = len(self.still), windows.place, windows.used
+        still, shifted = (_block_waves(self.shared, d) for d in (0.0, windows.shift))
+        running = np.zeros((3 * count, place.size), complex)
+        running[:count] = self.still[:, place]
+        if windows.steps.size:
+            moving = shifted.sums([rows[:, used] for rows in self.coefficients])
+            moving *= shifted.phase[:, used]
+            sums = np.cumsum(np.add.reduceat(moving, windows.steps, axis=1), axis=1)
+            later = windows.step > 0
+            running[count:, later] = sums[:, windows.step[later] - 1]
+        part = windows.part
+        if part.size:
+            samples = (self.blocks[place[part]] * windows.inside).T
             functions = _block_functions(self.shared.size, self.shared.reach)
             few = [function.T @ samples for function in functions]
             rest = [wave.sums(few) * wave.phase[:, place[part]] for wave in (still, shifted)]
             running[:, part] += np.concatenate(rest)
-        running = running[:, back]
-        plain = running[:, start.size :] - running[:, : start.size]
-        return plain.reshape(3, -1, start.size)
+        plain = running[:, windows.last] - running[:, windows.first]
+        return plain.reshape(3, count, -1)
 
     def _trends(
         self, start: Int[np.ndarray, " windows"], length: int
@@ -255,6 +249,44 @@ class _Channel:
             middle = start + (length - 1) / 2 - (self.moments[0].size - 1) / 2
             parts[1] = (parts[1] - parts[0] * middle) * 12 / (length * (length**2 - 1.0))
         return np.stack([parts[0] / length, *parts[1:]]) if parts else np.zeros((0, start.size))
+
+
+class _Windows(NamedTuple):
+    """Where windows of one length begin and end in the blocks."""
+
+    length: int
+    start: Int[np.ndarray, " windows"]
+    shift: float  # rad per sample, of the taper's waves
+    turn: Complex[np.ndarray, " windows"]  # their phase at the starts
+    middle: Complex[np.ndarray, "frequencies windows"]  # phase there
+    place: Int[np.ndarray, " ends"]  # blocks with an end, rising
+    part: Int[np.ndarray, " parts"]  # which ends lie within a block
+    inside: Bool[np.ndarray, "parts samples"]  # the samples of these blocks before them
+    used: slice  # blocks from the first to before the last end
+    steps: Int[np.ndarray, " steps"]  # of these, at which new sums begin
+    step: Int[np.ndarray, " ends"]  # number of each end's block among those with an end
+    first: Int[np.ndarray, " windows"]  # number of each window's begin among the ends
+    last: Int[np.ndarray, " windows"]
+
+
+@ft.lru_cache(maxsize=16)
+def _place_windows(blocks: _Blocks, length: int, starts: tuple[int, ...]) -> _Windows:
+    start, shift = np.array(starts), 2 * np.pi / length
+    ends, number = np.unique(
+        np.concatenate([start, start + length]) + blocks.lead, return_inverse=True
+    )
+    place, beyond = np.divmod(ends, blocks.size)
+    filled, step = np.unique(place, return_inverse=True)
+    part = np.flatnonzero(beyond)
+    inside = np.arange(blocks.size) < beyond[part, None]
+    angle = np.array(blocks.angle)
+    turn = np.exp(1j * shift * start)
+    middle = np.exp(-1j * angle[:, None] * (start + length / 2))
+    used, steps = slice(int(filled[0]), int(filled[-1])), filled[:-1] - filled[0]
+    first, last = number[: start.size], number[start.size :]
+    return _Windows(
+        length, start, shift, turn, middle, place, part, inside, used, steps, step, first, last
+    )
 
 
 @ft.lru_cache(maxsize=32)

@@ -65,7 +65,9 @@ def remarks_on_harmonics(
         evidence = np.sum([weight * np.abs(factor) ** 2 for factor, weight in parts], axis=0)
         size = np.where(evidence > gammainccinv(len(parts), chance), np.abs(factor), 0.0)
         text = _describe(factor, size)
-        remarks += [Remark(text, omega[used], (output, first.input_names[i]))] if text else []
+        if text:
+            pair = output, first.input_names[i]
+            remarks.append(Remark(text, omega[used], pair, "nonlinear"))
     return tuple(remarks)
 
 

@@ -97,7 +97,8 @@ def _remarks_on_added(
                     f". The excitation repeats: jq.spectra.Periodic({settings}) tells noise from "
                     "distortion"
                 )
-        remarks += [Remark(text, omega[used], pair) for text in (static, change) if text]
+        texts = {"nonlinear": static, "changing": change}
+        remarks += [Remark(text, omega[used], pair, kind) for kind, text in texts.items() if text]
     return tuple(remarks)
 
 

@@ -63,13 +63,12 @@ def record_bins(records: Sequence[Record], integrators: int, delay: float) -> Bi
         values.append(spectra)
         grids.append(grid)
         owners.append(np.full(last, index))
-    joined = grids[0], owners[0], values[0]
+    omega, owner, joined = grids[0], owners[0], values[0]
     if len(records) > 1:
-        joined = [np.concatenate(part) for part in (grids, owners, values)]
-        order = np.argsort(joined[0], kind="stable")
-        joined = [part[order] for part in joined]
-    largest = np.array([np.max(np.abs(channel), initial=0.0) for channel in joined[2].T])
-    return Bins(*joined, len(records), largest)
+        order = np.argsort(np.concatenate(grids), kind="stable")
+        omega, owner, joined = (np.concatenate(part)[order] for part in (grids, owners, values))
+    largest = np.array([np.max(np.abs(channel), initial=0.0) for channel in joined.T])
+    return Bins(omega, owner, joined, len(records), largest)
 
 
 def recolour(

@@ -342,7 +342,7 @@ def _remark_on_lost(omega: Grid, setup: Setup, width: float | None) -> tuple[Rem
     if width is not None:
         enough = np.max(setup.windows.least[np.searchsorted(setup.windows.grid, omega)])
         remark += f"«wider|; or use a larger width: {enough:.4g} rad/s holds enough Fourier bins»"
-    return (Remark(remark, omega),)
+    return (Remark(remark, omega, kind="undetermined"),)
 
 
 def _remark_on_unmoved(
@@ -356,7 +356,7 @@ def _remark_on_unmoved(
         f"(random errors above {100 * DIVISIBLE:.0f} %). Excite by the references, record longer, "
         "or sample faster"
     )
-    return (Remark(text),)
+    return (Remark(text, kind="no response"),)
 
 
 def _remark_on_resolution(omega: Grid) -> tuple[Remark, ...]:
@@ -367,7 +367,7 @@ def _remark_on_resolution(omega: Grid) -> tuple[Remark, ...]:
         "a mode that rings or a line (a tone, as of a rotor or the mains). Record longer, and "
         "3 to 10 s of rest at the end"
     )
-    return (Remark(text, omega),)
+    return (Remark(text, omega, kind="no response"),)
 
 
 def _remark_on_ringing(omega: Grid) -> tuple[Remark, ...]:
@@ -379,4 +379,4 @@ def _remark_on_ringing(omega: Grid) -> tuple[Remark, ...]:
         "mains), is mistaken for response. Record 3 to 10 s of rest at the end, sweep wider"
         "«, or raise global_order»; leave the frequencies of a line out"
     )
-    return (Remark(text, omega),)
+    return (Remark(text, omega, kind="ringing"),)

@@ -331,18 +331,18 @@ def _remarks(
             "undetermined {where}: the inputs cannot be separated there. Use different phases in "
             "each record"
         )
-        remarks.append(Remark(text, lost))
+        remarks.append(Remark(text, lost, kind="undetermined"))
     departures = [one.departure for one in periods if one.departure > _UNSETTLED]
     if departures:
         text = (
             f"the first period differs from the later ones by {max(departures):.3g} times the "
             "noise power, because a transient remains: discard more periods"
         )
-        remarks.append(Remark(text))
+        remarks.append(Remark(text, kind="transient"))
     if np.any(scatter.significant):
         text = (
             "nonlinear distortion exceeds the noise: the error bars are those of the best linear "
             "approximation. Use a smaller amplitude, or take the fit as that at this amplitude"
         )
-        remarks.append(Remark(text))
+        remarks.append(Remark(text, kind="nonlinear"))
     return tuple(remarks)

@@ -26,7 +26,7 @@ class Remark(Message):
     - `text`: what happened, the number, and what to do. `{where}` stands for the frequencies.
     - `omega`: the frequencies that it is about, in rad/s; none for the response as a whole.
     - `pair`: names of the output and the input that it is about; `None` for all pairs.
-    - `kind`: what it is about, for code that decides by it.
+    - `kind`: what it is about, such as "leakage" or "nonlinear", for code that decides by it.
     """
 
     text: str
@@ -41,7 +41,8 @@ class Remark(Message):
         kind: str = "",
     ) -> "Remark":
         points = tuple(float(x) for x in omega)
-        self = super().__new__(cls, text.replace("{where}", _place(points)), kind)
+        sentence = text.replace("{where}", _place(points))
+        self: Remark = super().__new__(cls, sentence, kind)  # pyright: ignore[reportAssignmentType]
         self.text, self.omega, self.pair = text, points, pair
         return self
 

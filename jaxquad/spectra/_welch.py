@@ -80,14 +80,14 @@ def transform_records(
             mine += [origin + start for start in local]
         origin += record.samples + max(length for length, _ in layout)
     groups = tuple((n, tuple(mine)) for (n, _), mine in zip(layouts[0], starts, strict=True))
-    # By taper and by length, the windows of all records side by side, as neighbours in memory.
+
+    def side_by_side(part: Sequence[np.ndarray]) -> np.ndarray:
+        """The windows of all records, as neighbours in memory."""
+        rows = [np.swapaxes(x, 1, 2) for x in part]
+        return np.swapaxes(rows[0] if len(rows) == 1 else np.concatenate(rows, axis=2), 1, 2)
+
     joined, *slopes = (
-        tuple(
-            np.swapaxes(np.concatenate([np.swapaxes(x, 1, 2) for x in part], axis=2), 1, 2)
-            if len(part) > 1
-            else part[0]
-            for part in zip(*lengths, strict=True)
-        )
+        tuple(side_by_side(part) for part in zip(*lengths, strict=True))
         for lengths in zip(*parts, strict=True)
     )
     none = Slopes(np.zeros((0, 0, 0), complex), np.zeros((0, 0, 0), complex))
@@ -276,7 +276,7 @@ def _remarks(
     remarks += remarks_on_linearity(records, omega, response, coherence, method)
     remarks += _remarks_on_inputs(omega, 1 - np.nan_to_num(averaged.alone), first.input_names)
     remarks += _remarks_on_leakage(omega, averaged.leakage(), error, names)
-    return remarks + ((Remark(_FEW.format(count=most)),) if most < 3 else ())
+    return remarks + ((Remark(_FEW.format(count=most), kind="few windows"),) if most < 3 else ())
 
 
 def _remarks_on_inputs(
@@ -294,14 +294,14 @@ def _remarks_on_inputs(
                 "out. Excite the inputs independently, one after the other or with interleaved "
                 "multisines"
             )
-            remarks.append(Remark(text, omega[lost]))
+            remarks.append(Remark(text, omega[lost], kind="undetermined"))
         elif np.mean(coherence[:, i]) > _CORRELATED:
             text = (
                 f"input {name} is correlated with the other inputs: their average coherence is "
                 f"{coherence[:, i].mean():.2f} (limit {_CORRELATED}), so the errors of conditioned "
                 f"responses are larger. Excite the inputs independently"
             )
-            remarks.append(Remark(text))
+            remarks.append(Remark(text, kind="correlated inputs"))
     return tuple(remarks)
 
 
@@ -326,7 +326,7 @@ def _remarks_on_leakage(
                 "include it. Use «jq.spectra.LocalPolynomial()», which estimates leakage, a longer "
                 "window, or «integrators=» where the plant integrates"
             )
-            remarks.append(Remark(text, omega[leaked], (output, source)))
+            remarks.append(Remark(text, omega[leaked], (output, source), "leakage"))
     return tuple(remarks)
 
 

@@ -16,7 +16,6 @@ from jaxquad.ensembles import Members
 from jaxquad.loops import linear_numbers, Loop
 from jaxquad.models import DecoupledAxes, Multirotor
 from jaxquad.simulation import (
-    asked_devices,
     check_run,
     Devices,
     devices_for,
@@ -225,7 +224,7 @@ def make_problem(
 
 def linear_loops(members: Members, devices: DeviceChoice) -> LinearLoops:
     axes = decouple(members.plant)
-    places = devices_for(members.size, asked_devices(devices))
+    places = devices_for(members.size, devices)
     longest = float(members.longest_delay)
     return LinearLoops(axes, members.delay, members.assumed_inertia, longest, members.dt, places)
 

@@ -159,7 +159,7 @@ def _tune_axis(axis: _ReadAxis, filters: Mapping[str, float]) -> AutopilotPropos
         return unsure(f"this log cannot tell: {again.verdict}. {recipe}", again)
     if again.kind != "flown":
         return unsure(f"this log cannot tell: {again.verdict}", again)
-    read = lambda inputs: read_records(path, plant.settings, beside=inputs)
+    read = lambda inputs: read_records(path, plant.settings, further_inputs=inputs)
     throttle = study_throttle(plant, proposal, flown, read)
     design = design_gains(settings, plant, flown, flight, throttle, filters)
     return AutopilotProposal(

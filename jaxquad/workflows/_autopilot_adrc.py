@@ -81,7 +81,7 @@ def tune_adrc(
     with warnings.catch_warnings():  # the throttle is slow, or rests
         warnings.simplefilter("ignore", RecordWarning)
         throttle = {"throttle": dict(proposal.setup.throttle)}
-        records = list(read_records(path, record, beside=throttle))
+        records = list(read_records(path, record, further_inputs=throttle))
     announce("the gain over the throttle")
     low, high = settings.band or (0.0, 0.0)
     band = None if settings.band is None else (2 * np.pi * low, 2 * np.pi * high)

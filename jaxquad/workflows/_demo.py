@@ -29,8 +29,23 @@ def write_demo_log(path: str | Path, seed: int = 0) -> Path:
     """
     low, high = 2 * np.pi * 0.4, 2 * np.pi * 15
     signal = sweep(low, high, duration=40, sample_rate=_RATE, amplitude=0.06)
-    command, rate = _simulated(signal.signal, seed)
-    columns = (signal.time, signal.signal, command, rate)
+    # M = x0 - feedback q, held for a sample; q' = gain M(t - delay) behind a lag, and gusts.
+    random, samples = np.random.default_rng(seed), signal.signal.size
+    noise, shocks = random.standard_normal((2, samples))
+    dt, late = 1 / _RATE, round(_DELAY * _RATE)
+    stay, decay = np.exp(-dt / _LAG), np.exp(-_CORNER * dt)
+    command, measured = np.zeros((2, samples))
+    rate = moment = gust = 0.0
+    for k in range(samples):
+        measured[k] = rate + _NOISE * noise[k]
+        command[k] = signal.signal[k] - _FEEDBACK * measured[k]
+        delayed = command[k - late] if k >= late else 0.0
+        # The lag's exact mean over the sample, in which its input is constant.
+        mean = delayed + (moment - delayed) * (1 - stay) * _LAG / dt
+        rate += dt * (_GAIN * mean + gust)
+        moment = delayed + (moment - delayed) * stay
+        gust = decay * gust + _GUST * np.sqrt(1 - decay**2) * shocks[k]
+    columns = (signal.time, signal.signal, command, measured)
     rows = ("{:.6f},{:.8g},{:.8g},{:.8g}\n".format(*row) for row in zip(*columns, strict=True))
     return write_file(Path(path), f"time,x0,M,q\n{''.join(rows)}")
 
@@ -48,23 +63,3 @@ def find_demo_flight() -> tuple[Path, IdentifySettings]:
         input=f"M{field}", output=f"q{field}", reference=f"x0{field}",
         units={f"q{field}": "rad/s"}, rate=250.0, start=50.0, stop=76.0, band=(0.7, 12.0),
     )  # fmt: skip
-
-
-def _simulated(swept: np.ndarray, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """M = x0 - feedback q, held for a sample; q' = gain M(t - delay) behind a lag, and gusts."""
-    random = np.random.default_rng(seed)
-    noise, shocks = random.standard_normal((2, swept.size))
-    dt, delay = 1 / _RATE, round(_DELAY * _RATE)
-    stay, hold = np.exp(-dt / _LAG), np.exp(-_CORNER * dt)
-    command, measured = np.zeros((2, swept.size))
-    rate = moment = gust = 0.0
-    for k in range(swept.size):
-        measured[k] = rate + _NOISE * noise[k]
-        command[k] = swept[k] - _FEEDBACK * measured[k]
-        held = command[k - delay] if k >= delay else 0.0
-        # The lag's exact mean over the sample, in which its input is constant.
-        mean = held + (moment - held) * (1 - stay) * _LAG / dt
-        rate += dt * (_GAIN * mean + gust)
-        moment = held + (moment - held) * stay
-        gust = hold * gust + _GUST * np.sqrt(1 - hold**2) * shocks[k]
-    return command, measured

@@ -12,7 +12,6 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxquad._core import announce, marked_text, Message
-from jaxquad.autopilot import FlownLaw
 from jaxquad.identify import (
     Bands,
     Combination,
@@ -42,6 +41,7 @@ from ._settings import IdentifySettings
 
 
 if TYPE_CHECKING:
+    from jaxquad.autopilot import FlownLaw
     from jaxquad.plot import Panels
 
 
@@ -82,7 +82,7 @@ class Identification:
     parts: Mapping[str, Fit | None]
     proposal: Proposal | None = None
     more: tuple[Path, ...] = ()
-    flown: FlownLaw | None = None
+    flown: "FlownLaw | None" = None
     check: Verification | None = None
     bands: Bands | None = None
     explanation: Explanation | None = None
@@ -289,7 +289,7 @@ class Identification:
             filters=self.filters,
             law=_law_if_any(self),
             formula="; ".join(filter(None, (self.formula, self.filters_text))),
-            beside=self.supplements,
+            texts=self.supplements,
         )
         self._write_figures(folder)
         return path
@@ -350,30 +350,32 @@ def _record_title(record: Record, more: Sequence[Path]) -> str:
     return f"{Path(record.source).name}, {span}" if more else span
 
 
-def _law_if_any(found: Identification) -> LawLoop | None:
+def _law_if_any(result: Identification) -> LawLoop | None:
+    if result.flown is None:
+        return None
     from jaxquad.autopilot import loop_of_law
 
     try:
-        [unit] = found.records[0].output_units
-        return loop_of_law(found.flown, found.fit, found.frf, found.filters, unit)
+        [unit] = result.records[0].output_units
+        return loop_of_law(result.flown, result.fit, result.frf, result.filters, unit)
     except Exception as error:  # the record shows its loop without the law, too
         text = f"the loop by its law is missing: {reason_of(error).marked}"
         warnings.warn(text, PageWarning, stacklevel=2)
         return None
 
 
-def _record_with_throttle(found: Identification) -> Record | None:
+def _record_with_throttle(result: Identification) -> Record | None:
     """The first record with the throttle that the log's proposal names; None without one."""
-    proposal, first = found.proposal, found.records[0]
+    proposal, first = result.proposal, result.records[0]
     if proposal is None or not proposal.setup.throttle:
         return None
     options = proposal.options_with_throttle
     options |= {"start": float(first.time[0]), "stop": float(first.time[-1])}
-    options |= {"sample_rate": first.sample_rate, "max_gap": found.settings.max_gap}
+    options |= {"sample_rate": first.sample_rate, "max_gap": result.settings.max_gap}
     try:
         with warnings.catch_warnings():  # the record has said what was repaired
             warnings.simplefilter("ignore", RecordWarning)
-            return read(found.path, **options)
+            return read(result.path, **options)
     except RecordError as error:
         announce(f"no spectrum over the throttle: {error}")
         return None

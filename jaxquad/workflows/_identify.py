@@ -3,12 +3,11 @@
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, TYPE_CHECKING, TypeVar
 
 import numpy as np
 
 from jaxquad._core import announce, as_messages
-from jaxquad.autopilot import flown_law
 from jaxquad.identify import (
     behind_filters,
     CoherenceWeighted,
@@ -28,6 +27,7 @@ from jaxquad.identify import (
 )
 from jaxquad.models import LaggedIntegrator, parameter_units, TransferFunction
 from jaxquad.records import Proposal, Record
+from jaxquad.records.firmware import axis_of_rate
 from jaxquad.report import reason_of
 from jaxquad.spectra import (
     Composite,
@@ -47,6 +47,10 @@ from ._result_file import load_result, StoredResult
 from ._settings import IdentifySettings
 
 
+if TYPE_CHECKING:
+    from jaxquad.autopilot import FlownLaw
+
+T = TypeVar("T")
 _COSTS = {"ml": MaximumLikelihood(), "coherence": CoherenceWeighted()}
 _POINTS = 100  # frequencies, log-spaced over the band
 _LONGEST = 0.02  # of the record: a longer delay is no delay of the vehicle
@@ -118,13 +122,13 @@ def identify_opened(opened: OpenedLogs) -> Identification:
     - `opened`: what `open_logs`, or `open_again` of a stored result, returned.
     """
     paths, settings, proposal, records = opened
-    flown = flown_law(paths, mix_of(settings.output), mix_of(settings.input), proposal, settings)
+    flown = _flown_law(opened)
     filters = () if flown is None or settings.keep_gyro_filters else flown.filters
     estimate = _estimate(opened, filters, vehicle=flown is not None, compare=True)
     method, frf, fit, parts, delay = estimate
     responses, fits, failures = {method: frf}, {method: fit}, {}
 
-    def attempt(title: str, compute: Callable[[], object]):
+    def attempt(title: str, compute: Callable[[], T]) -> T | None:
         try:
             return compute()
         except Exception as error:
@@ -145,6 +149,19 @@ def identify_opened(opened: OpenedLogs) -> Identification:
         paths[0], settings, records, responses, fits, parts, proposal, paths[1:], flown, check,
         bands, explanation, failures,
     )  # fmt: skip
+
+
+def _flown_law(opened: OpenedLogs) -> "FlownLaw | None":
+    """The gyro's filters and the law of an autopilot's log; None for any other output."""
+    paths, settings, proposal, _ = opened
+    [outputs] = mix_of(settings.output).values() or [{}]
+    axes = [axis for name in outputs if (axis := axis_of_rate(name)) is not None]
+    if len(outputs) != 1 or not axes:
+        return None
+    from jaxquad.autopilot import flown_law  # here: with it come the laws of all firmwares
+
+    [rate], [axis], [command] = outputs, axes, mix_of(settings.input).values()
+    return flown_law(paths, rate, axis, command, proposal, settings)
 
 
 def identify_fit(opened: OpenedLogs) -> Identification:
@@ -291,7 +308,7 @@ def _fit_response(frf: FrequencyResponse, settings: IdentifySettings) -> Fit:
 
 
 def _fit_parts(
-    whole: Fit, frf: FrequencyResponse, settings: IdentifySettings
+    full: Fit, frf: FrequencyResponse, settings: IdentifySettings
 ) -> tuple[str, dict[str, Fit | None]]:
     """The band in words, and fits to its upper and lower two thirds where the misfit is large.
 
@@ -299,14 +316,14 @@ def _fit_parts(
     integrator, and for a response that feedback dominates or whose phase rises: no part of it
     would be better. None for a part in which the solver diverged.
     """
-    small = not whole.chi_squared >= _MISFIT**2 or not isinstance(whole.model, LaggedIntegrator)
+    small = not full.chi_squared >= _MISFIT**2 or not isinstance(full.model, LaggedIntegrator)
     no_plant = any(remark.kind in (DOMINATED, EARLY) for remark in frf.remarks)
-    if not whole.verdict.fitted or small or no_plant:
+    if not full.verdict.fitted or small or no_plant:
         return "", {}
 
     def fit_part(band: tuple[float, float]) -> Fit | None:
         try:  # from where the fit stopped
-            return fit(whole.model, frf, free=whole.names, cost=_COSTS[settings.cost], band=band)
+            return fit(full.model, frf, free=full.names, cost=_COSTS[settings.cost], band=band)
         except ValueError:
             return None
 
@@ -320,15 +337,15 @@ def _fit_parts(
     }
 
 
-def _gain_change(where: str, part: Fit | None, whole: Fit) -> str:
+def _gain_change(where: str, part: Fit | None, full: Fit) -> str:
     """A remark on a part of the band in which the gain is another one; empty where it is not."""
-    sure = whole.determined[0] or whole.verdict.kind == "no model"
+    sure = full.determined[0] or full.verdict.kind == "no model"
     if part is None or not (part.determined[0] and sure):
         return ""
-    before, after = whole.values[0], part.values[0]
+    before, after = full.values[0], part.values[0]
     if not abs(after - before) > max(_CHANGE * abs(before), 2 * part.standard_errors[0]):
         return ""
-    ratio, ratio_before = part.chi_squared**0.5, whole.chi_squared**0.5
+    ratio, ratio_before = part.chi_squared**0.5, full.chi_squared**0.5
     return (
         f"{where} the gain is {after:.4g} instead of {before:.4g}, with a misfit of {ratio:.1f} "
         f"instead of {ratio_before:.1f}: the model does not hold over the whole band. Fit the part "

@@ -295,7 +295,8 @@ def _by_name(value: object, advice: str) -> list[tuple[object, Any, Any]]:
         raise ValueError(advice)
     split = lambda pair: pair.partition("=")[::2] if isinstance(pair, str) else pair
     parts = ((pair, split(pair)) for pair in pairs)
-    return [(pair, *(x if _is_list(x) and len(x) == 2 else (None, None))) for pair, x in parts]
+    two = ((pair, x if _is_list(x) and len(x) == 2 else (None, None)) for pair, x in parts)
+    return [(pair, name, content) for pair, (name, content) in two]
 
 
 def _units(value: object) -> dict[str, str]:
@@ -320,8 +321,11 @@ def _ranges(value: object) -> dict[str, Pair]:
 
 def _patterns(value: object) -> tuple[str, ...]:
     patterns = (value,) if isinstance(value, str) else value
-    texts = _is_list(patterns) and all(isinstance(text, str) and text for text in patterns)
-    if not texts or not patterns:
+    if (
+        not _is_list(patterns)
+        or not patterns
+        or not all(x and isinstance(x, str) for x in patterns)
+    ):
         raise ValueError('give a file pattern or a list of them, such as "**/*.ulg"')
     if any(pattern.startswith("/") for pattern in patterns):
         raise ValueError("give patterns relative to the folder of the logs, without a / in front")

@@ -50,10 +50,10 @@ class StoredResult(NamedTuple):
     @property
     def used_band(self) -> tuple[float, float]:
         """The lowest and the highest frequency that the fit used, in rad/s."""
-        found = self.content.get("used_band_rad_per_s")
-        if not isinstance(found, list):  # a result of an earlier version
+        used = self.content.get("used_band_rad_per_s")
+        if not isinstance(used, list):  # a result of an earlier version
             return self.band
-        low, high = map(float, found)
+        low, high = map(float, used)
         return low, high
 
     @property
@@ -75,19 +75,42 @@ class StoredResult(NamedTuple):
 
     @property
     def _parameters(self) -> dict[str, dict[str, Any]]:
-        found = _part(self.content, "fit").get("parameters")
-        return {one["name"]: one for one in found} if isinstance(found, list) else {}
+        rows = _part(self.content, "fit").get("parameters")
+        return {row["name"]: row for row in rows} if isinstance(rows, list) else {}
 
     @property
     def frf(self) -> "FrequencyResponse":
         """The response that was fitted; its errors count as independent between frequencies."""
-        return _response(_part(self.content, "response"))
+        import jax.numpy as jnp
+
+        from jaxquad.spectra import FrequencyResponse, independent_errors
+
+        content: Mapping[str, Any] = _part(self.content, "response")
+        array = lambda name: np.array(content[name], float)  # null becomes nan
+        omega, error = array("omega_rad_per_s"), array("random_error")
+        size, coherence = 10 ** (array("magnitude_db") / 20), array("coherence")
+        response = size * np.exp(1j * np.radians(array("phase_deg")))
+        error = np.where(np.isfinite(error), error, np.inf)
+        return FrequencyResponse(
+            omega=jnp.asarray(omega),
+            response=jnp.asarray(response),
+            coherence=jnp.asarray(coherence),
+            random_error=jnp.asarray(error),
+            errors=independent_errors(omega, 2 * (error * size) ** 2),
+            direct_coherence=jnp.asarray(coherence),
+            multiple_coherence=jnp.asarray(np.max(coherence, axis=2)),
+            method=content["method"],
+            input_names=tuple(content["inputs"]),
+            output_names=tuple(content["outputs"]),
+            input_units=tuple(content.get("input_units", ())),
+            output_units=tuple(content.get("output_units", ())),
+        )
 
     def require_radians(self) -> None:
         """As the function of this name, for the output by the stored settings and response."""
         response = _part(self.content, "response")
-        pairs = (response.get("outputs"), response.get("output_units"))
-        names, units = (each if isinstance(each, list) else [] for each in pairs)
+        stored = (response.get("outputs"), response.get("output_units"))
+        names, units = (texts if isinstance(texts, list) else [] for texts in stored)
         for name, unit in zip(names, units, strict=False):  # an earlier version stored no units
             require_radians(str(name), dict(self.settings.units).get(str(name), str(unit)))
 
@@ -95,8 +118,8 @@ class StoredResult(NamedTuple):
     def tuned(self) -> "StoredTuning | None":
         """What `jaxquad tune` has stored for this result, in its folder or in `tuned/` there."""
         folders = (self.folder / "tuned", self.folder)
-        found = [folder for folder in folders if (folder / "tuned.json").exists()]
-        return load_tuning(found[0]) if found else None
+        folder = next((x for x in folders if (x / "tuned.json").exists()), None)
+        return None if folder is None else load_tuning(folder)
 
     def __str__(self) -> str:
         lines = [f"{self.log.name}: {self.summary}"]
@@ -128,16 +151,16 @@ class StoredResult(NamedTuple):
         from jaxquad.identify import UndeterminedError
         from jaxquad.models import LaggedIntegrator, TransferFunction
 
-        known = {each.__name__: each for each in (LaggedIntegrator, TransferFunction)}
+        models = {model.__name__: model for model in (LaggedIntegrator, TransferFunction)}
         if "model" not in self.content:
             raise UndeterminedError(f"the result holds no model: {self.summary}")
         numbers = dict(_part(self.content, "model"))
         kind = numbers.pop("kind", None)
-        if kind not in known:
-            kinds = ", ".join(known)
+        if kind not in models:
+            kinds = ", ".join(models)
             raise ValueError(f"the result holds a model of kind {kind!r}: known are {kinds}")
         try:
-            return known[str(kind)](**numbers)  # pyright: ignore[reportArgumentType]
+            return models[str(kind)](**numbers)  # pyright: ignore[reportArgumentType]
         except TypeError as error:
             raise ValueError(f"the result's model is incomplete: {error}") from error
 
@@ -165,70 +188,38 @@ class StoredTuning(NamedTuple):
     @property
     def controller(self) -> "ScheduledLADRC":
         """The tuned controller, as it was certified."""
-        return _controller(_part(self.content, "controller"))
+        import jax
+        import jax.numpy as jnp
+
+        from jaxquad.control import certainty_equivalence, LADRC, ScheduledLADRC
+
+        content: Mapping[str, Any] = _part(self.content, "controller")
+        numbers, dt = content["numbers"], float(content["dt"])
+        start = LADRC(1.0, 3.0, 1.0, limit=1.0, dt=dt)
+        template = ScheduledLADRC(start, certainty_equivalence(1.0, 1.0))
+        stored = lambda path, x: jnp.asarray(numbers[jax.tree_util.keystr(path)[1:]], x.dtype)
+        return jax.tree_util.tree_map_with_path(stored, template)
 
     def __str__(self) -> str:
         verdicts = self.content["verdicts"]
         assert isinstance(verdicts, list)
         words = {True: "OK  ", False: "FAIL", None: "--  "}
-        lines = [f"{words[each['holds']]} {each['name']}: {each['text']}" for each in verdicts]
+        lines = [f"{words[x['holds']]} {x['name']}: {x['text']}" for x in verdicts]
         gains = ", ".join(f"{name} {value:.4g}" for name, value in self.values.items())
         return "\n".join([*lines, f"tuned: {gains}"])
 
 
 def require_radians(name: str, unit: str) -> None:
     """Raise ValueError for an output that gains for an angle are not for, before a fit is made."""
-    if unit not in ("rad", "rad/s"):
-        raise ValueError(
-            f"the unit of {name} is {unit or 'not known'}, but gains are for an angle in rad: "
-            f"identify with the output in rad/s or rad {_in_radians(name, unit)}"
-        )
-
-
-def _in_radians(name: str, unit: str) -> str:
-    """The options that convert degrees, or that say what an unknown unit is."""
+    if unit in ("rad", "rad/s"):
+        return
+    options = f"(--unit {name}=rad/s)"
     if unit in ("deg", "deg/s"):
         radians = unit.replace("deg", "rad")
-        return f"(--output angle=0.017453293*{name} --unit angle={radians})"
-    return f"(--unit {name}=rad/s)"
-
-
-def _controller(content: Mapping[str, Any]) -> "ScheduledLADRC":
-    """A controller of the kind that `jaxquad tune` tunes, with the stored numbers."""
-    import jax
-    import jax.numpy as jnp
-
-    from jaxquad.control import certainty_equivalence, LADRC, ScheduledLADRC
-
-    numbers, dt = content["numbers"], float(content["dt"])
-    like = ScheduledLADRC(LADRC(1.0, 3.0, 1.0, limit=1.0, dt=dt), certainty_equivalence(1.0, 1.0))
-    stored = lambda path, x: jnp.asarray(numbers[jax.tree_util.keystr(path)[1:]], x.dtype)
-    return jax.tree_util.tree_map_with_path(stored, like)
-
-
-def _response(content: Mapping[str, Any]) -> "FrequencyResponse":
-    import jax.numpy as jnp
-
-    from jaxquad.spectra import FrequencyResponse, independent_errors
-
-    array = lambda name: np.array(content[name], float)  # null becomes nan
-    omega, error, coherence = (array(n) for n in ("omega_rad_per_s", "random_error", "coherence"))
-    size = 10 ** (array("magnitude_db") / 20)
-    response = size * np.exp(1j * np.radians(array("phase_deg")))
-    error = np.where(np.isfinite(error), error, np.inf)
-    return FrequencyResponse(
-        omega=jnp.asarray(omega),
-        response=jnp.asarray(response),
-        coherence=jnp.asarray(coherence),
-        random_error=jnp.asarray(error),
-        errors=independent_errors(omega, 2 * (error * size) ** 2),
-        direct_coherence=jnp.asarray(coherence),
-        multiple_coherence=jnp.asarray(np.max(coherence, axis=2)),
-        method=content["method"],
-        input_names=tuple(content["inputs"]),
-        output_names=tuple(content["outputs"]),
-        input_units=tuple(content.get("input_units", ())),
-        output_units=tuple(content.get("output_units", ())),
+        options = f"(--output angle=0.017453293*{name} --unit angle={radians})"
+    raise ValueError(
+        f"the unit of {name} is {unit or 'not known'}, but gains are for an angle in rad: "
+        f"identify with the output in rad/s or rad {options}"
     )
 
 
@@ -282,27 +273,23 @@ def free_folder(
     - `same`: what that file holds if the result is the same, made again, by key.
     - `sources`: the files that it is made from, in the order of its provenance.
     """
-    numbered = (wanted.with_name(f"{wanted.name}-{number}") for number in count(2))
-    return next(
-        folder for folder in chain([wanted], numbered) if _is_free(folder / name, same, sources)
-    )
-
-
-def _is_free(path: Path, same: Mapping[str, object], sources: Sequence[str | Path]) -> bool:
     from jaxquad._core import plain_content
     from jaxquad.report import sha256_of
 
-    if not path.exists():
-        return True
-    try:
-        content = json.loads(path.read_text())
-        hashes = [file["sha256"] for file in content["provenance"]["files"]]
-    except (OSError, ValueError, KeyError, TypeError):
-        return False
-    wanted = {key: json.loads(json.dumps(plain_content(value))) for key, value in same.items()}
-    return all(content.get(key) == value for key, value in wanted.items()) and hashes == [
-        sha256_of(each) for each in sources
-    ]
+    def is_free(path: Path) -> bool:
+        if not path.exists():
+            return True
+        try:
+            content = json.loads(path.read_text())
+            hashes = [file["sha256"] for file in content["provenance"]["files"]]
+        except (OSError, ValueError, KeyError, TypeError):
+            return False
+        plain = {key: json.loads(json.dumps(plain_content(x))) for key, x in same.items()}
+        alike = all(content.get(key) == value for key, value in plain.items())
+        return alike and hashes == [sha256_of(source) for source in sources]
+
+    numbered = (wanted.with_name(f"{wanted.name}-{number}") for number in count(2))
+    return next(folder for folder in chain([wanted], numbered) if is_free(folder / name))
 
 
 def load_result(path: str | Path) -> StoredResult:
@@ -327,9 +314,9 @@ def load_result(path: str | Path) -> StoredResult:
     """
     path = Path(path)
     if path.is_dir():
-        inside = path / "result.json"
-        beside = path.parent / "result.json"
-        path = beside if path.name == "tuned" and not inside.exists() else inside
+        result = path / "result.json"
+        of_gains = path.name == "tuned" and not result.exists()
+        path = path.parent / "result.json" if of_gains else result
     try:
         content = json.loads(path.read_text())
     except FileNotFoundError as error:

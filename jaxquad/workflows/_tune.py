@@ -1,7 +1,6 @@
 """Tune a controller on an identified axis: from a result and settings to certified gains."""
 
 import dataclasses
-from collections.abc import Mapping
 from pathlib import Path
 
 import jax
@@ -14,7 +13,7 @@ from jaxquad.export import write_c_header
 from jaxquad.identify import UndeterminedError
 from jaxquad.loops import Loop
 from jaxquad.report import provenance, write_json
-from jaxquad.simulation import Pulse, Saturation, Scenario, scenario, Simulation, Step
+from jaxquad.simulation import Pulse, Saturation, Scenario, scenario, Step
 from jaxquad.tuning import (
     describe_controller,
     KNOWN_INERTIA,
@@ -65,12 +64,12 @@ class Tuning:
         certificate = tuned.certificate
         content = {
             "holds": tuned.holds,
-            "verdicts": [each._asdict() for each in tuned.verdicts],
+            "verdicts": [verdict._asdict() for verdict in tuned.verdicts],
             "values": tuned.values,
             "controller": describe_controller(tuned.controller) | {"dt": self.loop.dt},
             "cost": tuned.cost,
             "converged": tuned.converged,
-            "bounds": [each._asdict() for each in tuned.bounds],
+            "bounds": [bound._asdict() for bound in tuned.bounds],
             "stabilised": tuned.stabilised,
             "evaluations": tuned.evaluations,
             "seconds": tuned.seconds,
@@ -84,43 +83,38 @@ class Tuning:
     def write(self, folder: str | Path) -> list[Path]:
         """Write `tuned.json`, a C header, `report.html` and the figures; returns their paths."""
         announce("figures and report")
-        folder, found, tuned = Path(folder), self.identification, self.tuned
+        folder, axis, tuned = Path(folder), self.identification, self.tuned
         name = self.settings.name
-        known = {k: v for k, v in self.settings.content().items() if v is not None}
-        origin = provenance(*found.paths, settings=known)
+        settings = {k: v for k, v in self.settings.content().items() if v is not None}
+        origin = provenance(*axis.paths, settings=settings)
         write_json(folder / "tuned.json", self.content() | {"provenance": origin.content()})
         write_c_header(folder / f"{name}.h", tuned.controller, name=name, axes=1)
         flights = worst_flights(tuned, self.loop, self.ensemble, self.flight)
-        from jaxquad.report import write_report  # here: with it comes matplotlib
+        from jaxquad.plot import certificate_figure, convergence_figure, flight, headless
+        from jaxquad.report import write_report  # here: with them comes matplotlib
 
         write_report(
             folder / "report.html",
-            fit=found.fit,
-            frf=found.frf,
-            record=found.records[0],
+            fit=axis.fit,
+            frf=axis.frf,
+            record=axis.records[0],
             tuned=tuned,
             flights=flights,
             provenance=origin,
-            formula=found.formula,
+            formula=axis.formula,
         )
-        drawn = _write_figures(folder, tuned, flights)
-        return [folder / "tuned.json", folder / f"{name}.h", folder / "report.html", *drawn]
+        with headless():
+            figures = {"convergence.png": convergence_figure(tuned.history)}
+            if tuned.certificate is not None:
+                figures["certificate.png"] = certificate_figure(tuned.certificate)
+            figures["flight.png"] = flight(flights)
+        for file, panels in figures.items():
+            panels.figure.savefig(folder / file, dpi=130)
+        files = ("tuned.json", f"{name}.h", "report.html", *figures)
+        return [folder / file for file in files]
 
     def __str__(self) -> str:
         return str(self.tuned)
-
-
-def _write_figures(folder: Path, tuned: Tuned, flights: Mapping[str, Simulation]) -> list[Path]:
-    from jaxquad.plot import certificate_figure, convergence_figure, flight, headless  # matplotlib
-
-    with headless():
-        figures = {"convergence.png": convergence_figure(tuned.history)}
-        if tuned.certificate is not None:
-            figures["certificate.png"] = certificate_figure(tuned.certificate)
-        figures["flight.png"] = flight(flights)
-    for file, panels in figures.items():
-        panels.figure.savefig(folder / file, dpi=130)
-    return [folder / file for file in figures]
 
 
 def tune(
@@ -149,41 +143,38 @@ def tune(
     **Raises:** ValueError for an output whose unit is neither rad nor rad/s, and for a negative
     gain; `UndeterminedError` (a ValueError) where the record does not determine the plant.
     """
-    found = result
-    if not isinstance(found, Identification):
-        stored = found if isinstance(found, StoredResult) else load_result(found)
+    axis = result
+    if not isinstance(axis, Identification):
+        stored = axis if isinstance(axis, StoredResult) else load_result(axis)
         stored.require_radians()
-        found = identify_fit(open_again(stored, log=log))
-    if found.filters:
+        axis = identify_fit(open_again(stored, log=log))
+    if axis.filters:
         raise ValueError(
             "the model is up to what the gyro's filters were given, and a loop is closed behind "
             "them: identify with keep_gyro_filters=True"
         )
-    if not found.fit.verdict.fitted:
-        raise UndeterminedError(found.fit.verdict.summary)
-    record = found.records[0]
+    if not axis.fit.verdict.fitted:
+        raise UndeterminedError(axis.fit.verdict.summary)
+    record = axis.records[0]
     require_radians(record.output_names[0], record.output_units[0])
     dt = record.dt if settings.dt is None else settings.dt
-    return _tuned(found, dt, settings, progress)
-
-
-def _tuned(
-    found: Identification, dt: float, settings: TuneSettings, progress: bool | None
-) -> Tuning:
-    record = found.records[0]
-    recorded_dt = record.dt if record.hold is None else "as fitted"  # commands are held
     posterior = Posterior(
-        found.fit, recorded_dt=recorded_dt, believed=settings.inertia, band=found.band,
-        largest_command=found.largest_command,
+        axis.fit, recorded_dt=record.dt if record.hold is None else "as fitted",  # held commands
+        believed=settings.inertia, band=axis.band, largest_command=axis.largest_command,
     )  # fmt: skip
-    plant, ensemble = posterior.plant, _ensemble(posterior, settings)
+    ensemble = Ensemble(
+        posterior,
+        inertia=LogUniform(*settings.spread),
+        assumed_inertia=Normal(settings.inertia_error) if settings.inertia_error else 1.0,
+        noise=np.radians(settings.noise),
+    )
+    plant = posterior.plant
     gain = float(np.asarray(plant.torque_gain)[0])
     if gain <= 0:
         raise ValueError(
             f"the gain is negative (KT = {gain:.4g}): identify with the sign of the input reversed "
             "(--input NAME=-CHANNEL)"
         )
-    held = settings.wo is not None
     wo = _START[1] if settings.wo is None else settings.wo
     wc = min(_START[0], wo / 3)
     start = LADRC(wc, wo, gain / settings.inertia, limit=settings.limit, dt=dt)
@@ -193,57 +184,39 @@ def _tuned(
         delay=posterior.delay,
     )  # fmt: skip
     announce(f"tuning on {settings.members} plants, then certifying on {settings.fresh}")
-    flown = _flight(gain, dt, settings)
+    flight, objective = _flight(gain, dt, settings)
     tuned = tune_controller(
         loop,
         ensemble,
-        flown,
-        objective=_objective(settings),
+        flight,
+        objective=objective,
         limits=(Limit("sensitivity_peak", at_most=settings.sensitivity),),
-        free=["ladrc.wc", "map.values"] if held else None,
+        free=None if settings.wo is None else ["ladrc.wc", "map.values"],
         members=settings.members,
         fresh=settings.fresh,
         peers={KNOWN_INERTIA: peers(plant, dt=dt)[KNOWN_INERTIA]},
         key=jax.random.key(settings.seed),
         progress=progress,
     )
-    return Tuning(found, settings, tuned, loop, ensemble, flown)
+    return Tuning(axis, settings, tuned, loop, ensemble, flight)
 
 
-def _ensemble(posterior: Posterior, settings: TuneSettings) -> Ensemble:
-    return Ensemble(
-        posterior,
-        inertia=LogUniform(*settings.spread),
-        assumed_inertia=Normal(settings.inertia_error) if settings.inertia_error else 1.0,
-        noise=np.radians(settings.noise),
-    )
-
-
-def _objective(settings: TuneSettings) -> Objective:
-    """That of docs/tuning.md, whose knee of 20 V^2/s belongs to a limit of 10 V."""
-    penalties = (
-        Penalty("activity_rate", knee=_ACTIVITY * settings.limit**2, weight=2.0),
-        Penalty("sensitivity_peak", knee=2.0, weight=3.0),
-        Penalty("abscissa", knee=-0.5, weight=5.0),
-    )
-    events = _events(settings)
-    return Objective(penalties=penalties, events=events, load_start=events[1])
-
-
-def _events(settings: TuneSettings) -> tuple[float, float, float]:
-    return 0.0, _PULSE * settings.duration, _BACK * settings.duration
-
-
-def _flight(gain: float, dt: float, settings: TuneSettings) -> Scenario:
-    _, pulse, back = _events(settings)
-    torque = settings.disturbance
-    if torque is None:
-        torque = 0.1 * gain * settings.limit
-    angle = np.radians(settings.step)
-    return scenario(
+def _flight(gain: float, dt: float, settings: TuneSettings) -> tuple[Scenario, Objective]:
+    """A step, a torque pulse and a step back, and what they cost."""
+    pulse, back = _PULSE * settings.duration, _BACK * settings.duration
+    angle, torque = np.radians(settings.step), settings.disturbance
+    torque = 0.1 * gain * settings.limit if torque is None else torque
+    flight = scenario(
         duration=settings.duration,
         dt=dt,
         axes=1,
         reference=Step(angle) + Step(-angle, at=back),
         disturbance=Pulse(torque, width=_WIDTH * settings.duration, at=pulse),
     )
+    # That of docs/tuning.md, whose knee of 20 V^2/s belongs to a limit of 10 V.
+    penalties = (
+        Penalty("activity_rate", knee=_ACTIVITY * settings.limit**2, weight=2.0),
+        Penalty("sensitivity_peak", knee=2.0, weight=3.0),
+        Penalty("abscissa", knee=-0.5, weight=5.0),
+    )
+    return flight, Objective(penalties=penalties, events=(0.0, pulse, back), load_start=pulse)

@@ -19,8 +19,6 @@ from jaxquad._xla import (
     _trial,
     scan_on_device,
 )
-from jaxquad._xla._loop import held_bytes, Segments, segments_of
-from jaxquad._xla._nvrtc import CannotCompile
 from jaxquad.models import sincos
 
 
@@ -113,28 +111,29 @@ def test_values_and_gradients_are_those_of_the_plain_scan(memory, monkeypatch):
 
 def test_carries_are_kept_as_often_as_a_part_of_the_memory_allows(monkeypatch):
     count, carry, members, block = 5000, 140, 100_000, 128
-    assert segments_of(count, carry, members, block) == Segments(count, 71, False)  # no GPU
+    segments = _loop.segments_of
+    assert segments(count, carry, members, block) == _loop.Segments(count, 71, False)  # no GPU
     for room, expected in (
-        (400e9, Segments(count, 2, True)),
-        (160e9, Segments(count, 3, True)),
-        (80e9, Segments(count, 6, True)),
-        (70e9, Segments(count, 71, False)),  # 7 carries of a block take more than 113 kB
+        (400e9, _loop.Segments(count, 2, True)),
+        (160e9, _loop.Segments(count, 3, True)),
+        (80e9, _loop.Segments(count, 6, True)),
+        (70e9, _loop.Segments(count, 71, False)),  # 7 carries of a block take more than 113 kB
     ):
         monkeypatch.setattr(_loop, "_memory", lambda room=room: (int(room), 228 * 1024))
-        assert segments_of(count, carry, members, block) == expected
+        assert segments(count, carry, members, block) == expected
     monkeypatch.setattr(_loop, "_memory", lambda: (10**12, 64 * 1024))
-    assert not segments_of(count, carry, members, block).are_shared  # not even two of them fit
-    assert segments_of(count, 40, members, block) == Segments(count, 2, True)
+    assert not segments(count, carry, members, block).are_shared  # not even two of them fit
+    assert _loop.segments_of(count, 40, members, block) == _loop.Segments(count, 2, True)
 
 
 def test_what_registers_have_no_room_for_is_held_in_shared_memory(monkeypatch):
-    assert held_bytes(944, 664, 128) == 0  # no GPU
+    assert _loop.held_bytes(944, 664, 128) == 0  # no GPU
     monkeypatch.setattr(_loop, "_memory", lambda: (10**12, 228 * 1024))
-    assert held_bytes(944, 664, 128) == 664 and held_bytes(472, 0, 128) == 0
-    assert held_bytes(680, 500, 128) == 0 and held_bytes(684, 500, 128) == 500
-    assert held_bytes(4000, 2000, 128) == 0  # more than a block has
-    assert segments_of(5000, 40, 1000, 128, 664) == Segments(5000, 2, True, 664)
-    assert segments_of(5000, 280, 1000, 128, 664) == Segments(5000, 71, False, 664)
+    assert _loop.held_bytes(944, 664, 128) == 664 and _loop.held_bytes(472, 0, 128) == 0
+    assert _loop.held_bytes(680, 500, 128) == 0 and _loop.held_bytes(684, 500, 128) == 500
+    assert _loop.held_bytes(4000, 2000, 128) == 0  # more than a block has
+    assert _loop.segments_of(5000, 40, 1000, 128, 664) == _loop.Segments(5000, 2, True, 664)
+    assert _loop.segments_of(5000, 280, 1000, 128, 664) == _loop.Segments(5000, 71, False, 664)
 
 
 def written(function, *args):
@@ -352,7 +351,7 @@ def test_a_step_of_too_many_arrays_is_left_to_the_plain_scan_and_said():
 
 def test_what_nvrtc_does_not_compile_runs_as_a_plain_scan_with_a_warning(monkeypatch):
     def fails(*_):
-        raise CannotCompile("line 7: error")
+        raise _nvrtc.CannotCompile("line 7: error")
 
     monkeypatch.setattr(_kernel_memory, "launch", fails)
     x = jnp.asarray(0.7)
@@ -363,7 +362,7 @@ def test_what_nvrtc_does_not_compile_runs_as_a_plain_scan_with_a_warning(monkeyp
 
 def test_without_nvrtc_it_is_said_what_brings_it(monkeypatch):
     monkeypatch.setattr(_nvrtc, "_places", lambda: iter(["no such library"]))
-    with pytest.raises(CannotCompile, match="pip install"):
+    with pytest.raises(_nvrtc.CannotCompile, match="pip install"):
         _nvrtc._library.__wrapped__()
 
 

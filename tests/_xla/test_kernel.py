@@ -227,8 +227,6 @@ with warnings.catch_warnings(record=True) as said:
 assert not told.one_kernel and 'lacks what kernels are made with' in told.why_not
 assert told.why_not in str(said[-1].message)
 x = jax.numpy.ones(3)
-from jaxquad._compile._door import compilers
-assert compilers() is _plain
 assert jax.numpy.allclose(_plain.as_one_kernel(jax.numpy.sin, x), jax.numpy.sin(1.0))
 print("plain")
 """

@@ -7,7 +7,7 @@ import pytest
 from scipy.linalg import expm
 
 from jaxquad.autopilot import ArduPilotRate, FilterChain, firmware_named
-from jaxquad.autopilot._rate_gains import (
+from jaxquad.autopilot._rate_loops import (
     cells_of,
     delay_margin,
     gains_of,

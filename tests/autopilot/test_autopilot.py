@@ -13,8 +13,7 @@ from px4_flights import GYRO_HZ as SAMPLED_HZ, Vehicle, write_log
 from scipy import signal
 
 from jaxquad._core import Message
-from jaxquad.autopilot import betaflight_loop, px4_loop
-from jaxquad.autopilot._proposal import AutopilotProposal
+from jaxquad.autopilot import AutopilotProposal, betaflight_loop, px4_loop
 from jaxquad.cli import main
 from jaxquad.workflows import AutopilotSettings, SettingsError
 

@@ -21,7 +21,6 @@ from jaxquad.autopilot import (
     FilterChain,
     find_inexpressible,
     find_parameter,
-    Firmware,
     ladrc_as_pid,
     list_parameters,
     motor_share,
@@ -40,7 +39,7 @@ from jaxquad.control import LADRC, PID
 
 
 # Differential thrust per motor and rad/s of the defaults, with Ki/Kp in 1/s and Kd/Kp in ms.
-DEFAULTS: dict[Firmware, tuple[float, ...]] = {
+DEFAULTS: dict[str, tuple[float, ...]] = {
     "px4": (0.1061, 0.1414, 0.00212, 1.33, 20.0),
     "ardupilot": (0.0675, 0.0675, 0.00180, 1.00, 26.7),
     "betaflight": (0.0826, 1.1202, 0.00091, 13.56, 11.0),
@@ -105,7 +104,7 @@ def test_a_cascade_is_the_angle_pid_and_back():
     cascade = Cascade(a, p, np.minimum(i, 0.9 * p * a))  # the larger root is the angle's gain
     kp, ki, kd = pid_of(jax.tree.map(jnp.asarray, cascade))
     np.testing.assert_allclose(cascade_of(kp, ki, kd), cascade, rtol=1e-9)
-    outers: dict[Firmware, str] = {"px4": "MC_ROLL_P", "ardupilot": "ATC_ANG_RLL_P"}
+    outers: dict[str, str] = {"px4": "MC_ROLL_P", "ardupilot": "ATC_ANG_RLL_P"}
     for firmware, outer in outers.items():
         found = cascade_parameters(firmware, "roll", PID(5.5, 1.0, 0.5), torque_per_unit=2.0)
         rate = rate_gains(firmware, "roll", found, torque_per_unit=2.0)

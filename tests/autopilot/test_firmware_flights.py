@@ -8,11 +8,20 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from jaxquad.autopilot import AxesProposal
-from jaxquad.autopilot._law_check import check_law
+from jaxquad.autopilot import (
+    AxesProposal,
+    check_law,
+    read_channels_if_any,
+    read_flown,
+    settings_of,
+)
 from jaxquad.cli import main
-from jaxquad.workflows import _autopilot as workflow, autopilot, AutopilotSettings
-from jaxquad.workflows._autopilot import _read_axis
+from jaxquad.workflows import (
+    _autopilot as workflow,
+    autopilot,
+    IdentifySettings,
+    propose_settings,
+)
 
 
 BETAFLIGHT, ARDUPILOT = "betaflight_firmware", "ardupilot_firmware"
@@ -28,12 +37,18 @@ SOME = {"A_sticks.BFL", "mixer_chirp_roll.BIN"}
 LEFT = {"P": 0.01, "I": 0.03, "D": 0.01, "output": 0.01}  # beyond what rounding of the log explains
 
 
+def flown_of(path, axis):
+    """The loop that flew and the channels of its law."""
+    asked, proposal = propose_settings(path, IdentifySettings(axis=axis))
+    assert proposal is not None
+    flight = read_channels_if_any(path, proposal, asked, settings_of(path, proposal).values)
+    assert flight is not None
+    return read_flown(path, proposal, flight.middle, flight.tracked_hz), flight
+
+
 def law_of(path, axis, **changed):
     """The law of a log replayed, with other gains where `changed` has some."""
-    settings = AutopilotSettings(axis=axis)
-    axis = _read_axis(path, settings)
-    flown, flight = axis.flown, axis.flight
-    assert flight is not None
+    flown, flight = flown_of(path, axis)
     loop = flown.loop
     if changed:
         loop = dataclasses.replace(loop, law=dataclasses.replace(loop.law, **changed))
@@ -68,11 +83,7 @@ def test_another_law_is_named_by_its_term(data, changed, wrong):
 
 @pytest.mark.slow
 def test_a_set_point_that_acts_a_loop_later_is_found_and_said(data):
-    path = data / ARDUPILOT / "rate_chirp_pitch.BIN"
-    settings = AutopilotSettings(axis="pitch")
-    axis = _read_axis(path, settings)
-    flown, flight = axis.flown, axis.flight
-    assert flight is not None
+    flown, flight = flown_of(data / ARDUPILOT / "rate_chirp_pitch.BIN", "pitch")
     check = check_law(flown.loop, flown.axis, dataclasses.replace(flight, late=0.0))
     assert check.flew and check.shifted and check.late == pytest.approx(1 / 400)
     assert "+2.5 ms after its stamp" in check.text

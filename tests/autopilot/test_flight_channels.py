@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from flight_logs import ardupilot
 
-from jaxquad.autopilot._flight_channels import read_channels
+from jaxquad.autopilot import read_channels_if_any
 from jaxquad.records import propose, read_settings
 from jaxquad.workflows import IdentifySettings
 
@@ -30,7 +30,8 @@ from jaxquad.workflows import IdentifySettings
 def test_ardupilots_unfiltered_gyro_is_that_which_flew(tmp_path, gyros, core, parameters, used):
     path = ardupilot(tmp_path, 10, gyros=gyros, core=core, settings=parameters)
     settings = IdentifySettings(start=22, stop=30)
-    flight = read_channels(path, propose(path), settings, read_settings(path).values)
+    flight = read_channels_if_any(path, propose(path), settings, read_settings(path).values)
+    assert flight is not None
     if used is None:
         assert flight.unfiltered == () and flight.names == ("RATE.R", "")
         return

@@ -10,25 +10,37 @@ from scipy.signal import lfilter
 from sweep_logs import write_sweep
 
 from jaxquad._core import Message
-from jaxquad.autopilot import Butterworth, FilterChain, loop_of_law, Notch, PT1
-from jaxquad.autopilot._flight_channels import FlightChannels
-from jaxquad.autopilot._flown_law import best_filters, FlownLaw, StoredFilters
+from jaxquad.autopilot import (
+    best_filters,
+    Butterworth,
+    FilterChain,
+    FlightChannels,
+    FlownLaw,
+    loop_of_law,
+    Notch,
+    PT1,
+    StoredFilters,
+)
 from jaxquad.cli import main
 from jaxquad.workflows import (
     identify,
     identify_again,
     IdentifySettings,
     load_result,
-    open_logs,
     tune,
     TuneSettings,
     verify_result,
 )
-from jaxquad.workflows._identify import identify_fit
 
 
 CHAIN = FilterChain((Butterworth(20.0), PT1(60.0)), 400.0)
 AT = np.array([0.5, 3.0, 20.0, 150.0])
+
+
+def law_of(found):
+    """The flown loop of an identification."""
+    [unit] = found.records[0].output_units
+    return loop_of_law(found.flown, found.fit, found.frf, found.filters, unit)
 
 
 @pytest.fixture
@@ -66,7 +78,7 @@ def test_ardupilots_filters_are_divided_out_and_the_result_stays_one(log, tmp_pa
     assert low < 25067 < high and high - low < 0.03 * 25067
     assert found.fit.interval("lag")[0] < 0.030 < found.fit.interval("lag")[1] + 1e-4
     assert found.fit["delay"] < 5e-4
-    loop = loop_of_law(found)
+    loop = law_of(found)
     assert loop is not None and loop.model is not None and loop.step is not None
     assert np.max(1 / np.abs(1 + loop.model.response)) == pytest.approx(1.80, abs=0.03)
     assert loop.measured.crossover == pytest.approx(loop.model.crossover, rel=0.02)
@@ -99,7 +111,7 @@ def test_ardupilots_filters_are_divided_out_and_the_result_stays_one(log, tmp_pa
 def test_betaflights_page_has_a_step_and_the_margins_of_its_law(log, tmp_path, name):
     """Sticks and chirp of one vehicle and one set of gains: the same loop, whatever F adds."""
     found = identify(log(name), IdentifySettings(axis="roll"))
-    loop = loop_of_law(found)
+    loop = law_of(found)
     assert loop is not None and loop.model is not None
     margin, error = loop.measured.phase_margin
     assert loop.measured.crossover == pytest.approx(40.0, rel=0.03)
@@ -117,9 +129,7 @@ def test_betaflights_page_has_a_step_and_the_margins_of_its_law(log, tmp_path, n
 def test_a_loop_of_ones_own_is_tuned_behind_the_filters(tmp_path):
     path = write_sweep(tmp_path / "sweep.csv")
     asked = IdentifySettings(input="M=right-left", output="q", units={"q": "rad/s"}, band=(0.5, 6))
-    opened = open_logs(path, asked)
-    assert identify_fit(opened).settings.keep_gyro_filters
-    found = dataclasses.replace(identify_fit(opened), settings=opened.settings)
+    found = identify(path, asked)
     ahead = dataclasses.replace(found, flown=FlownLaw((CHAIN,), "as the parameters say"))
     assert ahead.filters and not found.filters
     with pytest.raises(ValueError, match="keep_gyro_filters=True"):

@@ -102,13 +102,11 @@ class Kestrel(Firmware):
 
 
 @pytest.fixture
-def kestrel():
+def kestrel(monkeypatch):
+    """Known for the time of a test."""
+    for registry in ("autopilot._firmware._FIRMWARES", "records._firmwares._OFFERED"):
+        monkeypatch.setattr(f"jaxquad.{registry}", {})
     jq.autopilot.register(Kestrel())
-    yield
-    from jaxquad.autopilot._firmware import _FIRMWARES
-    from jaxquad.records._firmwares import _OFFERED
-
-    del _FIRMWARES["kestrel"], _OFFERED["kestrel"]
 
 
 @pytest.fixture

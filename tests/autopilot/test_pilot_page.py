@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from html_pages import HOSTILE, Page, UNSEEN
 
-from jaxquad.autopilot import _page, _page_sections, FilterChain, PilotPage, PT1, write_pilot_page
+import jaxquad.plot
+from jaxquad.autopilot import _page, FilterChain, PilotPage, PT1, write_pilot_page
 from jaxquad.plot import FlownAgain, Spectrum, StepBand
 from jaxquad.report import Headline, provenance, Table
 
@@ -82,11 +83,11 @@ def test_the_page_of_several_axes_has_each_of_them_behind_its_verdict(tmp_path):
     assert all(f"{x} again" in shown.text("section") for x in "ab")
 
 
-@pytest.mark.parametrize("name", sorted(_page_sections.SECTIONS))
+@pytest.mark.parametrize("name", sorted(_page.SECTIONS))
 def test_a_section_that_raises_says_why_and_costs_no_other(tmp_path, monkeypatch, name):
-    stubs = dict.fromkeys(_page_sections.SECTIONS, lambda _: {"failed": "left out here"})
+    stubs = dict.fromkeys(_page.SECTIONS, lambda _: {"failed": "left out here"})
     stubs[name] = lambda _: {}["rate"]
-    monkeypatch.setattr(_page_sections, "SECTIONS", stubs)
+    monkeypatch.setattr(_page, "SECTIONS", stubs)
     text = write_pilot_page(tmp_path / "page.html", page("roll")).read_text(encoding="utf-8")
     shown = Page(text)
     assert not shown.errors and "p_roll" in shown.text("section")
@@ -95,7 +96,7 @@ def test_a_section_that_raises_says_why_and_costs_no_other(tmp_path, monkeypatch
 
 
 def test_provenance_and_figures_may_fail_too(tmp_path, monkeypatch):
-    monkeypatch.setattr(_page_sections, "steps_figure", lambda *_: 1 / 0)
+    monkeypatch.setattr(jaxquad.plot, "steps_figure", lambda *_: 1 / 0)
     monkeypatch.setattr(_page, "provenance_section", lambda _: 1 / 0)
     whole = dataclasses.replace(page("roll"), provenance=provenance())
     text = write_pilot_page(tmp_path / "page.html", whole).read_text(encoding="utf-8")

@@ -13,10 +13,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from airframe import Airframe
+from descent import OneSolve
 from scipy.optimize import least_squares
 
-from jaxquad.identify import select_parameters
-from jaxquad.identify.batch._fit_batch import solve_batch
+import jaxquad as jq
 
 
 jax.config.update("jax_enable_x64", True)
@@ -43,6 +43,23 @@ def case():
     return truth, exact * (1 + error * (white[0] + 1j * white[1])), error
 
 
+def frf_of(measured, error):
+    response, one = jnp.asarray(measured)[:, None, None], jnp.ones((OMEGA.size, 1, 1))
+    errors = 2 * jnp.asarray(error)[:, None, None] ** 2 * jnp.abs(response) ** 2
+    return jq.spectra.FrequencyResponse(
+        omega=jnp.asarray(OMEGA),
+        response=response,
+        coherence=0.95 * one,
+        random_error=jnp.asarray(error)[:, None, None],
+        errors=jq.spectra.independent_errors(jnp.asarray(OMEGA), errors),
+        direct_coherence=0.95 * one,
+        multiple_coherence=0.95 * one[:, 0],
+        method="joint",
+        input_names=("u",),
+        output_names=("y",),
+    )
+
+
 def _good(values, truth):
     return np.mean(np.max(np.abs(values / truth - 1), axis=1) < 0.25)
 
@@ -51,10 +68,8 @@ def _good(values, truth):
 def test_ours(benchmark, case):
     truth, measured, error = case
     model = Airframe(*(jnp.asarray(value) for value in START))
-    parameters = select_parameters(model, None)
-    weights = jnp.asarray(np.stack([1 / error] * 2, axis=-1))[:, :, None, None]
-    data = (jnp.asarray(OMEGA), jnp.asarray(measured)[..., None, None], weights)
-    found = benchmark(lambda: jax.block_until_ready(solve_batch(model, parameters, *data)))
+    frfs = [frf_of(*each) for each in zip(measured, error, strict=True)]
+    found = benchmark(lambda: jq.identify.fit_batch(model, frfs, cost=OneSolve()))
     benchmark.extra_info["steps"] = float(np.mean(found.steps))
     assert np.all(found.converged)
     assert _good(np.asarray(found.values), truth) > 0.99

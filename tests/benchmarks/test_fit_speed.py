@@ -4,22 +4,18 @@
 
 Both start from the same values on the same response, fit logarithms of five parameters (gain,
 lag, damping, natural frequency, delay) under the same weights, and must agree. Ours also gives
-covariance, identifiability and remarks; `solve` is the minimisation alone, as scipy's call is.
+covariance, identifiability and remarks; `descend` is the minimisation alone, as scipy's call is.
 """
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from airframe import Airframe
+from descent import descend, OneSolve, problem_of
 from scipy.optimize import least_squares
 
 import jaxquad as jq
-from jaxquad.identify import select_parameters
-from jaxquad.identify.frequency_domain._cost import points_of, usable
-from jaxquad.identify.frequency_domain._problem import make_problem
-from jaxquad.identify.frequency_domain._solve import solve
 
 
 jax.config.update("jax_enable_x64", True)
@@ -75,13 +71,6 @@ def _model():
     return Airframe(*(jnp.asarray(value) for value in START))
 
 
-class _OneSolve(eqx.Module):
-    """Maximum likelihood without the second solve under the model's own weights."""
-
-    def weights(self, points, ratio):
-        return jq.identify.MaximumLikelihood().weights(points, np.ones_like(ratio))
-
-
 @pytest.mark.benchmark(group="fit")
 def test_scipy_least_squares(benchmark, frf):
     benchmark(_peer, frf)
@@ -89,16 +78,12 @@ def test_scipy_least_squares(benchmark, frf):
 
 @pytest.mark.benchmark(group="fit")
 def test_solve(benchmark, frf):
-    parameters = select_parameters(_model(), None)
-    cost = _OneSolve()
-    problem = make_problem(_model(), parameters, [frf])
-    points = points_of([frf], [usable(frf, None, 0.6)])[0]
-    problem = problem.weighted([cost.weights(points, np.ones(points.used.shape))])
-    found = benchmark(lambda: solve(problem, np.asarray(parameters.start[:5]), None, 256).z)
+    problem = problem_of(_model(), None, frf, ERROR)
+    found = benchmark(lambda: descend(problem))
     np.testing.assert_allclose(np.exp(found), _peer(frf), rtol=1e-5)
 
 
 @pytest.mark.benchmark(group="fit")
 def test_fit_with_all_its_doubts(benchmark, frf):
-    fit = benchmark(lambda: jq.fit(_model(), frf, cost=_OneSolve()))
+    fit = benchmark(lambda: jq.fit(_model(), frf, cost=OneSolve()))
     np.testing.assert_allclose(fit.values, _peer(frf), rtol=1e-5)

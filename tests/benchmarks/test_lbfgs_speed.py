@@ -14,13 +14,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
-from tuning_case import ensemble, EVENTS, flight, loop, objective, STARTS
+from tuning_case import coordinates_of, cost_at, ensemble, loop, minimise, pose, STARTS
 
 from jaxquad.tuning import LBFGS
-from jaxquad.tuning._cost import evaluate_cost, initial_multipliers, stack_copies, Subproblem
-from jaxquad.tuning._lbfgs import minimise
-from jaxquad.tuning._parameters import select_coordinates
-from jaxquad.tuning._problem import make_problem, TimeSpan
 
 
 jax.config.update("jax_enable_x64", True)
@@ -31,24 +27,17 @@ KEY, START = jax.random.key(0), STARTS["slow"]
 
 def case():
     members = ensemble().draw(loop(), MEMBERS, KEY)
-    problem = make_problem(START, members, flight(), span=TimeSpan(EVENTS))
-    coordinates = select_coordinates(START)
+    coordinates = coordinates_of(START)
     scatter = np.random.default_rng(0).normal(size=(PROBLEMS, coordinates.start.size))
-    return problem, coordinates, coordinates.start + SCATTER * scatter
+    return members, coordinates, coordinates.start + SCATTER * scatter
 
 
-def subproblem(problem, count):
-    stacked = stack_copies(objective(), count)
-    given = initial_multipliers(problem, (), count)
-    return Subproblem(stacked, (), given, jnp.ones(count, bool), jnp.full(count, -0.75))
-
-
-def own(problem, coordinates, start):
+def own(members, coordinates, start):
     """Costs at the ends, and evaluations of each start."""
-    stacked = subproblem(problem, len(start))
+    posed = pose(START, members, copies=len(start))
 
     def evaluate(z, on):
-        found = evaluate_cost(jnp.asarray(z), jnp.asarray(on), coordinates, problem, stacked)
+        found = cost_at(z, coordinates, posed, on)
         return np.asarray(found.value), np.asarray(found.gradient)
 
     found = minimise(evaluate, start, LBFGS())
@@ -68,7 +57,7 @@ def _cost_jvp(primals, tangents):
 
 
 def value_and_gradient(z, given):
-    found = evaluate_cost(z[None], jnp.ones(1, bool), *given)
+    found = cost_at(z[None], *given)
     return found.value[0], found.gradient[0]
 
 
@@ -83,22 +72,22 @@ def batched(start, given):
     return jax.vmap(one)(start)
 
 
-def optimistix(problem, coordinates, start):
+def optimistix(members, coordinates, start):
     with jax.numpy_dtype_promotion("standard"):
-        given = (coordinates, problem, subproblem(problem, 1))
+        given = (coordinates, pose(START, members))
         value, steps = batched(jnp.asarray(start), given)
     return np.asarray(value), np.asarray(steps)
 
 
 def test_the_tuners_lbfgs_beside_optimistix():
-    problem, coordinates, start = case()
+    members, coordinates, start = case()
     lines, best = [], np.inf
     for run in (own, optimistix):
         began = time.process_time()
-        run(problem, coordinates, start)
+        run(members, coordinates, start)
         first = time.process_time() - began
         began = time.process_time()
-        value, count = run(problem, coordinates, start)
+        value, count = run(members, coordinates, start)
         seconds = time.process_time() - began
         best = min(best, float(np.min(value)))
         lines.append((run.__name__, value, count, seconds, first))

@@ -8,19 +8,14 @@ Timed is the descent alone, which is all that scipy's call does: what a fit need
 slopes by all parameters, free or fixed, comes once per fit.
 """
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from descent import descend, OneSolve, problem_of
 from scipy.optimize import least_squares
 
 import jaxquad as jq
-from jaxquad.identify import select_parameters
-from jaxquad.identify.batch._fit_batch import solve_batch
-from jaxquad.identify.frequency_domain._cost import points_of, usable
-from jaxquad.identify.frequency_domain._problem import make_problem
-from jaxquad.identify.frequency_domain._solve import solve
 from jaxquad.models import simulate_linear, StateSpace
 
 
@@ -89,17 +84,12 @@ def model(values):
     return StateSpace(F=f, G=g, H0=H0, input_delay=late)
 
 
-class _OneSolve(eqx.Module):
-    def weights(self, points, ratio):
-        return jq.identify.MaximumLikelihood().weights(points, np.ones_like(ratio))
-
-
-def problem():
-    shape = MEASURED.shape
-    omega, variance = jnp.asarray(OMEGA), 2 * ERROR**2 * np.abs(MEASURED) ** 2
-    frf = jq.spectra.FrequencyResponse(
+def frf_of(measured):
+    shape = measured.shape
+    omega, variance = jnp.asarray(OMEGA), 2 * ERROR**2 * np.abs(measured) ** 2
+    return jq.spectra.FrequencyResponse(
         omega=omega,
-        response=jnp.asarray(MEASURED),
+        response=jnp.asarray(measured),
         coherence=jnp.full(shape, 0.95),
         random_error=jnp.full(shape, ERROR),
         errors=jq.spectra.independent_errors(omega, jnp.asarray(variance)),
@@ -109,10 +99,6 @@ def problem():
         input_names=("lon", "lat", "col"),
         output_names=("u", "v", "p", "q", "w", "r"),
     )
-    parameters = select_parameters(model(START), NAMES)
-    cost, points = _OneSolve(), points_of([frf], [usable(frf, None, 0.6)])[0]
-    made = make_problem(model(START), parameters, [frf])
-    return made.weighted([cost.weights(points, np.ones(points.used.shape))])
 
 
 @pytest.mark.benchmark(group="state-space fit")
@@ -122,9 +108,8 @@ def test_scipy_least_squares(benchmark):
 
 @pytest.mark.benchmark(group="state-space fit")
 def test_solve(benchmark):
-    made = problem()
-    z = np.asarray(made.parameters.start[: TRUTH.size])
-    found = benchmark(lambda: solve(made, z, None, 256).z)
+    made = problem_of(model(START), NAMES, frf_of(MEASURED), ERROR)
+    found = benchmark(lambda: descend(made))
     values = np.asarray(made.parameters.values(found))
     np.testing.assert_allclose(values, peer(), rtol=1e-4, atol=1e-6)
 
@@ -143,9 +128,9 @@ def test_batch_of_200(benchmark):
     truth = numpy_response(TRUTH)
     noise = rng.standard_normal((2, FITS, *truth.shape))
     responses = truth * (1 + ERROR * (noise[0] + 1j * noise[1]))
-    responses[0], made = MEASURED, problem()
-    data = OMEGA, responses, np.full((*responses.shape, 2), 1 / ERROR)
-    found = benchmark(lambda: solve_batch(model(START), made.parameters, *data))
+    responses[0] = MEASURED
+    frfs, options = [frf_of(each) for each in responses], {"free": NAMES, "cost": OneSolve()}
+    found = benchmark(lambda: jq.identify.fit_batch(model(START), frfs, **options))
     np.testing.assert_allclose(found.values[0], peer(), rtol=1e-4, atol=1e-6)
     assert np.all(found.converged)
 

@@ -6,9 +6,6 @@ import pytest
 from conftest import ROOT
 from package_messages import messages
 
-from jaxquad.cli._main import printer_of_warnings
-from jaxquad.records import RecordWarning
-
 
 BANNED = (
     r"\brigs?\b", r"\brooms?\b", r"\btold\b", r"\bCE\b", r"\bbuys?\b", r"\bnobody\b",
@@ -45,10 +42,3 @@ def test_a_term_that_messages_use_is_defined(found, word):
     assert any(word in text for _, text in found)
     path, definition = DEFINED[word]
     assert re.search(definition, (ROOT / path).read_text())
-
-
-def test_a_warning_is_printed_once_however_often_a_log_is_read(capsys):
-    show = printer_of_warnings()
-    for text in ("gaps filled («max_gap=»).", "another", "gaps filled («max_gap=»)."):
-        show(RecordWarning(text), RecordWarning, "a.py", 1)
-    assert capsys.readouterr().err == "! gaps filled (--max-gap).\n! another\n"

@@ -27,7 +27,6 @@ from jaxquad.simulation import (
     Step,
     WhiteNoise,
 )
-from jaxquad.simulation._memory import free_memory, require_memory
 
 
 ROUNDING = 1e-12  # the same sums, in vectors of another length
@@ -71,9 +70,8 @@ def test_results_lie_where_those_of_one_device_do(found):
 
 @pytest.mark.slow
 def test_data_that_were_put_on_a_device_by_hand_are_computed_there(found):
-    assert found["data put by hand lie on"] == [1]
-    assert found["data that are split lie on"] == [0, 1]
-    assert found["the same data on two"] is None
+    assert found["those of data put by hand lie on"] == [[1], True]
+    assert found["those of split data lie on"] == [[0], False]
 
 
 @pytest.mark.slow
@@ -216,19 +214,15 @@ def test_slices_of_what_members_share_are_refused():
 
 def test_what_the_memory_does_not_hold_is_refused_before_it_is_tried():
     vast, key = 10**9, jax.random.key(0)
-    if free_memory(jax.local_devices()[0]) is None:
+    if not Path("/proc/meminfo").exists():
         pytest.skip("this machine does not tell how much memory is free")
     with pytest.raises(ValueError, match="1000000000 members needs about .* GB are free"):
         scenario(duration=1.0, axes=1, noise=WhiteNoise(0.1), ensemble=vast, key=key)
-    with pytest.raises(ValueError, match="a record needs about 1e\\+09 GB.*take less"):
-        require_memory("a record", 1e18, "take less")
 
 
 def test_a_record_that_the_memory_does_not_hold_is_refused():
     """A scenario of many samples, of shapes only: nothing is allocated."""
-    from jaxquad.simulation._simulate import _run
-
     plant = eqx.filter_eval_shape(lambda: DecoupledAxes([0.05], jnp.ones((1, 10**9))))
     loop = (Loop(plant, PD([40.0], [8.0])), HAPPENS)
     with pytest.raises(ValueError, match="100 samples of 1 axes of 1000000000 members needs"):
-        eqx.filter_eval_shape(_run, *loop)
+        eqx.filter_eval_shape(simulate, *loop)

@@ -9,11 +9,8 @@ from scipy.optimize import least_squares
 from synthetic import OMEGA, response_of
 
 import jaxquad as jq
-from jaxquad.identify import make_problem, residuals, select_parameters
-from jaxquad.identify.frequency_domain._cost import points_of, usable
-from jaxquad.identify.frequency_domain._gauss_newton import DampedGaussNewton
-from jaxquad.identify.frequency_domain._mixing import mixings_of
-from jaxquad.identify.frequency_domain._solve import least_squares as minimum_of, solve
+from jaxquad._core import STALLED
+from jaxquad.identify import least_squares as minimum_of
 
 
 TRUTH = jq.LaggedIntegrator(280.0, 0.016, 0.011)
@@ -73,25 +70,10 @@ def test_a_fit_to_one_record_is_one_program_and_it_mixes_what_shares_noise():
     assert fits[1].cost != pytest.approx(fits[0].cost, rel=0.1)
 
 
-@pytest.mark.parametrize("correlation", [0.0, 0.6], ids=["independent", "shared"])
-def test_costs_aside_of_a_minimum_are_a_hundredth_above_its_own(correlation):
-    frf = response_of(TRUTH, error=0.002, correlation=correlation, seed=0)
-    points, cost = points_of([frf], [usable(frf, None, 0.6)]), jq.identify.MaximumLikelihood()
-    weights = [cost.weights(points[0], np.ones(frf.response.shape))]
-    problem = make_problem(START, select_parameters(START, None), [frf])
-    problem = problem.weighted(weights, mixings_of(points, weights))
-    found = solve(problem, np.asarray(problem.parameters.start), None, 256)
-    here = np.sum(np.asarray(residuals(jnp.asarray(found.z), problem)) ** 2)
-    assert found.aside is not None  # else NumPy would have to look
-    # The cost is a parabola but for the curvature of the response.
-    np.testing.assert_allclose(found.aside, 1.01 * here, rtol=1e-3)
-
-
 @pytest.mark.slow
 def test_the_minimum_has_the_derivatives_of_finite_differences():
     def found(data):
-        solver = DampedGaussNewton(1e-12)
-        return optx.least_squares(decay, solver, jnp.ones(2), args=data).value
+        return minimum_of(decay, jnp.ones(2), data, max_steps=256, tolerance=1e-12).z
 
     slopes = jax.jit(jax.jacrev(found))(jnp.asarray(DATA))
     moved = DATA + 1e-3 * np.concatenate([np.eye(8), -np.eye(8)])
@@ -105,12 +87,11 @@ def test_a_wall_of_nan_is_divergence_and_a_start_in_it_ends_there():
         # falls towards the wall at 1, behind which there is nothing
         return jnp.where(z < 1, 3 - z, jnp.nan)
 
-    solver = DampedGaussNewton(1e-8)
     for start in (0.0, 2.0):
-        found = optx.least_squares(walled, solver, jnp.asarray([start]), throw=False)
-        assert found.result == optx.RESULTS.nonlinear_divergence
+        found = minimum_of(walled, jnp.asarray([start]), None, max_steps=256, tolerance=1e-8)
+        assert not found.converged and int(found.reason) == STALLED
         # the best point that it reached, just before the wall, or the start itself
-        assert found.value[0] == pytest.approx(start if start > 1 else 1.0, abs=1e-6)
+        assert found.z[0] == pytest.approx(start if start > 1 else 1.0, abs=1e-6)
 
 
 def test_too_few_steps_are_told_apart_from_a_minimum():

@@ -90,8 +90,8 @@ class Walled(Folded):
         return jnp.exp(log * jnp.ones_like(omega)).astype(complex)[:, None, None]
 
 
-def constant_response():
-    frf = response_of(TRUTH)
+def constant_response(correlation=0.0):
+    frf = response_of(TRUTH, correlation=correlation)
     return eqx.tree_at(lambda f: f.response, frf, jnp.ones_like(frf.response))
 
 
@@ -105,9 +105,10 @@ def test_a_stationary_point_that_is_no_minimum_says_so():
     assert abs(abs(best.values[0] - 1.0) - 1.0) < 1e-6
 
 
-def test_a_fit_that_stays_on_a_saddle_says_so():
+@pytest.mark.parametrize("correlation", [0.0, 0.6], ids=["independent", "shared"])
+def test_a_fit_that_stays_on_a_saddle_says_so(correlation):
     at, free = Folded(jnp.asarray(1.0)), (jq.identify.Real("b"),)
-    fit = jq.fit(at, constant_response(), free=free)
+    fit = jq.fit(at, constant_response(correlation), free=free)
     assert fit.values == [1.0]
     assert any("no minimum: the cost falls to one side" in remark for remark in fit.remarks)
 

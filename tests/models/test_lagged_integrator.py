@@ -1,5 +1,7 @@
 """An axis with the damping of its rate: one more number, of which 0 changes nothing."""
 
+from pathlib import Path
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -7,7 +9,7 @@ from synthetic import response_of
 
 import jaxquad as jq
 from jaxquad.models import evaluate_response, imaginary, parameter_units
-from jaxquad.workflows._identification import model_formula
+from jaxquad.workflows import Identification
 
 
 OMEGA = jnp.geomspace(0.3, 300.0, 50)
@@ -81,5 +83,9 @@ def test_plants_drawn_from_a_fit_are_damped():
 
 def test_the_formula_of_a_page_has_it():
     settings = jq.workflows.IdentifySettings(input="M", output="q")
-    assert "/ ((s + damping) (lag s + 1))" in model_formula(settings, damped=True)
-    assert "damping" not in model_formula(settings)
+    frf, formulas = response_of(TRUTH, error=0.01, seed=0, omega=np.asarray(OMEGA)), []
+    for start in (TRUTH, jq.LaggedIntegrator(280.0, 0.03, 0.002)):
+        fits = {"direct": jq.fit(start, frf)}
+        found = Identification(Path("log.csv"), settings, (), {"direct": frf}, fits, {})
+        formulas.append(found.formula)
+    assert "/ ((s + damping) (lag s + 1))" in formulas[0] and "damping" not in formulas[1]

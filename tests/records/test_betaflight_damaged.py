@@ -1,3 +1,6 @@
+import bisect
+import itertools
+
 import blackbox_writer as writer
 import numpy as np
 import pytest
@@ -6,8 +9,6 @@ from hypothesis import given, settings, strategies as st
 from log_writers import decode
 
 from jaxquad.records import ReadError
-from jaxquad.records.formats._betaflight_frames import payload
-from jaxquad.records.formats._betaflight_header import headers
 
 
 ROWS = rows(320)
@@ -186,17 +187,22 @@ def test_a_stray_byte_in_a_real_log_costs_one_interval_at_most(data):
         lost.append(true.shape[0] - found.columns["axisP[0]"].size)
     assert max(lost) <= 128 // 8 + 4 + 1
     for key in range(3):
-        at = key_frame_end(content, key)
+        at = key_frame_end(content, whole, key)
         found = decode("betaflight", content[:at] + b"\xfe" + content[at:]).tables[""]
         values = np.stack([np.asarray(x, np.int64) for x in found.columns.values()], axis=1)
         np.testing.assert_array_equal(values, true)
         assert all((rows[row[0]] == row).all() for row in values)
 
 
-def key_frame_end(content, number):
-    """Behind which byte an I frame of a log ends, by its decoder."""
-    [header] = headers(content)
-    assert not isinstance(header, ReadError)
-    main = payload(content, header).main
-    row = np.flatnonzero(main.key)[100 + number]
-    return int(main.offsets[row + 1])
+def key_frame_end(content, whole, number):
+    """Behind which byte a key frame ends, which has its counter and its time in full."""
+    stamps = zip(whole.columns["loopIteration"].tolist(), np.round(1e6 * whole.time), strict=True)
+    places = (
+        (row, content.find(b"I" + writer.unsigned(counter) + writer.unsigned(int(time))))
+        for row, (counter, time) in enumerate(stamps)
+    )
+    keys = [key for key in itertools.islice(places, 1000) if key[1] >= 0]
+    row, start = keys[20 + number]
+    cuts = range(start + 1, start + 400)
+    held = lambda cut: decode("betaflight", content[:cut]).tables[""].columns["axisP[0]"].size
+    return cuts[bisect.bisect_left(cuts, row + 1, key=held)]

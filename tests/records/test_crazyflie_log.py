@@ -6,8 +6,7 @@ from log_writers import crazyflie_log as log, decode
 
 from jaxquad.records import channels, propose, read, ReadError, RecordError
 from jaxquad.records.formats import load_log
-from jaxquad.workflows import IdentifySettings
-from jaxquad.workflows._log import open_logs
+from jaxquad.workflows import IdentifySettings, open_logs
 
 
 FIXED = (0xFFFF, "fixedFrequency", [("gyro.x", "f"), ("motor.m1", "H"), ("pm.state", "b")])

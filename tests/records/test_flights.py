@@ -1,16 +1,13 @@
 """Several flights in one file, and the part of a log in which the vehicle flies."""
 
-import dataclasses
-from types import SimpleNamespace
-from typing import Any
-
 import numpy as np
 import pytest
 from blackbox_rows import clock
+from html_pages import read_page
 
-from jaxquad.autopilot.betaflight._log import betaflight_setup, chirps, command_hold
 from jaxquad.cli import main
 from jaxquad.records import (
+    AXES,
     flights,
     propose,
     read,
@@ -19,14 +16,16 @@ from jaxquad.records import (
     RecordError,
     RecordWarning,
 )
-from jaxquad.records.firmware import Selection
 from jaxquad.records.formats import load_log
-from jaxquad.records.formats._betaflight_header import with_derived
-from jaxquad.records.proposals._flown_span import flown_span, in_flight
 from jaxquad.spectra import frequency_response, JointInputOutput
-from jaxquad.workflows import autopilot, AutopilotSettings, IdentifySettings, SettingsError
-from jaxquad.workflows._identification import _record_with_throttle
-from jaxquad.workflows._log import open_logs, propose_settings, read_logs
+from jaxquad.workflows import (
+    autopilot,
+    AutopilotSettings,
+    identify,
+    IdentifySettings,
+    open_logs,
+    SettingsError,
+)
 
 
 FIRMWARE = "betaflight_firmware"
@@ -135,53 +134,64 @@ def test_a_chirp_keeps_its_own_window(data):
     assert not any("left out" in each for each in setup.remarks)
 
 
-def changed(log, rows, **columns):
-    """The log of one flight with other values in some rows of its main table."""
-    table = log.tables[""]
-    values = {name: np.array(table.columns[name], np.float64) for name in columns}
-    for name, x in columns.items():
-        values[name][rows] = x / table.scales.get(name, 1.0)
-    table = dataclasses.replace(table, columns={**table.columns, **values})
-    return dataclasses.replace(log, tables={**log.tables, "": table})
+RATES = tuple(f"gyroADC[{k}]" for k in range(3))
+SETPOINTS = tuple(f"setpoint[{k}]" for k in range(4))
+
+
+def written(path, time, columns):
+    """A log of one flight, as blackbox_decode writes it."""
+    values = [np.arange(time.size), np.round(1e6 * time), *columns.values()]
+    head = ",".join(["loopIteration", "time", *columns])
+    np.savetxt(path, np.stack(values, axis=1), "%d", ",", header=head, comments="")
+    return path
+
+
+@pytest.fixture(scope="module")
+def sticks(data):
+    return load_log(data / FIRMWARE / "A_sticks.BFL").tables[""]
 
 
 @pytest.fixture
-def sticks(data):
-    return load_log(data / FIRMWARE / "A_sticks.BFL")
+def flown(sticks, tmp_path):
+    """The set-up for the flight with sticks, with other values in some rows."""
+
+    def setup_of(rows=(), **changed):
+        names = (*RATES, *SETPOINTS, "axisSum[0]")
+        columns = {name: np.array(sticks.columns[name], float) for name in names}
+        for name, values in changed.items():
+            columns[name][rows] = values
+        return propose(written(tmp_path / "log.csv", sticks.time, columns), axis="roll").setup
+
+    return setup_of
 
 
-def landed(log, after):
-    """On the ground from `after` (s) on, as it was before take-off."""
-    table = log.tables[""]
-    rows = table.time > after
-    still = {f"gyroADC[{k}]": 0.1 * np.sin(50 * table.time[rows]) for k in range(3)}
-    return changed(log, rows, **still, **{"setpoint[3]": 0.0 * table.time[rows]})
+def left_out(setup):
+    return next((x for x in setup.remarks if x.startswith("left out, as no flight")), "")
 
 
-def test_a_landing_is_left_out(sticks):
-    span = flown_span(landed(sticks, 30.0))
-    assert span.stop is not None and 30 - 0.25 <= span.stop < 30.5
-    assert "(landed)" in span.after
+def test_a_landing_is_left_out(flown, sticks):
+    """On the ground from 30 s on, as it was before take-off."""
+    rows = sticks.time > 30
+    still = 0.1 * np.sin(50 * sticks.time[rows])
+    setup = flown(rows, **dict.fromkeys(RATES, still), **{"setpoint[3]": 0.0})
+    assert setup.stop is not None and 30 - 0.25 <= setup.stop < 30.5
+    assert "(landed)" in left_out(setup)
 
 
-def test_a_crash_is_left_out_although_the_motors_still_run(sticks):
-    table = sticks.tables[""]
-    rows = table.time > 32
-    span = flown_span(changed(sticks, rows, **{"gyroADC[0]": 1500 * np.ones(rows.sum())}))
-    assert span.stop == pytest.approx(32, abs=0.26) and "(a crash)" in span.after
+def test_a_crash_is_left_out_although_the_motors_still_run(flown, sticks):
+    setup = flown(sticks.time > 32, **{"gyroADC[0]": 1500})
+    assert setup.stop == pytest.approx(32, abs=0.26) and "(a crash)" in left_out(setup)
 
 
-def test_a_dive_without_throttle_is_flight(sticks):
-    table = sticks.tables[""]
-    rows = (table.time > 15) & (table.time < 20)
-    dived = changed(sticks, rows, **{"setpoint[3]": np.zeros(rows.sum())})
-    assert flown_span(dived)[:2] == flown_span(sticks)[:2]
+def test_a_dive_without_throttle_is_flight(flown, sticks):
+    dived, plain = flown((sticks.time > 15) & (sticks.time < 20), **{"setpoint[3]": 0}), flown()
+    assert (dived.start, dived.stop) == (plain.start, plain.stop)
 
 
-def test_a_log_that_never_leaves_the_ground_says_so(sticks):
-    still = changed(sticks, slice(None), **{"setpoint[3]": np.zeros(sticks.tables[""].time.size)})
-    span = flown_span(still)
-    assert (span.start, span.stop) == (None, None) and "no flight" in span.remarks[0]
+def test_a_log_that_never_leaves_the_ground_says_so(flown):
+    setup = flown(slice(None), **{"setpoint[3]": 0})
+    assert (setup.start, setup.stop) == (None, None)
+    assert any("no flight" in each for each in setup.remarks)
 
 
 def test_start_and_stop_of_the_user_win(data):
@@ -207,27 +217,24 @@ def test_samples_beyond_the_limit_count_within_the_part_that_is_used(data):
 
 
 @pytest.mark.parametrize(("stated", "held"), [("125", 250e-6), ("127", 254e-6), ("16", 250e-6)])
-def test_the_hold_is_that_of_the_stamps_where_the_header_contradicts_them(sticks, stated, held):
-    period, remarks = command_hold(
-        dataclasses.replace(sticks, settings={**sticks.settings, "looptime": stated})
-    )
-    assert period == pytest.approx(held, rel=1e-4)
-    assert bool(remarks) == (stated == "16")
-    assert all("32 us" in each and "250 us" in each for each in remarks)
+def test_the_hold_is_that_of_the_stamps_where_the_header_contradicts_them(joined, stated, held):
+    said = f"H looptime:{stated}\n".encode()
+    path = joined("A_sticks", change=lambda _, x: x.replace(b"H looptime:125\n", said)[:600_000])
+    setup = propose(path, axis="roll").setup
+    assert setup.hold == pytest.approx(held, rel=1e-4)
+    assert any("32 us" in x and "250 us" in x for x in setup.remarks) == (stated == "16")
 
 
 def test_stamps_that_are_as_the_header_says_leave_the_hold_as_it_is(data):
     """LOG00037 lost frames, which its counters of loops and of time both show."""
-    log = load_log(data / "betaflight_ar8/LOG00037.BFL")
-    assert command_hold(log) == (125e-6, ())
+    setup = propose(data / "betaflight_ar8/LOG00037.BFL").setup
+    assert setup.hold == 125e-6 and not any(" us" in each for each in setup.remarks)
 
 
 def test_what_was_injected_outside_of_start_and_stop_is_not_used(data):
-    log = load_log(data / FIRMWARE / "A_chirp_roll.BFL")
-    setup = propose(data / FIRMWARE / "A_chirp_roll.BFL").setup
     for start, stop in ((10.0, 12.0), (29.5, 30.5)):
-        used = in_flight(log, setup, start, stop)
-        assert (used.start, used.stop, used.segments) == (start, stop, ())
+        setup = propose(data / FIRMWARE / "A_chirp_roll.BFL", start=start, stop=stop).setup
+        assert (setup.start, setup.stop, setup.segments) == (start, stop, ())
 
 
 def test_a_set_point_that_rests_is_no_reference(data):
@@ -236,39 +243,40 @@ def test_a_set_point_that_rests_is_no_reference(data):
     assert any("setpoint[0] never moves" in each for each in setup.remarks)
 
 
-def of_phase_alone(log):
+def of_phase_alone(log, folder):
     """The log as firmware writes it that fills nothing but the phase of its chirp."""
     table = log.tables[""]
-    columns = {k: v for k, v in table.columns.items() if k != "chirp"}
-    columns |= {f"debug[{k}]": np.zeros(table.time.size, np.int32) for k in range(1, 8)}
-    again = dataclasses.replace(table, columns=with_derived(columns))
-    return dataclasses.replace(log, tables={**log.tables, "": again})
+    names = ("debug[0]", *RATES, *SETPOINTS, *(f"axisSum[{k}]" for k in range(3)))
+    columns = {name: table.columns[name] for name in names}
+    columns |= {f"debug[{k}]": np.zeros(table.time.size) for k in range(1, 8)}
+    return written(folder / "log.csv", table.time, columns)
 
 
-@pytest.mark.parametrize("name", ["A_chirp_roll", "B_chirp_three_axes"])
-def test_a_chirp_whose_phase_alone_is_logged_is_the_same_chirp(data, name):
-    log = load_log(data / FIRMWARE / f"{name}.BFL")
-    table = of_phase_alone(log).tables[""]
+@pytest.mark.parametrize(("name", "axes"), [("A_chirp_roll", 1), ("B_chirp_three_axes", 3)])
+def test_a_chirp_whose_phase_alone_is_logged_is_the_same_chirp(data, tmp_path, name, axes):
+    whole = data / FIRMWARE / f"{name}.BFL"
+    log = load_log(whole)
+    path = of_phase_alone(log, tmp_path)
     sine, axis, tenths, excitation = (
-        table.columns["chirp"], *(log.tables[""].columns[f"debug[{k}]"] for k in (1, 2, 3))
-    )  # fmt: skip
+        load_log(path).tables[""].columns["chirp"],
+        *(log.tables[""].columns[f"debug[{k}]"] for k in (1, 2, 3)),
+    )
     above = tenths > 11  # 0.1 Hz; this firmware injects the cosine
     np.testing.assert_allclose(sine[above] ** 2 + (excitation[above] / 1e3) ** 2, 1, atol=3e-3)
     assert not sine[axis == -1].any()
     assert "chirp" not in log.tables[""].columns
-    ours, theirs = chirps(table), chirps(log.tables[""])
-    assert [x.axis for x in ours] == [x.axis for x in theirs] == list(range(len(theirs)))
-    for a, b in zip(ours, theirs, strict=True):
-        np.testing.assert_allclose([a.start, a.stop], [b.start, b.stop], atol=0.05)
-        np.testing.assert_allclose([a.low, a.high], [b.low, b.high], rtol=0.2)
-    setup = betaflight_setup(of_phase_alone(log), Selection())
-    assert setup.reference == "chirp" and len(setup.remarks) == len(theirs)
+    for each in AXES[:axes]:
+        ours, theirs = (propose(x, axis=each).setup for x in (path, whole))
+        assert ours.reference == "chirp" and ours.band is not None and theirs.band is not None
+        assert ours.start == pytest.approx(theirs.start, abs=0.05)
+        assert ours.stop == pytest.approx(theirs.stop, abs=0.05)
+        np.testing.assert_allclose(ours.band, theirs.band, rtol=0.2)
 
 
-def test_a_response_with_the_sine_of_the_phase_is_that_with_the_excitation(data):
+def test_a_response_with_the_sine_of_the_phase_is_that_with_the_excitation(data, tmp_path):
     """To three standard errors, at all frequencies that both see."""
     log = load_log(data / FIRMWARE / "A_chirp_roll.BFL")
-    table, wanted = of_phase_alone(log).tables[""], log.tables[""]
+    table, wanted = load_log(of_phase_alone(log, tmp_path)).tables[""], log.tables[""]
     time = clock(wanted)
     used = (time > 9) & (time < 29)
     u, y = (np.asarray(wanted.columns[x], float) for x in ("axisSum[0]", "gyroADC[0]"))
@@ -284,25 +292,22 @@ def test_a_response_with_the_sine_of_the_phase_is_that_with_the_excitation(data)
     np.testing.assert_array_less(np.abs(a / b - 1), 3 * np.asarray(error).ravel())
 
 
-def test_a_gap_that_is_allowed_is_allowed_for_the_spectrum_over_the_throttle(
-    tmp_path, without_type_checks
-):
+def test_a_gap_that_is_allowed_is_allowed_for_the_spectrum_over_the_throttle(tmp_path):
     time = np.arange(20_000) / 1000
     wave = 50 * np.sin(20 * time)
     columns = {
-        "loopIteration": np.arange(20_000), "time (us)": np.round(1e6 * time), "axisP[0]": wave,
-        "gyroADC[0] (deg/s)": wave, "setpoint[0]": wave, "setpoint[3]": 300 + 100 * np.sin(time),
+        "loopIteration": np.arange(20_000), "time (us)": np.round(1e6 * time),
+        "axisP[0]": 50 * np.cos(20 * time), "gyroADC[0] (deg/s)": wave,
+        "setpoint[0]": wave, "setpoint[3]": 300 + 100 * np.sin(time),
     }  # fmt: skip
     kept = (time < 9) | (time > 9.08)
     path, table = tmp_path / "log.csv", np.column_stack(list(columns.values()))[kept]
     np.savetxt(path, table, fmt="%.9g", delimiter=", ", header=", ".join(columns), comments="")
-    settings, proposal = propose_settings(path, IdentifySettings(axis="roll", max_gap=0.1))
     with pytest.warns(RecordWarning, match="gaps filled"):
-        records = read_logs([path], settings)
-    opened: Any = SimpleNamespace(path=path, settings=settings, proposal=proposal, records=records)
-    both = _record_with_throttle(opened)
-    assert both is not None and both.samples == records[0].samples
-    assert both.input_names[1] == "throttle"
+        found = identify(path, IdentifySettings(axis="roll", max_gap=0.1))
+    found.write(tmp_path)
+    images = [each["alt"] for each in read_page(tmp_path / "report.html").of("img")]
+    assert any("over throttle" in each for each in images)
 
 
 def test_the_list_of_channels_ends_with_the_flights_of_a_file(joined, capsys):

@@ -1,17 +1,16 @@
-"""The broken loop and the spectrum of a page: where they are shown, and what they say."""
+"""The step, the broken loop and the spectrum of a page: where they are shown, what they say."""
 
 import numpy as np
 import pytest
+from html_pages import read_page
 from scipy.signal import lfilter
 from synthetic import response_of
 
 import jaxquad as jq
 from jaxquad.plot import StepBand
-from jaxquad.report import LawLoop
-from jaxquad.report._loop import entry_of, loop_section
-from jaxquad.report._spectrum import spectrum_section, throttle_of
-from jaxquad.report._step import step_section
-from jaxquad.spectra import BrokenLoop
+from jaxquad.report import LawLoop, write_report
+from jaxquad.report._loop import entry_of, loop_section, predict_step, step_section
+from jaxquad.spectra import BrokenLoop, estimate_step
 
 
 DT, SAMPLES = 0.004, 15000
@@ -100,13 +99,75 @@ def test_a_step_that_the_log_does_not_show_is_computed_by_the_law(frf):
     assert bare is not None and bare["computed"] is None
 
 
-def test_a_motor_is_called_one_where_it_follows_the_throttle(frf):
+def test_a_motor_is_called_one_where_it_follows_the_throttle(frf, tmp_path):
+    fit = jq.fit(jq.LaggedIntegrator(10.0, 0.01, 0.0), frf, free=("gain", "lag"))
     record = flown()
-    assert throttle_of(record) == "throttle"
-    section = spectrum_section(frf, record)
+    alone = jq.records.select(record, inputs=["u0"], outputs=["y0"])
+    pages = [
+        read_page(write_report(tmp_path / "page.html", fit=fit, frf=frf, spectrum=each))
+        for each in (record, alone)
+    ]
+    assert any("Spectrum of y0 over throttle" in page.text("figcaption") for page in pages[:1])
+    assert "motors." in pages[0].text("p") and "Record the throttle as well" in pages[1].text("p")
+
+
+@pytest.fixture(scope="module")
+def stepped():
+    """A lagged integrator under proportional feedback, flown by steps, in weak gusts."""
+    random, samples = np.random.default_rng(2), 15000
+    r = np.repeat(random.standard_normal(samples // 150), 150)
+    u, y = np.zeros((2, samples))
+    rate = moment = 0.0
+    for k in range(samples):
+        y[k] = rate + 0.001 * random.standard_normal()
+        u[k] = 0.04 * (r[k] - y[k])
+        stay = np.exp(-DT / 0.03)
+        mean = u[k] + (moment - u[k]) * (1 - stay) * 0.03 / DT
+        rate += DT * 280.0 * mean + 0.001 * random.standard_normal()
+        moment = u[k] + (moment - u[k]) * stay
+    return jq.Record(
+        np.arange(samples) * DT, u, y, r, input_names="u0", output_names="y0",
+        output_units="rad/s", reference_units="rad/s", hold="dt",
+    )  # fmt: skip
+
+
+def fit_of(gain):
+    model = jq.LaggedIntegrator(gain, 0.03, 0.0)
+    frf = response_of(model, error=0.01, seed=0)
+    return jq.fit(model, frf, free=("gain", "lag")), frf
+
+
+def test_the_right_model_predicts_the_measured_step_and_a_wrong_one_does_not(stepped):
+    found = estimate_step(stepped)
+    inside = {}
+    for gain in (280.0, 0.6 * 280.0):
+        fit, frf = fit_of(gain)
+        predicted = predict_step(fit, frf, stepped)
+        assert predicted is not None
+        assert predicted.error is not None
+        error = np.hypot(predicted.error, found.standard_error)
+        early = (found.time > 0.05) & (found.time < 0.5)
+        inside[gain] = np.abs(predicted.mean - found.mean)[early] < 3 * error[early] + 0.02
+    assert np.mean(inside[280.0]) > 0.95 and np.mean(inside[0.6 * 280.0]) < 0.3
+
+
+def test_the_section_says_that_the_data_suffice_and_shows_both(stepped):
+    fit, frf = fit_of(280.0)
+    section = step_section(fit, frf, stepped)
     assert section is not None
-    assert len(section["images"]) == 2 and "throttle" in section["images"][1].caption
-    assert section["text"].endswith("motors.")
-    quiet = jq.records.select(record, inputs=["u0"], outputs=["y0"])
-    poor = spectrum_section(frf, quiet)
-    assert poor is not None and "Record the throttle as well" in poor["text"]
+    assert not section["doubts"] and "The data suffice" in section["notes"][0]
+    assert section["table"].heads == ("", "measured", "model")
+    assert "prediction of the model" in section["image"].alt
+
+
+def test_no_reference_gives_no_section_and_a_poor_one_no_figure(stepped):
+    fit, frf = fit_of(280.0)
+    bare = jq.Record(stepped.time, stepped.inputs, stepped.outputs, output_names="y0")
+    assert step_section(fit, frf, bare) is None
+    quiet = np.zeros_like(stepped.time)
+    quiet[5000:5200] = 1.0
+    poor = jq.Record(
+        stepped.time, stepped.inputs, stepped.outputs, quiet, input_names="u0", output_names="y0"
+    )
+    section = step_section(fit, frf, poor)
+    assert section is not None and section["doubts"] and section["image"] is None

@@ -10,7 +10,6 @@ from jaxquad.control import PD, place_pd
 from jaxquad.loops import Loop
 from jaxquad.models import Allocation, Attitude, MotorLag, Multirotor, QUANSER_HOVER
 from jaxquad.simulation import Encoder, excite, MotorDrive, runge_kutta, Scenario, simulate
-from jaxquad.simulation._step import integrate
 
 
 DT, SAMPLES = 0.002, 125
@@ -87,14 +86,6 @@ def test_a_runge_kutta_step_keeps_every_structure_and_is_exact_for_a_cubic():
                         {"t": jnp.asarray(1.0), "x": jnp.asarray(1.0)}, 0.5)  # fmt: skip
     assert moved["t"] == 1.5
     assert moved["x"] == pytest.approx(1.5**4, rel=1e-14)
-
-
-def test_reverse_mode_keeps_of_rolled_stages_their_slopes_and_nothing_within_them():
-    """The derivative of `slope` needs a value of each of its three operations."""
-    slope = lambda x: jnp.sin(jnp.sin(jnp.sin(x)))
-    step = lambda x: integrate(slope, x, 0.1, 1, rolled=True)
-    kept = jax.vjp(step, jnp.ones(70))[1]
-    assert sum(x.size // 70 for x in jax.tree.leaves(kept)) == 1 + 4
 
 
 INERTIAS = np.array(SHEET.inertia)[:, None] * np.array([0.7, 1.0, 1.6])

@@ -7,7 +7,6 @@ import pytest
 
 import jaxquad as jq
 from jaxquad.spectra import ErrorCovariance
-from jaxquad.spectra._error_covariance import add_effects, reach_of
 
 
 FREQUENCIES, OUTPUTS, INPUTS, PARAMETERS = 70, 2, 3, 4
@@ -129,13 +128,12 @@ def test_independent_errors_take_room_for_themselves_only():
 def test_narrow_effects_are_those_of_all_atoms(width, step):
     rng = np.random.default_rng(width)
     first = np.cumsum(rng.integers(1, 4, FREQUENCIES))[::step]
-    effect, values = draw(rng, FREQUENCIES, INPUTS, width), draw(rng, FREQUENCIES, INPUTS, 2)
+    effect = draw(rng, FREQUENCIES, INPUTS, width)
     effect[3, :, -1] = 0.0  # a shorter one
-    count, half = int(np.max(first)) + width, 61
-    found = np.zeros((count, 2), complex)
-    for low, high in ((0, half), (half, count)):
-        add_effects(found[low:high], low, effect, reach_of(effect, first), values)
-    expected = np.zeros_like(found)
-    for begin, each, value in zip(first, effect, values, strict=True):
-        expected[begin : begin + width] += each.T @ value
-    np.testing.assert_allclose(found, expected, atol=1e-12)
+    all_atoms = np.zeros((FREQUENCIES, INPUTS, int(np.max(first)) + width), complex)
+    for row, narrow, begin in zip(all_atoms, effect, first, strict=True):
+        row[:, begin : begin + width] = narrow
+    noise, columns = draw(rng, FREQUENCIES, OUTPUTS, OUTPUTS), draw(rng, *SHAPE, 2)
+    found = ErrorCovariance(ERRORS.omega, effect, noise, first=first).project(columns)
+    expected = ErrorCovariance(ERRORS.omega, all_atoms, noise).project(columns)
+    np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-12 * np.max(np.abs(expected)))

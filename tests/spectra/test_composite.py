@@ -10,7 +10,6 @@ from jaxquad.excitation import sweep
 from jaxquad.records import Record
 from jaxquad.spectra import Composite, frequency_response, Welch
 from jaxquad.spectra._average import combine, Conditioned
-from jaxquad.spectra._noise import kept_if_few
 
 
 RATE = 250.0
@@ -167,12 +166,3 @@ def test_several_records_share_no_window():
 def test_impossible_options_are_refused(options, message):
     with pytest.raises(ValueError, match=message):
         Composite(**options)
-
-
-def test_squares_are_kept_between_estimates_for_few_frequencies_alone():
-    made = []
-    remember = ft.lru_cache(maxsize=4)(made.append)
-    for count, calls in ((256, 1), (257, 3)):
-        kept_if_few(remember, count)(0)
-        kept_if_few(remember, count)(0)
-        assert len(made) == calls

@@ -8,7 +8,6 @@ from scipy import signal
 
 from jaxquad.records import Record
 from jaxquad.spectra import DOMINATED, EARLY, frequency_response, JointInputOutput, Welch
-from jaxquad.spectra._feedback import _ORDER, lagged_products, share_from_output
 
 
 DT, SAMPLES = 0.01, 6000
@@ -138,32 +137,3 @@ def test_an_output_before_its_input_is_named_with_the_time_that_explains_it(samp
     assert 0.5 * samples * 10 < least < 10 * shift and "time stamps" in remark
     (direct,) = remarks_of(early)
     assert "time stamps" in direct
-
-
-@pytest.mark.parametrize("gain", [0.5, 2.0])
-def test_the_share_is_that_of_the_simulated_powers(gain):
-    rng = np.random.default_rng(0)
-    y, r = rng.standard_normal((2, 40_000))
-    u = r - gain * np.concatenate([[0.0], y[:-1]])
-    found = share_from_output([np.stack([y, u])], DT, np.geomspace(30.0, 300.0, 20))
-    # 40 000 samples and 12 lags: standard errors of 1.5 %.
-    np.testing.assert_allclose(found.output_first, gain**2 / (1 + gain**2), atol=0.05)
-    np.testing.assert_allclose(found.input_first, gain**2 / (1 + gain**2), atol=0.05)
-
-
-def test_what_both_have_in_common_at_one_sample_is_counted_either_way():
-    y, r = np.random.default_rng(0).standard_normal((2, 40_000))
-    found = share_from_output([np.stack([y, r - 3.0 * y])], DT, np.geomspace(30.0, 300.0, 20))
-    np.testing.assert_allclose(found.output_first, 0.9, atol=0.03)
-    assert np.all(found.input_first < 0.03)
-
-
-def test_too_short_a_record_says_nothing():
-    x = np.random.default_rng(0).standard_normal((2, 100))
-    assert not np.any(share_from_output([x], DT, OMEGA).output_first)
-
-
-def test_sums_of_products_are_those_of_the_shifted_samples():
-    x = np.random.default_rng(0).standard_normal((2, 300))
-    rows = np.concatenate([x[:, _ORDER - k : 300 - k] for k in range(_ORDER + 1)])
-    np.testing.assert_allclose(lagged_products(x), rows @ rows.T, atol=1e-10)

@@ -6,7 +6,12 @@ from scipy import signal
 
 from jaxquad.records import read, Record, RecordWarning
 from jaxquad.spectra import DOMINATED, frequency_response, JointInputOutput, Welch
-from jaxquad.spectra._feedback import dominated_by_feedback, phase_slope
+from jaxquad.spectra._feedback import (
+    dominated_by_feedback,
+    lagged_products,
+    phase_slope,
+    share_from_output,
+)
 
 
 RATE, SAMPLES = 50.0, 3000
@@ -115,6 +120,37 @@ def test_a_rise_that_all_frequencies_share_by_chance_is_none():
     assert phase_rises(omega, response, error, coherence)
     covariance = lambda: np.outer(together, together.conj())
     assert not phase_rises(omega, response, error, coherence, covariance)
+
+
+@pytest.mark.parametrize("gain", [0.5, 2.0])
+def test_the_share_is_that_of_the_simulated_powers(gain):
+    rng = np.random.default_rng(0)
+    y, r = rng.standard_normal((2, 40_000))
+    u = r - gain * np.concatenate([[0.0], y[:-1]])
+    found = share_from_output([np.stack([y, u])], 0.01, np.geomspace(30.0, 300.0, 20))
+    # 40 000 samples and 12 lags: standard errors of 1.5 %.
+    np.testing.assert_allclose(found.output_first, gain**2 / (1 + gain**2), atol=0.05)
+    np.testing.assert_allclose(found.input_first, gain**2 / (1 + gain**2), atol=0.05)
+
+
+def test_what_both_have_in_common_at_one_sample_is_counted_either_way():
+    y, r = np.random.default_rng(0).standard_normal((2, 40_000))
+    found = share_from_output([np.stack([y, r - 3.0 * y])], 0.01, np.geomspace(30.0, 300.0, 20))
+    np.testing.assert_allclose(found.output_first, 0.9, atol=0.03)
+    assert np.all(found.input_first < 0.03)
+
+
+def test_too_short_a_record_says_nothing():
+    x = np.random.default_rng(0).standard_normal((2, 100))
+    assert not np.any(share_from_output([x], 0.01, np.geomspace(2.0, 60.0, 50)).output_first)
+
+
+def test_sums_of_products_are_those_of_the_shifted_samples():
+    x = np.random.default_rng(0).standard_normal((2, 300))
+    found = lagged_products(x)
+    order = len(found) // 2 - 1
+    rows = np.concatenate([x[:, order - k : 300 - k] for k in range(order + 1)])
+    np.testing.assert_allclose(found, rows @ rows.T, atol=1e-10)
 
 
 def measured(path, **options):

@@ -1,5 +1,3 @@
-import platform
-
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -185,19 +183,3 @@ def test_taking_out_the_delay_removes_the_bias_of_the_window():
     )
     assert worst(plain, exact) > 0.01
     assert worst(shifted, exact) < 1e-10
-
-
-@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="others keep memory in their own way")
-def test_a_second_estimate_takes_its_memory_from_the_first():
-    data = record(samples=20_000)
-    for _ in range(2):
-        frequency_response(data)
-    first = pages_taken()
-    frequency_response(data)
-    assert pages_taken() - first < 3000  # without a block given back first, 20 000
-
-
-def pages_taken():
-    import resource
-
-    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt

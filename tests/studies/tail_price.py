@@ -23,25 +23,26 @@ from scipy.optimize import minimize
 sys.path.append(str(Path(__file__).parents[1]))
 jax.config.update("jax_enable_x64", True)
 
-from tuning_case import ensemble, EVENTS, flight, loop, objective, STARTS  # noqa: E402
+from tuning_case import (  # noqa: E402
+    coordinates_of,
+    cost_at,
+    ensemble,
+    flight,
+    linear_members,
+    loop,
+    objective,
+    pose,
+    STARTS,
+)
 
 import jaxquad as jq  # noqa: E402
-from jaxquad.tuning._cost import (  # noqa: E402
-    evaluate_cost,
-    initial_multipliers,  # noqa: E402
-    SMOOTHING,
-    stack_copies,
-    Subproblem,
-)
-from jaxquad.tuning._parameters import select_coordinates  # noqa: E402
-from jaxquad.tuning._problem import linear_loops, make_problem, TimeSpan  # noqa: E402
-from jaxquad.tuning._tail import WorstLoops  # noqa: E402
 
 
 PEAK, SLICE = 3.6, 2048
+SMOOTHING = 1e-6  # 1/s, of the abscissa
 FREE = ["ladrc.wc", "ladrc.wo", "map.values"]
 START = loop(STARTS["certainty equivalence"])
-COORDINATES = select_coordinates(START.controller, FREE)
+COORDINATES = coordinates_of(START.controller, FREE)
 ACTIVE, CYCLES = 256, 12  # members that the limit is kept on at once; how often others join them
 SETTINGS = {  # the limit, and the slices of 2048 members that it is kept on
     "no limit": (PEAK, 0),
@@ -54,11 +55,8 @@ SETTINGS = {  # the limit, and the slices of 2048 members that it is kept on
 
 def cost_of(members) -> Callable:
     """The objective of flights: value, gradient, and the numbers of each member."""
-    problem = make_problem(START.controller, members, flight(), span=TimeSpan(EVENTS))
-    given = initial_multipliers(problem, (), 1), jnp.array([True]), jnp.full(1, -0.75)
-    subproblem = Subproblem(stack_copies(objective(), 1), (), *given)
-    on = jnp.array([True])
-    return lambda z: evaluate_cost(jnp.asarray(z)[None], on, COORDINATES, problem, subproblem)
+    posed = pose(START.controller, members)
+    return lambda z: cost_at(jnp.asarray(z)[None], COORDINATES, posed)
 
 
 @eqx.filter_jit
@@ -87,18 +85,24 @@ def solve(cost, z, bound: float, slices, others) -> np.ndarray:
             break
         near = sorted(near, key=lambda at: -level[at])[:60]
         known = list(dict.fromkeys([*known, *near]))[-ACTIVE:]
-        z = _minimise(cost, z, np.log(bound), WorstLoops(slices, known), others)
+        z = _minimise(cost, z, np.log(bound), known, put_into(others, slices, known))
     return z
 
 
-def _minimise(cost, z, bound: float, worst: WorstLoops, others) -> np.ndarray:
+def put_into(others, slices, places):
+    """The members at the places (slice, member) instead of the first of the others."""
+    for k, (s, member) in enumerate(places):
+        others = others.replaced(np.array([k]), slices[s], np.array([member]))
+    return others
+
+
+def _minimise(cost, z, bound: float, known, loops) -> np.ndarray:
     def value(z):
         found = cost(z)
         return float(found.value[0]), np.asarray(found.gradient[0])
 
-    constraints, count = [], len(worst.places)
+    constraints, count = [], len(known)
     if count:
-        loops = worst.put_into(others, np.arange(count))
         level = lambda z: bound - np.asarray(peaks(jnp.asarray(z), COORDINATES, loops))[:count]
         slope = lambda z: -np.asarray(slopes(jnp.asarray(z), COORDINATES, loops))[:count]
         constraints = [{"type": "ineq", "fun": level, "jac": slope}]
@@ -135,7 +139,7 @@ def tuned(key) -> np.ndarray:
         limits=[jq.Limit("sensitivity_peak", at_most=PEAK)], progress=False,
     )  # fmt: skip
     print(f"{found.tail}, {found.evaluations} gradients", flush=True)
-    return select_coordinates(found.controller, FREE).start
+    return coordinates_of(found.controller, FREE).start
 
 
 def main() -> None:
@@ -145,13 +149,13 @@ def main() -> None:
     draw = lambda key, n: ensemble().fresh(START, n, key)
     far = jax.random.key(4242)
     fold = jax.random.fold_in
-    test = [linear_loops(draw(fold(far, k), SLICE), None) for k in range(32)]
+    test = [linear_members(draw(fold(far, k), SLICE)) for k in range(32)]
     fresh = cost_of(draw(far, 1024))
     rows: dict[str, list[Row]] = {}
     for key in map(jax.random.key, range(count)):
         cost = cost_of(ensemble().draw(START, 64, key))
-        searched = [linear_loops(draw(fold(key, 2 + k), SLICE), None) for k in range(32)]
-        others = linear_loops(ensemble().draw(START, ACTIVE, fold(key, 1)), None)
+        searched = [linear_members(draw(fold(key, 2 + k), SLICE)) for k in range(32)]
+        others = linear_members(ensemble().draw(START, ACTIVE, fold(key, 1)))
         first = tuned(key)
         ends = {"`jq.tune`": first}
         for name, (bound, slices) in SETTINGS.items():

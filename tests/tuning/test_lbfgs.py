@@ -1,12 +1,11 @@
-"""The L-BFGS that runs many problems in lockstep, beside scipy's; and the rounds of multipliers."""
+"""The L-BFGS that runs many problems in lockstep, beside scipy's."""
 
 import numpy as np
 import pytest
 from scipy.optimize import minimize
+from tuning_case import minimise
 
 from jaxquad.tuning import LBFGS
-from jaxquad.tuning._cost import Rounds
-from jaxquad.tuning._lbfgs import minimise
 
 
 ROUGH = LBFGS(evaluations=200, tolerance=1e-12, gradient_tolerance=1e-8, longest_step=10.0)
@@ -110,15 +109,3 @@ def test_options_that_make_no_sense_are_refused():
         LBFGS(evaluations=0)
     with pytest.raises(ValueError, match="longest_step is 0.0"):
         LBFGS(longest_step=0.0)
-
-
-def test_rounds_that_come_no_nearer_to_a_limit_end_and_the_nearest_of_them_counts():
-    rounds, z = Rounds(), np.arange(2.0)[:, None]
-    # The first problem's limit cannot be met; the second's is, in ever smaller steps.
-    missed = np.array([[0.50, 0.5], [0.40, 0.2], [0.39, 0.05], [0.41, 0.001]])
-    for k, row in enumerate(missed):
-        rounds.add(z + 10 * k, np.array([3.0 - k, -1.0]), row[:, None])
-        assert not rounds.stalled[1]
-    assert rounds.stalled[0]
-    # Of the rounds within 5 % of the nearest miss, the one of the lowest cost.
-    np.testing.assert_array_equal(rounds.best()[:, 0], [20.0, 31.0])

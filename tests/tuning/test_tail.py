@@ -1,24 +1,25 @@
 """Limits on the tail of an ensemble: what a tune finds there, and what it leaves."""
 
+import dataclasses
+
 import jax
 import numpy as np
 import pytest
-from tuning_case import ensemble, equivalent, flight, loop, objective
+from html_pages import tuned_by_hand
+from tuning_case import ensemble, equivalent, flight, linear_members, loop, objective
 
 from jaxquad.loops import loop_numbers
 from jaxquad.models import DecoupledAxes
 from jaxquad.simulation import scenario
-from jaxquad.tuning import LBFGS, Limit, tune
-from jaxquad.tuning._problem import linear_loops
-from jaxquad.tuning._tail import Tail, take_members, WorstLoops
-from jaxquad.tuning._tuned import describe_tail
+from jaxquad.tuning import LBFGS, Limit, Tail, tune
+from jaxquad.tuning._tail import take_members, WorstLoops
 
 
 pytestmark = pytest.mark.usefixtures("compiled_quickly")
 
 
 def loops(seed, count=6):
-    return linear_loops(ensemble().draw(loop(), count, jax.random.key(seed)), None)
+    return linear_members(ensemble().draw(loop(), count, jax.random.key(seed)))
 
 
 def test_the_worst_take_the_places_of_others():
@@ -49,10 +50,11 @@ def test_members_are_taken_from_several_draws_with_the_noise_that_is_theirs():
 
 def test_one_certificate_of_several_claims_less():
     """By Bonferroni: the claims of n certificates hold together with 1 - 0.05 n at least."""
-    found = describe_tail(Tail(searches=3, searched=24576, added=4, certificates=2))
-    assert "24576 further linear loops searched, 4 of the worst added" in found
-    assert "this is certificate 2" in found and "read its 95 % as 90 %" in found
-    assert "certificate" not in describe_tail(Tail(searches=1, searched=8192, certificates=1))
+    tails = Tail(searches=3, searched=24576, added=4, certificates=2), Tail(1, 8192, certificates=1)
+    several, one = (str(dataclasses.replace(tuned_by_hand(), tail=tail)) for tail in tails)
+    assert "24576 further linear loops searched, 4 of the worst added" in several
+    assert "this is certificate 2" in several and "read its 95 % as 90 %" in several
+    assert "this is certificate" not in one
 
 
 @pytest.mark.slow

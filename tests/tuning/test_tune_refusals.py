@@ -13,7 +13,7 @@ from certificates_by_hand import certificate, judged
 from jaxquad._core import as_float
 from jaxquad.control import LinearController
 from jaxquad.simulation import scenario, Step
-from jaxquad.tuning import LBFGS, Objective, tune
+from jaxquad.tuning import LBFGS, Limit, Objective, tune
 
 
 pytestmark = pytest.mark.usefixtures("compiled_quickly")
@@ -64,12 +64,30 @@ def test_a_controller_of_ones_own_is_tuned_up_to_the_gains_that_it_refuses():
     assert "this servo takes 15 at most" in str(found.convergence)
 
 
-def brief(controller, objective, free):
+def brief(controller, objective, free, *, evaluations=15, limits=()):
     happens = scenario(duration=1.0, axes=1, dt=case.DT, reference=Step(np.radians(4.0)))
     return tune(
         case.loop(controller), case.ensemble().draw(case.loop(), 4, jax.random.key(0)), happens,
-        objective=objective, progress=False, fresh=None, free=free, method=LBFGS(evaluations=15),
+        objective=objective, progress=False, fresh=None, free=free, limits=limits,
+        method=LBFGS(evaluations=evaluations),
     )  # fmt: skip
+
+
+@pytest.mark.slow
+def test_a_tune_that_is_stopped_has_not_converged_and_says_so():
+    found = brief(case.ladrc(3.0, 30.0), Objective(), None, evaluations=2).convergence
+    assert found.holds is False and "ended where the cost still falls" in found.text
+    assert "more evaluations" in found.remedy
+
+
+@pytest.mark.slow
+def test_a_limit_that_cannot_be_met_ends_the_rounds_nearest_to_it_and_says_so():
+    limits = [Limit("itae", at_most=1e-6)]
+    found = brief(case.ladrc(3.0, 30.0), Objective(), None, limits=limits, evaluations=60)
+    [missed] = found.limits
+    assert not missed.met and missed.reached > 1e-6
+    assert found.convergence.holds is False and "the limit on " in found.convergence.text
+    assert "Relax the limits" in found.convergence.remedy
 
 
 @pytest.mark.slow

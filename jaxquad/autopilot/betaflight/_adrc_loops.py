@@ -14,7 +14,7 @@ from .._filters import FilterChain, PT2
 from .._firmware import Parameter
 from .._parameters import find_parameter
 from .._rate_design import Kind
-from .._rate_gains import cells_of, hold_plants, law_responses, LoopQualities, RateLoops
+from .._rate_loops import cells_of, hold_plants, law_responses, LoopQualities, RateLoops
 from .._stages import beyond_limits
 from ._adrc import FlownADRC
 from ._header import FlownBetaflight

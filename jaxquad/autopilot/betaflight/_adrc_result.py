@@ -300,21 +300,43 @@ _PLANTS, _SEED = 100, 77  # of the steps' bands
 _POINTS = 60  # of a curve over the throttle
 
 
-def adrc_page(result: "ADRCAutopilot", origin: Provenance) -> PilotPage:
+def adrc_page(result: ADRCAutopilot, origin: Provenance) -> PilotPage:
     """All that the page shows."""
     version, proposal, plant = ".".join(map(str, result.version)), result.proposal, result.plant
-    flight = result.flight
+    flown, flight, axis = result.flown, result.flight, AXES.index(result.axis)
+    headlines = [Headline(*VERDICTS[result.kind], result.verdict)]
+    for throttle, again in result.shown_again.items():
+        flew = again.kind == "flown"
+        word = "THE FLOWN LOOP AGAIN" if flew else "THE FLOWN LOOP IS NOT REPRODUCED"
+        level = "good" if flew else "warn" if again.kind == "unknown" else "bad"
+        headlines.append(Headline(level, word, f"at {throttle:.2f} throttle: {again.verdict}"))
+    pid = flown.pid.law if isinstance(flown, FlownADRC) else flown.law
+    chains = chains_of(pid, axis)
+
+    def with_observer(cutoff: float) -> Chains:
+        observer = (FilterChain((PT2(cutoff),), 1 / pid.dt),) if cutoff > 0 else ()
+        return {"gyro": chains["gyro"], "observer": observer}
+
+    filters: dict[str, Chains] = {"flown": chains}
+    if isinstance(flown, FlownADRC):
+        filters = {"flown": with_observer(flown.lowpass_hz)}
+    elif result.new:
+        filters["proposed"] = with_observer(result.new["adrc_gyro_lpf_hz"])
+    steps, b0, stages = {}, None, None
+    if proposal is not None and plant is not None:
+        steps, b0 = _steps_and_b0(result, proposal, plant)
+        stages = stage_table(proposal, result.settings.fresh)
     return PilotPage(
         title=f"betaflight {version}, ADRC for {result.axis}".replace(" ,", ","),
-        headlines=_headlines(result),
-        remarks=[*result.remarks, *(f"not modelled: {text}" for text in result.flown.unmodelled)],
-        filters=_filters(result),
-        steps={} if proposal is None or plant is None else _steps(result, proposal, plant),
-        b0=None if proposal is None or plant is None else _b0(result, proposal, plant),
+        headlines=headlines,
+        remarks=[*result.remarks, *(f"not modelled: {text}" for text in flown.unmodelled)],
+        filters=filters,
+        steps=steps,
+        b0=b0,
         terms={} if flight is None or not flight.terms else logged_terms(flight),
         terms_are="as logged",
         motors=[] if flight is None else motor_rows(flight),
-        stages=None if proposal is None else _stage_rows(proposal, result.settings.fresh),
+        stages=stages,
         changes=change_rows(result.changes, result.words) if result.new else None,
         text=str(result),
         unit="pidsum",
@@ -322,85 +344,46 @@ def adrc_page(result: "ADRCAutopilot", origin: Provenance) -> PilotPage:
     )
 
 
-def _headlines(result: "ADRCAutopilot") -> list[Headline]:
-    headlines = [Headline(*VERDICTS[result.kind], result.verdict)]
-    for throttle, again in result.shown_again.items():
-        flew = again.kind == "flown"
-        word = "THE FLOWN LOOP AGAIN" if flew else "THE FLOWN LOOP IS NOT REPRODUCED"
-        level = "good" if flew else "warn" if again.kind == "unknown" else "bad"
-        headlines.append(Headline(level, word, f"at {throttle:.2f} throttle: {again.verdict}"))
-    return headlines
-
-
-def _frame(result: "ADRCAutopilot", proposal: ADRCProposal) -> ADRCFrame:
-    values = result.new or result.flown.parameters()
-    return ADRCFrame(
-        proposal.schedule, values.get("adrc_gyro_lpf_hz", 150.0), values.get("adrc_td_hz", 0.0),
+def _steps_and_b0(
+    result: ADRCAutopilot, proposal: ADRCProposal, plant: GainOverThrottle
+) -> tuple[dict[str, StepBand], B0Section]:
+    """Steps at the middle one of the throttles that were certified, and b0 over all of them."""
+    flown, schedule = result.flown, proposal.schedule
+    middle = proposal.throttle[len(proposal.throttle) // 2]
+    values = result.new or flown.parameters()
+    frame = ADRCFrame(
+        schedule, values.get("adrc_gyro_lpf_hz", 150.0), values.get("adrc_td_hz", 0.0),
         values.get("adrc_sigma_decay", 3.0) / 10,
     )  # fmt: skip
-
-
-def _filters(result: "ADRCAutopilot") -> dict[str, Chains]:
-    """Those that flew, and those of the ADRC where the PID flew."""
-    flown, axis = result.flown, AXES.index(result.axis)
-    pid = flown.pid.law if isinstance(flown, FlownADRC) else flown.law
-    chains = chains_of(pid, axis)
-    if isinstance(flown, FlownADRC):
-        return {"flown": _with_observer(chains, flown.lowpass_hz, pid.dt)}
-    if result.proposal is None or not result.new:
-        return {"flown": chains}
-    cutoff = result.new["adrc_gyro_lpf_hz"]
-    return {"flown": chains, "proposed": _with_observer(chains, cutoff, pid.dt)}
-
-
-def _with_observer(chains: Chains, cutoff: float, dt: float) -> Chains:
-    observer = (FilterChain((PT2(cutoff),), 1 / dt),) if cutoff > 0 else ()
-    return {"gyro": chains["gyro"], "observer": observer}
-
-
-def _steps(
-    result: "ADRCAutopilot", proposal: ADRCProposal, plant: GainOverThrottle
-) -> dict[str, StepBand]:
-    """At the middle one of the throttles that were certified."""
-    middle = proposal.throttle[len(proposal.throttle) // 2]
-    grid = StepGrid.of(result.flown.law.dt)
+    grid = StepGrid.of(flown.law.dt)
     loop = make_adrc_loop(
-        plant, result.flown, AXES.index(result.axis), middle, _frame(result, proposal), _PLANTS,
+        plant, flown, AXES.index(result.axis), middle, frame, _PLANTS,
         result.settings.seed + _SEED, grid.omega,
     )  # fmt: skip
-    name = lambda law: f"{law}, {middle:.2f} throttle"
-    flown = name(f"{'ADRC' if result.flew_adrc else 'PID'} flown")
-    steps = {flown: grid.band(loop.closed(None))}
-    if result.new:
-        design = np.array(proposal.stage[:3])
-        steps[name("ADRC proposed")] = grid.band(loop.closed(design))
-    return steps
-
-
-def _b0(result: "ADRCAutopilot", proposal: ADRCProposal, plant: GainOverThrottle) -> B0Section:
+    at = f", {middle:.2f} throttle"
+    steps = {f"{'ADRC' if result.flew_adrc else 'PID'} flown{at}": grid.band(loop.closed(None))}
     levels = [plant.b0(k) for k in range(plant.throttle.size)]
     low, high = np.array([level.interval for level in levels]).T
     measured = GainBand(plant.throttle, np.array([level.value for level in levels]), low, high)
-    ends = float(plant.low.min()), float(plant.high.max())
-    grid, scale = np.linspace(*ends, _POINTS), proposal.schedule.scale
-    taken = {}
-    if isinstance(result.flown, FlownADRC):
-        b0 = proposal.stages["what flew"].b0
-        taken["b0 that flew"] = ThrottleCurve(grid, b0 * result.flown.schedule.scale(grid))
+    throttle, taken = np.linspace(float(plant.low.min()), float(plant.high.max()), _POINTS), {}
+    if isinstance(flown, FlownADRC):
+        b0 = proposal.stages["what flew"].b0 * flown.schedule.scale(throttle)
+        taken["b0 that flew"] = ThrottleCurve(throttle, b0)
     if result.new:
-        name = f"b0 proposed, {proposal.law}"
-        taken[name] = ThrottleCurve(grid, proposal.stage.b0 * scale(grid))
-    curve = None if proposal.scaled is None else plant.b0_over(grid)
+        steps[f"ADRC proposed{at}"] = grid.band(loop.closed(np.array(proposal.stage[:3])))
+        b0 = proposal.stage.b0 * schedule.scale(throttle)
+        taken[f"b0 proposed, {proposal.law}"] = ThrottleCurve(throttle, b0)
+    curve = None if proposal.scaled is None else plant.b0_over(throttle)
     text = plant.what_to_fly() if proposal.scaled is None else f"gain / lag: {proposal.scaled}"
-    text = f"{text[0].upper()}{text[1:]}"
     more = (
         " The best b0 is not gain / lag: the motors' own pole 1 / lag is a part of what the "
         "observer has to follow."
     )
-    return B0Section(measured, taken, curve, f"{text}.{more}")
+    return steps, B0Section(measured, taken, curve, f"{text[0].upper()}{text[1:]}.{more}")
 
 
-def _stage_rows(proposal: ADRCProposal, fresh: int) -> Table:
+def stage_table(proposal: ADRCProposal, fresh: int) -> Table:
+    """What parameters give on fresh plants, for the page."""
     number = lambda x: "-" if np.isnan(x) else f"{x:.0f}"
     rows = [
         [

@@ -17,7 +17,7 @@ from jaxquad.records import AXES
 
 from .._parameters import store_parameters
 from .._rate_design import Kind
-from .._rate_gains import LoopQualities
+from .._rate_loops import LoopQualities
 from ._adrc import FlownADRC
 from ._adrc_loops import (
     a_third,

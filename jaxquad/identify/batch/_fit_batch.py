@@ -30,17 +30,18 @@ from ..frequency_domain._cost import (
     Cost,
     least_coherence,
     MaximumLikelihood,
+    Mixing,
+    mixings_of,
     Points,
     points_of,
     Range,
     usable,
 )
 from ..frequency_domain._fit import check_options
-from ..frequency_domain._held import held, hold_of
-from ..frequency_domain._mixing import Mixing, mixings_of
 from ..frequency_domain._parameters import Free, Numbers, Parameters, select_parameters, Tie
 from ..frequency_domain._problem import make_problem
 from ..frequency_domain._result import Fit
+from ..frequency_domain._sampled import behind_hold, hold_of
 from ..frequency_domain._solve import solution_at, stopped_early
 from ..uncertainty._assess import assess
 from ..uncertainty._error_budget import weighting_at
@@ -84,7 +85,7 @@ def solve_batch(
     `weights` (batch, frequencies, outputs, inputs, 2) are those of `ln|T/T^|` and of the wrapped
     phase of `T/T^` in rad, as of `jq.fit`, 0 where a point does not count; `mixings`, one for each
     member or none at all, take points together that share noise. All start from the model's values,
-    or from `start`. The model is evaluated one frequency at a time, with inputs held for `hold` s
+    or from `start`. The model is evaluated at all frequencies at once, inputs held for `hold` s
     (0: not held). A member that did not reach a stationary point has `converged` false, and its
     decrement says how far it is; one in a local minimum shows by its cost alone.
     Raises ValueError for shapes that do not match, no batch at all, or a response that at one
@@ -373,7 +374,7 @@ def fit_batch(
 @eqx.filter_jit
 def _sizes(where, z) -> Float[Array, "batch frequencies outputs inputs"]:
     def one(z):
-        model = held(where.parameters.insert(where.model, z), where.hold)
+        model = behind_hold(where.parameters.insert(where.model, z), where.hold)
         return jnp.abs(evaluate_response(model, where.omega))
 
     return jax.vmap(one)(z)

@@ -14,11 +14,10 @@ from jaxquad._compile import evaluate_once
 from jaxquad._core import Normal
 from jaxquad.models import evaluate_response, StateSpace
 
-from ..frequency_domain._condition import UNCHANGED
-from ..frequency_domain._held import held
-from ..frequency_domain._mixing import Mixing
-from ..frequency_domain._parameters import Numbers, Parameters, Place
+from ..frequency_domain._cost import Mixing
+from ..frequency_domain._parameters import Numbers, Parameters, Place, UNCHANGED
 from ..frequency_domain._problem import Problem, problem_normal
+from ..frequency_domain._sampled import behind_hold
 
 
 class Member(NamedTuple):
@@ -150,7 +149,7 @@ def _columns(
     """
 
     def response(z):
-        model = held(_insert(batch.model, batch.parameters, z), batch.hold)
+        model = behind_hold(_insert(batch.model, batch.parameters, z), batch.hold)
         return evaluate_response(model, omega[None])[0]
 
     here, columns = response(z), []

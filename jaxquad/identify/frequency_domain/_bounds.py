@@ -11,7 +11,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from ._mixing import mix
+from ._cost import mix
 from ._problem import Problem
 from ._solve import Solution, solution_at, solve, weighted_residuals
 
@@ -80,7 +80,14 @@ def settle_at_bounds(
         low = np.flatnonzero(near).tolist()
         if not low:
             return solution
-        step = _one_sided_step(local, low)
+        from scipy.optimize import lsq_linear
+
+        # The Gauss-Newton step under which none near zero becomes negative; of these the value to
+        # go to, in units of what shows.
+        units, smallest = np.ones(z.size), np.full(z.size, -np.inf)
+        units[low], smallest[low] = visible[low], 0.0
+        bounds, rows = (smallest, np.inf), local.jacobian * units
+        step = lsq_linear(rows, -local.residual, bounds, method="bvls").x
         if not any(step[k] > _NEAR for k in low):
             at = z.copy()
             at[low] += np.log(_AT_ZERO * visible[low])
@@ -89,18 +96,6 @@ def settle_at_bounds(
         change[low] = np.log(np.maximum(step[low], _AT_ZERO) * visible[low])
         solution = solve(problem, z + change, solver, max_steps)
     return solution
-
-
-def _one_sided_step(local: Linearised, low: Sequence[int]) -> Vector:
-    """The Gauss-Newton step under which no parameter near zero becomes negative.
-
-    Of `z`, but of the parameters near zero: the value to go to, in units of what shows.
-    """
-    from scipy.optimize import lsq_linear
-
-    units, least = np.ones(local.jacobian.shape[1]), np.full(local.jacobian.shape[1], -np.inf)
-    units[low], least[low] = local.visible[low], 0.0
-    return lsq_linear(local.jacobian * units, -local.residual, (least, np.inf), method="bvls").x
 
 
 def polish(

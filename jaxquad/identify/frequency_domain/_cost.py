@@ -1,12 +1,27 @@
-"""Costs: weights on the logarithm of the ratio of model to measurement."""
+"""Costs: weights on the logarithm of the ratio of model to measurement, and shared noise.
+
+Points of a response that share noise count together: neighbours partly repeat one another.
+
+So do pairs of output and input at one frequency: outputs share noise, and inputs that a narrow
+window hardly tells apart share the outputs' noise. Whitened pair by pair along frequency, and then
+at each frequency across pairs, estimates are nearly as sharp as under the whole covariance.
+
+Under the inverse of their whole covariance the estimates would be the sharpest, but also trust
+what the covariance says of the small differences between neighbours, which nobody knows: they
+would follow any bias. So each point has a share of doubt, noise that it shares with none, as large
+as that of all the points that it shares noise with.
+"""
 
 import functools as ft
-from collections.abc import Mapping, Sequence
-from typing import Protocol, runtime_checkable
+import itertools
+from collections.abc import Callable, Mapping, Sequence
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Complex, Float
+from jaxtyping import Array, Bool, Complex, Float
 
 from jaxquad._core import Message, pytree_node
 from jaxquad.spectra import DOMINATED, FrequencyResponse
@@ -16,6 +31,9 @@ _COHERENT, _POOR = 0.6, 0.05  # least coherence: in general, and beside coherent
 _ENOUGH = 5  # coherent points beside which poor ones count
 _LARGEST = 0.3  # random error of a point that counts
 _DB = 20 / np.log(10)  # dB to a unit of natural logarithm
+_DECADE = 10.0
+_PRECISE = 0.1  # random error that noise alone does not reach
+_ALONE = 1.02  # sum of |rho|^2 below which all points of a pair count as independent
 _W_g, _W_p = 1.0, 0.01745  # so that 1 dB weighs as much as 7.57 deg
 
 Mask = Bool[np.ndarray, "frequencies outputs inputs"]
@@ -124,16 +142,16 @@ class MaximumLikelihood:
         return np.stack([root, root], axis=-1)
 
 
-def least_coherence(given: float | None, cost: Cost, frf: FrequencyResponse) -> float:
-    """The least coherence of a point that counts: as `given`, or what is best for the cost.
+def least_coherence(wanted: float | None, cost: Cost, frf: FrequencyResponse) -> float:
+    """The least coherence of a point that counts: as `wanted`, or what is best for the cost.
 
     A cost that knows the noise weighs poor points as they deserve; others have to do without them.
     So has the joint estimate, a ratio, whose error is no longer small where coherence is; and so
     have the direct estimate of a closed loop and a response that is coherent nowhere: what little
     they show may be noise that is fed back.
     """
-    if given is not None:
-        return given
+    if wanted is not None:
+        return wanted
     if not (isinstance(cost, MaximumLikelihood) and frf.method == "direct" and not frf.fed_back):
         return _COHERENT
     return _POOR if np.count_nonzero(usable(frf, None, _COHERENT)) >= _ENOUGH else _COHERENT
@@ -158,10 +176,45 @@ def usable(frf: FrequencyResponse, band: Band, least: float) -> Mask:
     error, averaged likewise, is below 30 %.
     """
     omega, error = np.asarray(frf.omega), np.asarray(frf.random_error)
-    known = np.isfinite(np.asarray(frf.response)) & np.isfinite(error)
-    coherent = _local_mean(omega, np.asarray(frf.coherence)) >= least
-    sharp = _local_mean(omega, np.fmin(error, 1.0)) <= _LARGEST
-    return known & coherent & sharp & _in_band(frf, band)
+    kernel = _third_of_an_octave(omega.tobytes())
+    mean = lambda values: (kernel @ values.reshape(len(values), -1)).reshape(values.shape)
+    finite = np.isfinite(np.asarray(frf.response)) & np.isfinite(error)
+    coherent = mean(np.asarray(frf.coherence)) >= least
+    sharp = mean(np.fmin(error, 1.0)) <= _LARGEST
+
+    def within(limits: Range | None) -> Bool[np.ndarray, " frequencies"]:
+        low, high = limits or (0.0, np.inf)
+        inside = (omega >= low) & (omega <= high)
+        if not low < high or not np.any(inside):
+            raise ValueError(
+                f"band {limits} rad/s holds none of the response's frequencies, which run from "
+                f"{omega[0]:.4g} to {omega[-1]:.4g} rad/s"
+            )
+        return inside
+
+    if not isinstance(band, Mapping):
+        return finite & coherent & sharp & within(band)[:, None, None]
+    inside, names = np.ones(error.shape, dtype=bool), (frf.output_names, frf.input_names)
+    pairs = list(itertools.product(*names))
+    for pair, limits in band.items():
+        if pair not in pairs:
+            raise ValueError(
+                f"no response pair {pair!r} for a band: (output, input) is one of {pairs}"
+            )
+        o, i = (side.index(name) for side, name in zip(names, pair, strict=True))
+        inside[:, o, i] = limits is not None and within(limits)
+    return finite & coherent & sharp & inside
+
+
+@ft.lru_cache(maxsize=16)
+def _third_of_an_octave(omega: bytes) -> Float[np.ndarray, "frequencies frequencies"]:
+    """Weights of a mean around each frequency (the bytes of their array, rad/s).
+
+    Choosing single points whose coherence came out high by chance would bias the fit.
+    """
+    place = np.log(np.frombuffer(omega))
+    kernel = np.exp(-0.5 * ((place[:, None] - place[None, :]) / 0.2) ** 2)
+    return kernel / kernel.sum(axis=1, keepdims=True)
 
 
 def describe_usable(frfs: Sequence[FrequencyResponse], points: int, least: float) -> str:
@@ -176,31 +229,26 @@ def describe_usable(frfs: Sequence[FrequencyResponse], points: int, least: float
     )
 
 
-_DECADE = 10.0
-_SURE = 0.1  # random error that noise alone does not reach
 WIDER_BAND = "wider band"  # kind of a remedy
 
 
-def widen_band(frfs: Sequence[FrequencyResponse], seen: Sequence[Mask]) -> Message | None:
-    """The advice to excite more than the band of the points `seen`, with numbers.
+def widen_band(frfs: Sequence[FrequencyResponse], used: Sequence[Mask]) -> Message | None:
+    """The advice to excite more than the band of the points `used`, with numbers.
 
     None where that is a decade or more, or nothing.
     """
-    rows = [np.asarray(f.omega)[np.any(m, axis=(1, 2))] for f, m in zip(frfs, seen, strict=True)]
+    rows = [np.asarray(f.omega)[np.any(m, axis=(1, 2))] for f, m in zip(frfs, used, strict=True)]
     omega = np.concatenate(rows)
     if not omega.size or np.max(omega) >= _DECADE * np.min(omega):
         return None
     low, high = float(np.min(omega)), float(np.max(omega))
+    hertz = lambda *ends: " to ".join(f"{end / (2 * np.pi):.3g}" for end in ends)
+    in_both = lambda low, high: f"{low:.3g} to {high:.3g} rad/s ({hertz(low, high)} Hz)"
     return Message(
-        f"excite the axis («jq.sweep») over more than {_in_both(low, high)}, the band that counts "
-        f"here: for instance {_in_both(low, _DECADE * low)}",
+        f"excite the axis («jq.sweep») over more than {in_both(low, high)}, the band that counts "
+        f"here: for instance {in_both(low, _DECADE * low)}",
         WIDER_BAND,
     )
-
-
-def _in_both(low: float, high: float) -> str:
-    turn = 2 * np.pi
-    return f"{low:.3g} to {high:.3g} rad/s ({low / turn:.3g} to {high / turn:.3g} Hz)"
 
 
 def precise_points(frf: FrequencyResponse) -> Mask:
@@ -210,17 +258,17 @@ def precise_points(frf: FrequencyResponse) -> Mask:
     """
     error = np.nan_to_num(np.asarray(frf.random_error), nan=1.0)
     dominated = any(remark.kind == DOMINATED for remark in frf.remarks)
-    return np.isfinite(np.asarray(frf.response)) & (error <= _SURE) & (not dominated)
+    return np.isfinite(np.asarray(frf.response)) & (error <= _PRECISE) & (not dominated)
 
 
 def points_of(frfs: Sequence[FrequencyResponse], used: Sequence[Mask]) -> list[Points]:
     """The points of several responses, with a floor of 0."""
-    found = []
+    points = []
     for frf, mask in zip(frfs, used, strict=True):
         shared, correlations = _shared_noise(frf, mask)
         between = _between_pairs(frf, mask)
-        found.append(Points(frf, mask, shared, np.zeros(mask.shape), correlations, between))
-    return found
+        points.append(Points(frf, mask, shared, np.zeros(mask.shape), correlations, between))
+    return points
 
 
 def _between_pairs(
@@ -236,13 +284,10 @@ def _between_pairs(
     response = np.where(used, np.asarray(frf.response), 1.0).reshape(len(used), -1)
     turn = np.exp(-1j * np.angle(response)) / size
     both = mine[:, :, None] & mine[:, None, :] & ~np.eye(count, dtype=bool)
-    whole = turn[:, :, None] * covariance * np.conj(turn)[:, None, :]
-    correlation = np.where(both, whole, np.eye(count, dtype=complex))
+    relative = turn[:, :, None] * covariance * np.conj(turn)[:, None, :]
+    correlation = np.where(both, relative, np.eye(count, dtype=complex))
     shared = np.sum(np.real(correlation) ** 2 + np.imag(correlation) ** 2, axis=2)
     return correlation if np.any(shared > _ALONE) else None
-
-
-_ALONE = 1.02  # sum of |rho|^2 below which all points of a pair count as independent
 
 
 def _shared_noise(
@@ -266,55 +311,162 @@ def _shared_noise(
     return shared, correlations
 
 
-def _in_band(
-    frf: FrequencyResponse, band: Band
-) -> Bool[np.ndarray, " frequencies #outputs #inputs"]:
-    if not isinstance(band, Mapping):
-        return _between(frf, band)[:, None, None]
-    inside = np.ones(frf.response.shape, dtype=bool)
-    for pair, limits in band.items():
-        if pair not in (pairs := _pairs(frf)):
-            raise ValueError(
-                f"no response pair {pair!r} for a band: (output, input) is one of {list(pairs)}"
-            )
-        inside[(slice(None), *pairs[pair])] = limits is not None and _between(frf, limits)
-    return inside
+_DOUBT = 0.3  # of the variance of a point's share in the noise of all points
+
+Square = Complex[np.ndarray, "outputs inputs frequencies frequencies"]
+Across = Complex[np.ndarray, "frequencies pairs pairs"]
 
 
-def _pairs(frf: FrequencyResponse) -> dict[tuple[str, str], tuple[int, int]]:
-    return {
-        (output, source): (o, i)
-        for o, output in enumerate(frf.output_names)
-        for i, source in enumerate(frf.input_names)
-    }
+class Mixing(NamedTuple):
+    """How the weighted points of one response are taken together.
 
-
-def _between(frf: FrequencyResponse, band: Range | None) -> Bool[np.ndarray, " frequencies"]:
-    omega = np.asarray(frf.omega)
-    low, high = band or (0.0, np.inf)
-    if not low < high or not np.any((omega >= low) & (omega <= high)):
-        raise ValueError(
-            f"band {band} rad/s holds none of the response's frequencies, which run from "
-            f"{omega[0]:.4g} to {omega[-1]:.4g} rad/s"
-        )
-    return (omega >= low) & (omega <= high)
-
-
-def _local_mean(
-    omega: Float[np.ndarray, " frequencies"],
-    values: Float[np.ndarray, "frequencies outputs inputs"],
-) -> Float[np.ndarray, "frequencies outputs inputs"]:
-    """Mean over about a third of an octave.
-
-    Choosing single points whose own coherence came out high by chance would bias the fit.
+    The weighted misfits, magnitude as the real part and phase as the imaginary one, are multiplied
+    by `factor` along frequency, and then by `across` at each frequency, output by output; both are
+    triangular, and the identity where no noise is shared. `correlation` and `between` are those of
+    the noise, relative to the response. A single pair has no `across`.
     """
-    kernel = _third_of_an_octave(omega.tobytes())
-    return (kernel @ values.reshape(len(values), -1)).reshape(values.shape)
+
+    factor: Square
+    correlation: Square
+    across: Across | None = None
+    between: Across | None = None
+    idle: Bool[np.ndarray, ""] | None = None  # whether nothing is mixed, if programs are to ask
 
 
-@ft.lru_cache(maxsize=16)
-def _third_of_an_octave(omega: bytes) -> Float[np.ndarray, "frequencies frequencies"]:
-    """Weights of a mean around each frequency (the bytes of their array, rad/s)."""
-    place = np.log(np.frombuffer(omega))
-    kernel = np.exp(-0.5 * ((place[:, None] - place[None, :]) / 0.2) ** 2)
-    return kernel / kernel.sum(axis=1, keepdims=True)
+def mixings_of(points: Sequence[Points], weights: Sequence[Weights]) -> tuple[Mixing | None, ...]:
+    """One for each response, `None` where the points share no noise."""
+    return tuple(_mixing(*pair) for pair in zip(points, weights, strict=True))
+
+
+def _mixing(points: Points, weights: Weights) -> Mixing | None:
+    if not points.correlations and points.between is None:
+        return None
+    none = unmixed(points.used.shape)
+    factor, correlation = np.array(none.factor), np.array(none.correlation)
+    for (o, i), shared in points.correlations.items():
+        mine = np.flatnonzero(points.used[:, o, i])
+        # A floor on the error is shared with no other point.
+        alone = np.minimum((weights[mine, o, i, 0] * points.floor[mine, o, i]) ** 2, 1.0)
+        size = np.sqrt((1 - alone) / points.shared[mine, o, i])
+        total = size[:, None] * shared * size + np.diag(alone + _DOUBT)
+        root = np.sqrt(1 + _DOUBT) * np.linalg.inv(np.linalg.cholesky(total))
+        factor[o, i][np.ix_(mine, mine)] = root
+        correlation[o, i][np.ix_(mine, mine)] = shared
+    across, between = none.across, none.between
+    if points.between is not None:  # what whitens the pairs at each frequency
+        alone = np.minimum((weights[..., 0] * points.floor) ** 2, 1.0).reshape(len(weights), -1)
+        size, identity = np.sqrt(1 - alone), np.eye(alone.shape[1])
+        total = size[:, :, None] * points.between * size[:, None, :]
+        total = total + (alone + _DOUBT)[:, :, None] * identity
+        across = np.sqrt(1 + _DOUBT) * np.linalg.inv(np.linalg.cholesky(total))
+        between = points.between
+    return Mixing(factor, correlation, across, between, np.array(False))
+
+
+@ft.lru_cache(maxsize=8)
+def unmixed(shape: tuple[int, ...]) -> Mixing:
+    """The mixing of (frequencies, outputs, inputs) that share no noise: identities."""
+    count, outputs, inputs = shape
+    pairs, identity = outputs * inputs, np.eye(count, dtype=complex)
+    along = np.broadcast_to(identity, (2, outputs, inputs, count, count))
+    if pairs == 1:
+        return Mixing(*along, idle=np.array(True))
+    across = np.broadcast_to(np.eye(pairs, dtype=complex), (2, count, pairs, pairs))
+    return Mixing(*along, *across, idle=np.array(True))
+
+
+def mix(
+    mixing: Mixing | None, weighted: Float[np.ndarray, "frequencies outputs inputs 2 *columns"]
+) -> Float[np.ndarray, "frequencies outputs inputs 2 *columns"]:
+    """Weighted misfits, or their slopes, taken together."""
+    return weighted if mixing is None else _through(weighted, lambda x: mix_complex(mixing, x))
+
+
+def mix_twice(
+    mixing: Mixing | None, weighted: Float[np.ndarray, "frequencies outputs inputs 2 *columns"]
+) -> Float[np.ndarray, "frequencies outputs inputs 2 *columns"]:
+    """The same by the factors and then by their adjoints."""
+    if mixing is None:
+        return weighted
+
+    def twice(x: Complex[np.ndarray, "outputs inputs frequencies columns"]) -> np.ndarray:
+        mixed = mix_complex(mixing, x)
+        if mixing.across is not None:
+            mixed = _apply_across(np.conj(np.swapaxes(mixing.across, 1, 2)), mixed)
+        return np.conj(np.swapaxes(mixing.factor, 2, 3)) @ mixed
+
+    return _through(weighted, twice)
+
+
+def mix_complex(
+    mixing: Mixing, x: Complex[np.ndarray, "outputs inputs frequencies columns"]
+) -> Complex[np.ndarray, "outputs inputs frequencies columns"]:
+    """As `mix`, of magnitude and phase in one number."""
+    mixed = mixing.factor @ x
+    return mixed if mixing.across is None else _apply_across(mixing.across, mixed)
+
+
+def _apply_across(across: Across, x: np.ndarray) -> np.ndarray:
+    outputs, inputs, count, columns = x.shape
+    pairs = np.moveaxis(x.reshape(outputs * inputs, count, columns), 0, 1)
+    return np.moveaxis(across @ pairs, 1, 0).reshape(x.shape)
+
+
+def _through(weighted: np.ndarray, apply: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+    joined = np.moveaxis(weighted[:, :, :, 0] + 1j * weighted[:, :, :, 1], 0, 2)
+    flat = apply(joined.reshape(*joined.shape[:3], -1))
+    turned = np.moveaxis(flat.reshape(joined.shape), 2, 0)
+    return np.stack([np.real(turned), np.imag(turned)], axis=3)
+
+
+def expected_cost(
+    mixing: Mixing | None, sizes: Float[np.ndarray, "frequencies outputs inputs 2"]
+) -> Float[np.ndarray, "outputs inputs"]:
+    """What noise alone leaves of each pair's cost; `sizes` are weights times random errors.
+
+    Whitened along frequency, pairs count as correlated at each frequency as before.
+    """
+    if mixing is None:
+        return np.sum(sizes**2, axis=(0, 3))
+    size = np.moveaxis(sizes[..., 0], 0, -1)
+    noise = size[..., :, None] * mixing.correlation * size[..., None, :]
+    shaped = mixing.factor @ noise
+    if mixing.across is None or mixing.between is None:
+        return 2 * np.real(np.einsum("oifg,oifg->oi", shaped, np.conj(mixing.factor)))
+    power = np.real(np.einsum("oifg,oifg->foi", shaped, np.conj(mixing.factor)))
+    deviation = np.sqrt(np.maximum(power, 0.0)).reshape(len(power), -1)
+    noise = deviation[:, :, None] * mixing.between * deviation[:, None, :]
+    left = np.sum(np.real(mixing.across @ noise * np.conj(mixing.across)), axis=(0, 2))
+    return 2 * left.reshape(power.shape[1:])
+
+
+def mix_parts(
+    mixing: Mixing | None,
+    real: Float[Array, "*columns outputs inputs frequencies"],
+    imag: Float[Array, "*columns outputs inputs frequencies"],
+) -> tuple[Array, Array]:
+    """As `mix`, in JAX, with frequencies last."""
+    if mixing is None:
+        return real, imag
+
+    def turned(real: Array, imag: Array) -> tuple[Array, Array]:
+        turn = lambda matrix, part: jnp.einsum("oifg,...oig->...oif", matrix, part)
+        along = _turn_parts(turn, mixing.factor, real, imag)
+        if mixing.across is None:
+            return along
+        shape = real.shape
+        flat = (part.reshape(*shape[:-3], -1, shape[-1]) for part in along)
+        turn = lambda matrix, part: jnp.einsum("fpq,...qf->...pf", matrix, part)
+        real, imag = _turn_parts(turn, mixing.across, *flat)
+        return real.reshape(shape), imag.reshape(shape)
+
+    if mixing.idle is None:
+        return turned(real, imag)
+    return jax.lax.cond(mixing.idle, lambda *same: same, turned, real, imag)
+
+
+def _turn_parts(
+    turn: Callable[[Array, Array], Array], matrix: np.ndarray | Array, real: Array, imag: Array
+) -> tuple[Array, Array]:
+    c, s = jnp.real(matrix), jnp.imag(matrix)
+    return turn(c, real) - turn(s, imag), turn(s, real) + turn(c, imag)

@@ -17,7 +17,6 @@ from ..uncertainty._error_budget import Weighting, weighting_at
 from ..uncertainty._fit_remarks import DOUBT
 from ..uncertainty._verdict import Verdict, without_numbers
 from ._bounds import settle_at_bounds, solve_within_bounds
-from ._condition import Condition
 from ._cost import (
     Band,
     Cost,
@@ -25,6 +24,8 @@ from ._cost import (
     least_coherence,
     Mask,
     MaximumLikelihood,
+    Mixing,
+    mixings_of,
     Points,
     points_of,
     precise_points,
@@ -33,10 +34,15 @@ from ._cost import (
     Weights,
     widen_band,
 )
-from ._mixing import Mixing, mixings_of
-from ._model_checks import require_model, require_model_response
-from ._parameters import Free, Parameters, select_parameters, Tie
-from ._problem import make_problem, Prior, Problem, require_priors
+from ._parameters import Condition, Free, Parameters, select_parameters, Tie
+from ._problem import (
+    make_problem,
+    Prior,
+    Problem,
+    require_model,
+    require_model_response,
+    require_priors,
+)
 from ._refits import Options, Origin
 from ._result import Fit
 from ._solve import Solution
@@ -162,42 +168,36 @@ def fit_with(
     """
     small = all(np.size(frf.omega) <= _SMALL for frf in frfs)
     with one_blas_thread() if small else contextlib.nullcontext():
-        return _fit_with(model, frfs, options, rounds)
-
-
-def _fit_with(
-    model: PyTree, frfs: Sequence[FrequencyResponse], options: Options, rounds: int
-) -> Fit:
-    model, cost, band = with_arrays(model), options.cost, options.band
-    parameters = select_parameters(model, options.free, options.tied)
-    least = [least_coherence(options.min_coherence, cost, frf) for frf in frfs]
-    usable_points = [usable(frf, band, limit) for frf, limit in zip(frfs, least, strict=True)]
-    require_priors(model, options.priors)
-    if options.priors and not isinstance(cost, MaximumLikelihood):
-        raise ValueError(
-            Message(
-                "a prior needs a cost that knows the noise, and that of Eq. (14) does not: leave "
-                "«cost=» at its default, jq.identify.MaximumLikelihood()"
+        model, cost, band = with_arrays(model), options.cost, options.band
+        parameters = select_parameters(model, options.free, options.tied)
+        least = [least_coherence(options.min_coherence, cost, frf) for frf in frfs]
+        usable_points = [usable(frf, band, limit) for frf, limit in zip(frfs, least, strict=True)]
+        require_priors(model, options.priors)
+        if options.priors and not isinstance(cost, MaximumLikelihood):
+            raise ValueError(
+                Message(
+                    "a prior needs a cost that knows the noise, and that of Eq. (14) does not: "
+                    "leave «cost=» at its default, jq.identify.MaximumLikelihood()"
+                )
             )
-        )
-    too_few = _too_few_points(frfs, usable_points, parameters, max(least), band)
-    if too_few is not None:
-        remarks = dict.fromkeys(remark for frf in frfs for remark in frf.remarks)
-        return unfitted(model, parameters, too_few, tuple(remarks))
-    problem = make_problem(model, parameters, frfs, options.conditions, options.priors)
-    pairs = zip(usable_points, problem.silences, strict=True)
-    points = points_of(frfs, [mask & ~silent for mask, silent in pairs])
-    problem, solution, minima = _solve_reweighted(problem, points, options)
-    check_priors(problem, solution)
-    problem, solution, weighting = _solve_with_floor(problem, points, solution, options, rounds)
-    further = _remarks_on_silence(frfs, usable_points, problem)
-    origin = Origin(fit_with, tuple(points), options)
-    return assess(problem, weighting, solution, minima, further=further, origin=origin)
+        too_few = _too_few_points(frfs, usable_points, parameters, max(least), band)
+        if too_few is not None:
+            remarks = dict.fromkeys(remark for frf in frfs for remark in frf.remarks)
+            return unfitted(model, parameters, too_few, tuple(remarks))
+        problem = make_problem(model, parameters, frfs, options.conditions, options.priors)
+        pairs = zip(usable_points, problem.silences, strict=True)
+        points = points_of(frfs, [mask & ~silent for mask, silent in pairs])
+        problem, solution, minima = _solve_reweighted(problem, points, options)
+        check_priors(problem, solution)
+        problem, solution, weighting = _solve_with_floor(problem, points, solution, options, rounds)
+        further = _remarks_on_silence(frfs, usable_points, problem)
+        origin = Origin(fit_with, tuple(points), options)
+        return assess(problem, weighting, solution, minima, further=further, origin=origin)
 
 
 def _remarks_on_silence(
     frfs: Sequence[FrequencyResponse], usable_points: Sequence[Mask], problem: Problem
-) -> list[str]:
+) -> list[Message]:
     """Remark on responses that were measured, and that the model has none of."""
     remarks = []
     for frf, mask, pairs in zip(frfs, usable_points, problem.silent, strict=True):
@@ -206,11 +206,12 @@ def _remarks_on_silence(
             if not error.size or np.mean(error < _PRESENT) < 0.5:
                 continue
             pair = (frf.output_names[o], frf.input_names[i])
-            remarks.append(
+            text = (
                 f"{pair[0]} answers to {pair[1]} (random error {100 * np.median(error):.2g} % at "
                 f"{error.size} frequencies), but the model's response is zero: these points are "
                 f"left out; free what joins the two, or say band={{{pair}: None}}"
             )
+            remarks.append(Message(text, "no response"))
     return remarks
 
 

@@ -1,12 +1,10 @@
 """A fit as text, and as the content of `result.json`."""
 
-from collections.abc import Sequence
 from typing import NamedTuple, TYPE_CHECKING
 
 import numpy as np
 
-from ..uncertainty._derived import Tied
-from ..uncertainty._discrepancy import Discrepancy, SHARES
+from ..uncertainty._error_budget import SHARES
 
 
 if TYPE_CHECKING:
@@ -14,17 +12,26 @@ if TYPE_CHECKING:
 
 
 _SHOWN = 6  # optima of several starts
+_MARK = " *"  # behind the name of a parameter that is not determined
+_NO_PERCENTS = f"{'-':>7} {'-':>9}"
+_BY_NOISE = f"{'by noise alone':>23} {'width':>6}"
+_NOT_DETERMINED = {
+    "no minimum": "not determined, because the fit found no minimum",
+    "no model": "not determined, because no model of this structure holds",
+}
 
 
 def fit_table(fit: "Fit") -> str:
     """The verdict where it is a refusal, the table of parameters, and how good the fit is."""
     lines = [] if fit.identifiable else [str(fit.verdict)]
     if fit.verdict.fitted:
-        lines += [*_parameters(fit), _quality(fit), *_minima(fit)]
+        lines += [*_parameter_lines(fit), *_quality_lines(fit)]
     return "\n".join(lines + [f"! {remark}" for remark in fit.remarks])
 
 
-_MARK = " *"  # behind the name of a parameter that is not determined
+def counted(number: int, one: str, many: str = "") -> str:
+    """`1 start`, `2 starts`."""
+    return f"{number} {one if number == 1 else many or one + 's'}"
 
 
 class _Row(NamedTuple):
@@ -32,10 +39,11 @@ class _Row(NamedTuple):
 
     name: str
     unit: str
-    value: str
-    error: str
-    interval: str
-    beside: str  # what the noise alone says
+    value: float
+    error: float
+    interval: tuple[float, float]
+    noise_interval: tuple[float, float]
+    width: str  # what makes the interval as wide as it is
     percents: str  # Cramer-Rao bound and insensitivity
     determined: bool
 
@@ -44,110 +52,70 @@ class _Row(NamedTuple):
         return self.name if self.determined else f"{self.name}{_MARK}"
 
 
-def _parameters(fit: "Fit") -> list[str]:
-    tied = fit.tied
-    rows = [*(_free(fit, k) for k in range(len(fit.names))), *(_of_tied(fit, t) for t in tied)]
+def _parameter_lines(fit: "Fit") -> list[str]:
+    rows, discrepancy = [], fit.discrepancy
+    units = fit.parameter_units or ("",) * len(fit.names)
+    for k, (name, unit) in enumerate(zip(fit.names, units, strict=True)):
+        bounds, percents = (fit.cramer_rao[k], fit.insensitivity[k]), _NO_PERCENTS
+        if np.isfinite(bounds[1]):
+            percents = f"{bounds[0]:7.2f} {bounds[1]:9.2f}"
+        intervals = fit.interval(name), fit.interval(name, model_error=False)
+        width = "" if discrepancy is None else discrepancy.widths[k]
+        numbers = (fit.values[k], fit.standard_errors[k], *intervals)
+        rows.append(_Row(name, unit, *numbers, width, percents, bool(fit.determined[k])))
+    for tied in fit.tied:
+        intervals = tied.interval(), tied.interval(model_error=False)
+        numbers = (tied.value, tied.standard_error, *intervals)
+        rows.append(_Row(tied.name, "", *numbers, "tied", _NO_PERCENTS, tied.determined))
     width = max(9, *(len(row.label) for row in rows))
     wide = max(len(row.unit) for row in rows)
-    apart = fit.discrepancy is not None
-    lines = [_heads(fit, width, wide)]
+    pad = lambda text: [f"{text:<{max(4, wide)}}"] if wide else []
+    heads = [f"{'parameter':<{width}}", *pad("unit"), f"{'value':>11}", f"{'std. error':>10}"]
+    heads += [f"{'95 % interval':>23}", *([_BY_NOISE] if discrepancy is not None else [])]
+    heads += [f"{'CR %':>7}", f"{'insens. %':>9}"]
+    lines = [" ".join([*heads, *([] if fit.identifiable else [f"{'stopped at':>11}"])])]
+    between = lambda ends: f"{ends[0]:.5g} .. {ends[1]:.5g}"
     for row in rows:
-        value, interval, stopped = row.value, row.interval, ""
+        value, interval, stopped = f"{row.value:.5g}", between(row.interval), ""
+        by_noise = f"{between(row.noise_interval):>23} {row.width:>6}"
         if not row.determined:
-            value, interval, stopped = "-", "not determined", row.value
-        cells = [f"{row.unit:<{max(4, wide)}}"] if wide else []
-        cells += [f"{value:>11}", row.error, f"{interval:>23}", *([row.beside] if apart else [])]
+            value, interval, stopped = "-", "not determined", value
+            by_noise = " " * len(_BY_NOISE)
+        cells = [f"{row.label:<{width}}", *pad(row.unit), f"{value:>11}", f"{row.error:10.2g}"]
+        cells += [f"{interval:>23}", *([by_noise] if discrepancy is not None else [])]
+        lines.append(" ".join([*cells, row.percents, f"{stopped:>11}"]).rstrip())
+    if fit.tied:
+        ties = (f"{t.name} to {', '.join(t.follows) or 'fixed numbers'}" for t in fit.tied)
+        lines.append(f"tied: {'; '.join(ties)}")
+    if discrepancy is not None:
+        size, degrees = 100 * SHARES[0] * discrepancy.amplitude, np.degrees(discrepancy.amplitude)
+        none = f" (probability of none: {100 * discrepancy.none:.0f} %)"
         lines.append(
-            " ".join([f"{row.label:<{width}}", *cells, row.percents, f"{stopped:>11}"]).rstrip()
+            f"95 % intervals count model error: {size:.2g} % of magnitude, {degrees:.2g} deg of "
+            f"phase{none if discrepancy.none > 0.05 else ''}"
         )
-    lines += _ties(tied)
-    if apart:
-        lines.append(_how_wide(fit))
+        if "prior" in discrepancy.widths:
+            lines.append(
+                "width prior: the record cannot show this error; it is that of usual models"
+            )
     if not fit.identifiable:
-        why = _NOT_DETERMINED.get(fit.verdict.kind, _INDIVIDUALLY)
+        individually = "this record does not determine it individually"
+        why = _NOT_DETERMINED.get(fit.verdict.kind, individually)
         lines.append(f"* {why}: where the solver stopped is for comparison alone")
     return lines
 
 
-def _heads(fit: "Fit", width: int, wide: int) -> str:
-    heads = [f"{'parameter':<{width}}", *([f"{'unit':<{max(4, wide)}}"] if wide else [])]
-    heads += [f"{'value':>11}", f"{'std. error':>10}", f"{'95 % interval':>23}"]
-    heads += [_BESIDE] if fit.discrepancy is not None else []
-    heads += [f"{'CR %':>7}", f"{'insens. %':>9}"]
-    return " ".join([*heads, *([] if fit.identifiable else [f"{'stopped at':>11}"])])
-
-
-def _free(fit: "Fit", k: int) -> _Row:
-    low, high = fit.interval(fit.names[k])
-    known = np.isfinite(fit.insensitivity[k])
-    return _Row(
-        fit.names[k],
-        fit.parameter_units[k] if fit.parameter_units else "",
-        f"{fit.values[k]:.5g}",
-        f"{fit.standard_errors[k]:10.2g}",
-        f"{low:.5g} .. {high:.5g}",
-        _by_noise(fit, k),
-        f"{fit.cramer_rao[k]:7.2f} {fit.insensitivity[k]:9.2f}" if known else _NO_PERCENTS,
-        bool(fit.determined[k]),
-    )
-
-
-def _of_tied(fit: "Fit", tied: Tied) -> _Row:
-    intervals = (tied.interval(), tied.interval(model_error=False))
-    both, alone = (f"{low:.5g} .. {high:.5g}" for low, high in intervals)
-    beside = f"{alone:>23} {'tied':>6}" if tied.determined else " " * len(_BESIDE)
-    number = f"{tied.value:.5g}", f"{tied.standard_error:10.2g}"
-    return _Row(tied.name, "", *number, both, beside, _NO_PERCENTS, tied.determined)
-
-
-def _ties(tied: Sequence[Tied]) -> list[str]:
-    """What each tied parameter follows."""
-    texts = [f"{each.name} to {', '.join(each.follows) or 'fixed numbers'}" for each in tied]
-    return [f"tied: {'; '.join(texts)}"] if texts else []
-
-
-_NO_PERCENTS = f"{'-':>7} {'-':>9}"
-_INDIVIDUALLY = "this record does not determine it individually"
-_NOT_DETERMINED = {
-    "no minimum": "not determined, because the fit found no minimum",
-    "no model": "not determined, because no model of this structure holds",
-}
-_BESIDE = f"{'by noise alone':>23} {'width':>6}"
-
-
-def _by_noise(fit: "Fit", k: int) -> str:
-    """The interval by the noise alone, and what makes the other one as wide as it is."""
-    if fit.discrepancy is None or not fit.determined[k]:
-        return " " * len(_BESIDE)
-    low, high = fit.interval(fit.names[k], model_error=False)
-    return f"{f'{low:.5g} .. {high:.5g}':>23} {fit.discrepancy.widths[k]:>6}"
-
-
-def _how_wide(fit: "Fit") -> str:
-    """What the model leaves unexplained, and what the words under "width" mean."""
-    found = fit.discrepancy
-    if found is None:
-        return ""
-    size, degrees = 100 * SHARES[0] * found.amplitude, np.degrees(found.amplitude)
-    text = f"95 % intervals count model error: {size:.2g} % of magnitude, {degrees:.2g} deg"
-    text += " of phase"
-    text += f" (probability of none: {100 * found.none:.0f} %)" if found.none > 0.05 else ""
-    if "prior" in found.widths:
-        text += "\nwidth prior: the record cannot show this error; it is that of usual models"
-    return text
-
-
-def counted(number: int, one: str, many: str = "") -> str:
-    """`1 start`, `2 starts`."""
-    return f"{number} {one if number == 1 else many or one + 's'}"
-
-
-def _minima(fit: "Fit") -> list[str]:
-    """The optima at which the starts ended, if there were several."""
-    if not fit.minima:
-        return []
-    starts = sum(len(point.starts) for point in fit.minima)
-    lines = [f"{counted(starts, 'start')}, {counted(len(fit.minima), 'optimum', 'optima')}:"]
+def _quality_lines(fit: "Fit") -> list[str]:
+    """How good the fit is, and the optima at which the starts ended, if there were several."""
+    condition = f"{fit.condition:.3g}" if fit.condition < 1e6 else "singular"
+    lines = [
+        f"cost {fit.cost:.4g} (average {fit.average_cost:.4g}), misfit / random error "
+        f"{np.sqrt(fit.chi_squared):.2f}, {fit.points} points, condition {condition}, "
+        f"Newton decrement {fit.newton_decrement:.1e}, {counted(fit.steps, 'step')}"
+    ]
+    if fit.minima:
+        starts = counted(sum(len(point.starts) for point in fit.minima), "start")
+        lines.append(f"{starts}, {counted(len(fit.minima), 'optimum', 'optima')}:")
     for point in fit.minima[:_SHOWN]:
         values = ", ".join(f"{value:.4g}" for value in point.values)
         lines.append(f"  cost {point.cost:9.4g} from {len(point.starts)}: {point.kind}; {values}")
@@ -155,44 +123,71 @@ def _minima(fit: "Fit") -> list[str]:
     return lines + ([f"  and {rest} more of higher cost"] if rest > 0 else [])
 
 
-def _quality(fit: "Fit") -> str:
-    condition = f"{fit.condition:.3g}" if fit.condition < 1e6 else "singular"
-    return (
-        f"cost {fit.cost:.4g} (average {fit.average_cost:.4g}), misfit / random error "
-        f"{np.sqrt(fit.chi_squared):.2f}, {fit.points} points, condition {condition}, "
-        f"Newton decrement {fit.newton_decrement:.1e}, {counted(fit.steps, 'step')}"
-    )
-
-
 def fit_content(fit: "Fit") -> dict[str, object]:
     """The verdict of a fit, and the numbers where something was fitted."""
-    verdict = {
-        "kind": fit.verdict.kind,
-        "summary": fit.verdict.summary,
-        "undetermined": fit.verdict.undetermined,
-        "reasons": fit.verdict.reasons,
-        "remedies": fit.verdict.remedies,
-        "bounds": [bound._asdict() for bound in fit.verdict.bounds],
-    }
-    known: dict[str, object] = {
+    verdict, discrepancy = fit.verdict, fit.discrepancy
+    content: dict[str, object] = {
         "identifiable": fit.identifiable,
-        "verdict": verdict,
+        "verdict": {
+            "kind": verdict.kind,
+            "summary": verdict.summary,
+            "undetermined": verdict.undetermined,
+            "reasons": verdict.reasons,
+            "remedies": verdict.remedies,
+            "bounds": [bound._asdict() for bound in verdict.bounds],
+        },
         "remarks": fit.remarks,
     }
-    if not fit.verdict.fitted:
-        return known
+    if not verdict.fitted:
+        return content
+    parameters = [
+        {
+            "name": name,
+            "unit": fit.parameter_units[k] if fit.parameter_units else None,
+            "value": fit.values[k],
+            "standard_error": fit.standard_errors[k],
+            "determined": bool(fit.determined[k]),
+            "interval_95": fit.interval(name),
+            "noise_standard_error": fit.noise_standard_errors[k],
+            "noise_interval_95": fit.interval(name, model_error=False),
+            "width": None if discrepancy is None else discrepancy.widths[k],
+            "cramer_rao_percent": fit.cramer_rao[k],
+            "insensitivity_percent": fit.insensitivity[k],
+        }
+        for k, name in enumerate(fit.names)
+    ]
+    ties = [
+        {
+            "name": tied.name,
+            "tied_to": tied.follows,
+            "value": tied.value,
+            "standard_error": tied.standard_error,
+            "determined": tied.determined,
+            "interval_95": tied.interval(),
+            "noise_standard_error": tied.noise_standard_error,
+            "noise_interval_95": tied.interval(model_error=False),
+        }
+        for tied in fit.tied
+    ]
+    size = None
+    if discrepancy is not None:
+        size = {
+            "amplitude_rad": discrepancy.amplitude,
+            "length_ln_omega": discrepancy.length,
+            "probability_of_none": discrepancy.none,
+        }
     return {
-        **known,
-        "parameters": [_parameter(fit, k) for k in range(len(fit.names))],
-        "tied": [_tied_content(each) for each in fit.tied],
+        **content,
+        "parameters": parameters,
+        "tied": ties,
         "combinations": [
             combination.content() | {"interval_95": combination.interval}
             for combination in fit.combinations
         ],
-        "null_directions": fit.verdict.null_directions,
+        "null_directions": verdict.null_directions,
         "covariance": fit.covariance,
         "noise_covariance": fit.noise_covariance,
-        "discrepancy": None if fit.discrepancy is None else _discrepancy(fit.discrepancy),
+        "discrepancy": size,
         "cost": fit.cost,
         "average_cost": fit.average_cost,
         "chi_squared": fit.chi_squared,
@@ -200,41 +195,4 @@ def fit_content(fit: "Fit") -> dict[str, object]:
         "newton_decrement": fit.newton_decrement,
         "points": fit.points,
         "steps": fit.steps,
-    }
-
-
-def _parameter(fit: "Fit", k: int) -> dict[str, object]:
-    return {
-        "name": fit.names[k],
-        "unit": fit.parameter_units[k] if fit.parameter_units else None,
-        "value": fit.values[k],
-        "standard_error": fit.standard_errors[k],
-        "determined": bool(fit.determined[k]),
-        "interval_95": fit.interval(fit.names[k]),
-        "noise_standard_error": fit.noise_standard_errors[k],
-        "noise_interval_95": fit.interval(fit.names[k], model_error=False),
-        "width": None if fit.discrepancy is None else fit.discrepancy.widths[k],
-        "cramer_rao_percent": fit.cramer_rao[k],
-        "insensitivity_percent": fit.insensitivity[k],
-    }
-
-
-def _tied_content(tied: Tied) -> dict[str, object]:
-    return {
-        "name": tied.name,
-        "tied_to": tied.follows,
-        "value": tied.value,
-        "standard_error": tied.standard_error,
-        "determined": tied.determined,
-        "interval_95": tied.interval(),
-        "noise_standard_error": tied.noise_standard_error,
-        "noise_interval_95": tied.interval(model_error=False),
-    }
-
-
-def _discrepancy(found: Discrepancy) -> dict[str, object]:
-    return {
-        "amplitude_rad": found.amplitude,
-        "length_ln_omega": found.length,
-        "probability_of_none": found.none,
     }

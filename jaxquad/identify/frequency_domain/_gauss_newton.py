@@ -63,7 +63,7 @@ class DampedGaussNewton(optx.AbstractLeastSquaresSolver):
         return y, aux, {}
 
     def _evaluation(self, fn: Callable[..., PyTree], args: PyTree) -> Callable[[Array], Normal]:
-        known = self.normal
-        if known is not None:
-            return lambda z: known(z, args)
+        normal = self.normal
+        if normal is not None:
+            return lambda z: normal(z, args)
         return lambda z: normal_equations(lambda z, args: fn(z, args)[0], z, args)

@@ -1,4 +1,4 @@
-"""Which numbers of a model are free, under which names, and how each is scaled."""
+"""Which numbers of a model are free, how they are scaled, and how records change them."""
 
 import functools as ft
 from collections.abc import Callable, Mapping, Sequence
@@ -10,8 +10,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
-from jaxquad._core import is_concrete, pytree_node, require_float64
+from jaxquad._core import (
+    is_concrete,
+    pytree_node,
+    require_finite,
+    require_float64,
+    require_positive,
+)
 from jaxquad.models import is_optional, StateSpace
+
+
+_MOVED = 1.01  # factor on the free parameters at which ties are looked at
 
 
 class Positive(NamedTuple):
@@ -101,34 +110,27 @@ def namespace_of(x: Numbers):
 
 def with_values(model: PyTree, places: Sequence[Place], values: Float[Numbers, " n"]) -> PyTree:
     """Return `model` with the numbers at `places` replaced by `values`; see `Parameters`."""
-    whole, structure = jax.tree.flatten(model)
-    numbers = [k for k, leaf in enumerate(whole) if eqx.is_inexact_array(leaf)]
-    leaves = [whole[k] for k in numbers]
-
-    def rebuilt() -> PyTree:
-        for k, leaf in zip(numbers, leaves, strict=True):
-            whole[k] = leaf
-        return jax.tree.unflatten(structure, whole)
-
-    if namespace_of(values) is np:
+    all_leaves, structure = jax.tree.flatten(model)
+    numbers = [k for k, leaf in enumerate(all_leaves) if eqx.is_inexact_array(leaf)]
+    leaves, host = [all_leaves[k] for k in numbers], namespace_of(values) is np
+    if host:
         leaves = [np.array(leaf) if is_concrete(leaf) else leaf for leaf in leaves]
-        if all(isinstance(leaf, np.ndarray) for leaf in leaves):
-            for place, value in zip(places, values, strict=True):
-                leaves[place.leaf].reshape(-1)[place.index] = value
-            return rebuilt()
-    for leaf in {place.leaf for place in places}:
+    in_place = [host and isinstance(leaves[place.leaf], np.ndarray) for place in places]
+    for place, value, numpy in zip(places, values if host else places, in_place, strict=True):
+        if numpy:
+            leaves[place.leaf].reshape(-1)[place.index] = value
+    for leaf in {place.leaf for place, numpy in zip(places, in_place, strict=True) if not numpy}:
         mine = np.array([k for k, place in enumerate(places) if place.leaf == leaf])
         index = np.array([places[k].index for k in mine])
-        if isinstance(leaves[leaf], np.ndarray) and namespace_of(values) is np:
-            leaves[leaf].reshape(-1)[index] = values[mine]
-            continue
         if leaves[leaf].size == 1:  # a scatter takes ten times as long to trace
             number = jax.lax.slice_in_dim(values, mine[0], mine[0] + 1)
             leaves[leaf] = number.astype(leaves[leaf].dtype).reshape(leaves[leaf].shape)
-            continue
-        flat = jnp.asarray(leaves[leaf]).reshape(-1).at[index].set(values[mine])
-        leaves[leaf] = flat.reshape(leaves[leaf].shape)
-    return rebuilt()
+        else:
+            flat = jnp.asarray(leaves[leaf]).reshape(-1).at[index].set(values[mine])
+            leaves[leaf] = flat.reshape(leaves[leaf].shape)
+    for k, leaf in zip(numbers, leaves, strict=True):
+        all_leaves[k] = leaf
+    return jax.tree.unflatten(structure, all_leaves)
 
 
 def number_at(place: Place) -> Callable[[PyTree], Float[Array, ""]]:
@@ -155,29 +157,22 @@ def name_places(model: PyTree) -> list[Place]:
 def _places(
     structure: PyTree, shapes: tuple[tuple[int, ...] | None, ...]
 ) -> tuple[tuple[Place, ...], tuple[str, ...]]:
-    """Of all numbers in arrays of these shapes (None: no array); and the arrays' own names."""
+    """Of all numbers in arrays of these shapes (None: no array); and the arrays' names."""
     hollow = jax.tree.unflatten(structure, [x if x is None else np.zeros(x) for x in shapes])
-    places, names, given = [], [], _given_names(hollow)
-    for leaf, (path, array) in enumerate(jax.tree_util.tree_flatten_with_path(hollow)[0]):
-        name = jax.tree_util.keystr(path, simple=True, separator=".")
-        names.append(name)
-        for index in range(array.size):
-            place = np.unravel_index(index, array.shape)
-            entry = name + "".join(f"[{i}]" for i in place)
-            places.append(Place(given.get(entry, entry), leaf, index, entry))
-    return tuple(places), tuple(names)
-
-
-def _given_names(model: PyTree) -> dict[str, str]:
-    """Entry -> name of what the state spaces in a model name: `axis.F[1][1]` -> `axis.Lp`."""
-    is_named = lambda x: isinstance(x, StateSpace)
-    found = {}
-    for path, node in jax.tree_util.tree_flatten_with_path(model, is_leaf=is_named)[0]:
+    text = ft.partial(jax.tree_util.keystr, simple=True, separator=".")
+    # What the state spaces in a model name: `axis.F[1][1]` is `axis.Lp`.
+    is_state_space, aliases = lambda x: isinstance(x, StateSpace), {}
+    for path, node in jax.tree_util.tree_flatten_with_path(hollow, is_leaf=is_state_space)[0]:
         if isinstance(node, StateSpace):
-            place = jax.tree_util.keystr(path, simple=True, separator=".")
-            prefix = f"{place}." if place else ""
-            found |= {prefix + entry: prefix + name for name, entry in node.names}
-    return found
+            prefix = f"{text(path)}." if path else ""
+            aliases |= {prefix + entry: prefix + name for name, entry in node.names}
+    places, arrays = [], []
+    for leaf, (path, array) in enumerate(jax.tree_util.tree_flatten_with_path(hollow)[0]):
+        arrays.append(text(path))
+        for index, entry in enumerate(np.ndindex(array.shape)):
+            name = arrays[-1] + "".join(f"[{i}]" for i in entry)
+            places.append(Place(aliases.get(name, name), leaf, index, name))
+    return tuple(places), tuple(arrays)
 
 
 def find_place(model: PyTree, name: str, purpose: str) -> Place:
@@ -212,11 +207,20 @@ def select_parameters(
         a tie that follows itself or a later one.
     """
     places = name_places(model)
-    ties = _tied(places, tied or {})
-    bound = {place.name for place, _ in ties}
-    wanted = _expand(model, [p for p in places if free is not None or p.name not in bound], free)
     values, by_name = _numbers(model, places), _by_name(places)
-    chosen = [_choose(item, by_name, values) for item in wanted]
+    for name, tie in (tied or {}).items():
+        if name not in by_name:
+            raise ValueError(
+                f"no parameter {name!r} to tie; the model has: {', '.join(p.name for p in places)}"
+            )
+        if not callable(tie):
+            raise ValueError(
+                f"{name} is tied to {tie!r}: give a function of the model, "
+                "lambda m: -m.F[0, 1]; a plain number belongs in the model"
+            )
+    ties = tuple((by_name[name], tie) for name, tie in (tied or {}).items())
+    bound = {place.name for place, _ in ties}
+    chosen = [_scaled(item, by_name, values) for item in _expand(model, places, free, bound)]
     names = [place.name for place, _, _ in chosen]
     if len(set(names)) != len(names) or not names:
         raise ValueError(f"free={names}: name each free parameter once, and at least one")
@@ -232,67 +236,41 @@ def select_parameters(
     ordered = tuple(place for place, _, _ in chosen) + tuple(fixed)
     ratio = np.array([values[p.name] for p in ordered]) / np.array(scales)
     start = np.where(logs, np.log(np.where(logs, ratio, 1.0)), ratio)
-    found = Parameters(ordered, ties, logs, len(chosen), np.asarray(scales, float), start)
-    _check_order(model, found)
-    return found
-
-
-_MOVED = 1.01  # factor on the free parameters at which ties are looked at
-
-
-def _check_order(model: PyTree, parameters: Parameters) -> None:
-    """Raise ValueError for a tie that follows itself, or one that comes after it."""
-    if not parameters.ties:
-        return
-    values = _MOVED * parameters.values(parameters.start[: parameters.count])
-    once = parameters.replace(model, values)
-    twice = parameters.replace(once, values)
-    places = [place for place, _ in parameters.ties]
-    for name, value in _numbers(once, places).items():
-        if not np.isclose(value, _numbers(twice, places)[name], rtol=1e-9, equal_nan=True):
+    parameters = Parameters(ordered, ties, logs, len(chosen), np.asarray(scales, float), start)
+    if not ties:
+        return parameters
+    # No tie follows itself, or one that comes after it.
+    start = _MOVED * parameters.values(parameters.start[: parameters.count])
+    moved = parameters.replace(model, start)
+    again = parameters.replace(moved, start)
+    tied_places = [place for place, _ in ties]
+    for name, value in _numbers(moved, tied_places).items():
+        if not np.isclose(value, _numbers(again, tied_places)[name], rtol=1e-9, equal_nan=True):
             raise ValueError(
                 f"{name} is tied to itself, or to a parameter whose tie comes later: ties are "
                 "computed one after the other, each from free, fixed and earlier tied parameters"
             )
+    return parameters
 
 
-def _tied(places: list[Place], tied: Mapping[str, Tie]) -> tuple[tuple[Place, Tie], ...]:
-    by_name = _by_name(places)
-    for name, tie in tied.items():
-        if name not in by_name:
-            known = ", ".join(place.name for place in places)
-            raise ValueError(f"no parameter {name!r} to tie; the model has: {known}")
-        if not callable(tie):
-            raise ValueError(
-                f"{name} is tied to {tie!r}: give a function of the model, "
-                "lambda m: -m.F[0, 1]; a plain number belongs in the model"
-            )
-    return tuple((by_name[name], tie) for name, tie in tied.items())
-
-
-def _expand(model: PyTree, places: list[Place], free: Free) -> list[str | Positive | Real]:
+def _expand(
+    model: PyTree, places: list[Place], free: Free, bound: set[str]
+) -> list[str | Positive | Real]:
+    """All free parameters, with the entries of arrays in the place of these."""
     if free is None:
         values = _numbers(model, places)
         absent = lambda p: values[p.name] == 0 and is_optional(model, p.path)
-        return [place.name for place in places if not absent(place)]
+        return [p.name for p in places if p.name not in bound and not absent(p)]
     if callable(free):
-        return _marked(model, places, free)
+        flags = jax.tree.map(lambda _: False, eqx.filter(model, eqx.is_inexact_array))
+        marked = jax.tree.leaves(eqx.tree_at(free, flags, replace_fn=lambda _: True))
+        return [place.name for place in places if marked[place.leaf]]
     items = []
     for item in [free] if isinstance(free, str | Positive | Real) else free:
         name = item if isinstance(item, str) else item.name
-        whole = [place.name for place in places if place.path.startswith(f"{name}[")]
-        items += whole if isinstance(item, str) and whole else [item]
+        entries = [place.name for place in places if place.path.startswith(f"{name}[")]
+        items += entries if isinstance(item, str) and entries else [item]
     return items
-
-
-def _marked(
-    model: PyTree, places: list[Place], where: Callable[[PyTree], PyTree]
-) -> list[str | Positive | Real]:
-    arrays = eqx.filter(model, eqx.is_inexact_array)
-    flags = jax.tree.map(lambda _: False, arrays)
-    flags = eqx.tree_at(where, flags, replace_fn=lambda _: True)
-    marked = jax.tree.leaves(flags)
-    return [place.name for place in places if marked[place.leaf]]
 
 
 def _numbers(model: PyTree, places: list[Place]) -> dict[str, float]:
@@ -301,13 +279,13 @@ def _numbers(model: PyTree, places: list[Place]) -> dict[str, float]:
     return {p.name: float(leaves[p.leaf][p.index]) for p in places}
 
 
-def _choose(
+def _scaled(
     item: str | Positive | Real, by_name: dict[str, Place], values: dict[str, float]
 ) -> tuple[Place, bool, float]:
+    """Where a free parameter is, whether its logarithm is fitted, and its scale."""
     name = item if isinstance(item, str) else item.name
     if name not in by_name:
-        known = ", ".join(values)
-        raise ValueError(f"no parameter {name!r} in the model; it has: {known}")
+        raise ValueError(f"no parameter {name!r} in the model; it has: {', '.join(values)}")
     name = by_name[name].name
     value = values[name]
     if not np.isfinite(value):
@@ -325,3 +303,102 @@ def _choose(
             f"zero with jq.identify.Real({name!r}, scale=...)"
         )
     return by_name[name], True, float(np.sign(value))
+
+
+Condition = Callable[[PyTree], PyTree]
+
+
+@pytree_node
+class _ByFunction:
+    """A condition that is a function, into which JAX cannot look."""
+
+    change: Condition = eqx.field(static=True)
+
+    def __call__(self, model: PyTree) -> PyTree:
+        return self.change(model)
+
+
+def _same(model: PyTree) -> PyTree:
+    return model
+
+
+UNCHANGED = _ByFunction(_same)  # the condition of a record that was taken on the model as it is
+
+
+@pytree_node
+class Changed:
+    """A known change of one parameter, in one of the records of a fit.
+
+    A weight on the arms, another propeller: it tells parameters apart of which one record shows
+    the ratio alone. The parameter counts as `times * value + plus`.
+
+    **Arguments:**
+
+    - `parameter`: its name, as in `free=`.
+    - `plus`: what is added, in the parameter's unit.
+    - `times`: a factor, above 0.
+
+    **Raises:** ValueError for what is not one finite number each, and where both change nothing.
+
+    A function of the model does the same. This one pickles, and fits with it keep their compiled
+    program for the next process.
+
+    !!! example
+
+        ```python
+        loaded = jq.identify.Changed("J_x", plus=0.0276)
+        fit = jq.fit(model, (frf, frf_loaded), conditions=(None, loaded))
+        ```
+    """
+
+    parameter: str = eqx.field(static=True)
+    plus: float | Float[Numbers, ""] = 0.0
+    times: float | Float[Numbers, ""] = 1.0
+
+    def __post_init__(self):
+        for name in ("plus", "times"):  # arrays: other numbers run the same program
+            number = np.asarray(getattr(self, name), dtype=float)
+            if number.ndim:
+                raise ValueError(f"{name} has the shape {number.shape}: give one number")
+            object.__setattr__(self, name, number)
+        require_finite("plus", self.plus)
+        require_positive("times", self.times)
+        if self.plus == 0.0 and self.times == 1.0:
+            raise ValueError(f"{self.parameter} is not changed: give plus= or times=")
+
+    def __call__(self, model: PyTree) -> PyTree:
+        """The model with the change."""
+        place = find_place(model, self.parameter, "for a condition")
+        arrays = [leaf for leaf in jax.tree.leaves(model) if eqx.is_inexact_array(leaf)]
+        value = self.times * arrays[place.leaf].reshape(-1)[place.index] + self.plus
+        return with_values(model, (place,), value[None])
+
+
+def require_conditions(
+    model: PyTree, conditions: Sequence[Condition | None] | None, count: int
+) -> list[Condition]:
+    """One for each of `count` responses, all of them pytrees.
+
+    ValueError for another number, and for what is no condition.
+    """
+    changes = [None] * count if conditions is None else list(conditions)
+    if len(changes) != count:
+        raise ValueError(
+            f"{len(changes)} conditions for {count} responses: give one for each, None where the "
+            "model holds as it is"
+        )
+    nodes: list[Condition] = []
+    for change in changes:
+        if change is None:
+            nodes.append(UNCHANGED)
+            continue
+        if isinstance(change, Changed):
+            find_place(model, change.parameter, "for a condition")
+        elif not callable(change):
+            raise ValueError(
+                f"condition {change!r} is no change of the model: give None, "
+                "jq.identify.Changed(name, change), or a function from a model to a model"
+            )
+        is_leaf = jax.tree_util.all_leaves([change])
+        nodes.append(_ByFunction(change) if is_leaf else change)
+    return nodes

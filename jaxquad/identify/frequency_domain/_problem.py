@@ -1,3 +1,5 @@
+"""The least-squares problem of a fit: models, records, weights and priors."""
+
 import dataclasses
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
@@ -10,13 +12,12 @@ from jaxtyping import Array, Bool, Complex, Float, PyTree
 
 from jaxquad._compile import evaluate_once, FEW, no_fuse
 from jaxquad._core import Message, Normal, normal_equations, on_host, pytree_node
-from jaxquad.models import evaluate_response
+from jaxquad.models import evaluate_response, LaggedIntegrator, StateSpace, TransferFunction
 from jaxquad.spectra import FrequencyResponse
 
-from ._condition import Condition, require_conditions
-from ._held import Aliases, evaluate_sampled, hold_of, plan_aliases
-from ._mixing import mix_parts, Mixing, unmixed
-from ._parameters import find_place, Numbers, Parameters
+from ._cost import mix_parts, Mixing, unmixed
+from ._parameters import Condition, find_place, Numbers, Parameters, require_conditions
+from ._sampled import Aliases, evaluate_sampled, hold_of, plan_aliases
 
 
 class Prior(eqx.Module):
@@ -82,7 +83,7 @@ class Problem:
     @property
     def silences(self) -> list[Bool[np.ndarray, "outputs inputs"]]:
         """The pairs of each response that the model has none of, whatever its parameters are."""
-        masks = [np.zeros(each.shape[1:], dtype=bool) for each in self.measured]
+        masks = [np.zeros(measured.shape[1:], dtype=bool) for measured in self.measured]
         for mask, pairs in zip(masks, self.silent, strict=True):
             for pair in pairs:
                 mask[pair] = True
@@ -97,24 +98,14 @@ class Problem:
         """Problems of one record each, and one of the priors, for what no weight matters to."""
         if self.is_single:
             return [self.weighted(())]
-        none = dataclasses.replace(
-            self,
-            conditions=(),
-            omega=(),
-            measured=(),
-            weights=(),
-            mixings=(),
-            aliases=(),
-            silent=(),
-        )
-        bare = dataclasses.replace(none, quantities=(), prior=np.zeros((0, 2)))
         names = ("conditions", "omega", "measured", "aliases", "silent")
-        fields = zip(
-            self.conditions, self.omega, self.measured, self.aliases, self.silent, strict=True
-        )
+        empty = dict.fromkeys((*names, "weights", "mixings"), ())
+        none = dataclasses.replace(self, **empty)
+        bare = dataclasses.replace(none, quantities=(), prior=np.zeros((0, 2)))
+        rows = zip(*(getattr(self, name) for name in names), strict=True)
         records: list[Problem] = [
-            dataclasses.replace(bare, **{name: (x,) for name, x in zip(names, each, strict=True)})
-            for each in fields
+            dataclasses.replace(bare, **{name: (x,) for name, x in zip(names, row, strict=True)})
+            for row in rows
         ]
         return [*records, none] if self.quantities else records
 
@@ -124,13 +115,13 @@ class Problem:
         mixings: Sequence[Mixing | None] | None = None,
     ) -> "Problem":
         """The same problem under other weights, with points that share noise taken together."""
-        each = [None] * len(weights) if mixings is None else mixings
-        return dataclasses.replace(self, weights=tuple(weights), mixings=tuple(each))
+        mixings = [None] * len(weights) if mixings is None else mixings
+        return dataclasses.replace(self, weights=tuple(weights), mixings=tuple(mixings))
 
     def mixed(self) -> "Problem":
         """The same with the identity as mixing where points share no noise: of one structure."""
         pairs = zip(self.mixings, self.measured, strict=True)
-        return self.weighted(self.weights, [each or unmixed(like.shape) for each, like in pairs])
+        return self.weighted(self.weights, [mixing or unmixed(x.shape) for mixing, x in pairs])
 
 
 def make_problem(
@@ -151,33 +142,28 @@ def make_problem(
 
     - `ValueError`: another number of conditions than of responses, or what is no condition.
     """
-    taken = require_conditions(model, conditions, len(frfs))
+    changes = require_conditions(model, conditions, len(frfs))
     numbers = [[prior.value, prior.standard_error] for prior in priors]
-    shapes = [(*frf.response.shape, 2) for frf in frfs]
+    measured = [np.asarray(frf.response) for frf in frfs]
+    pairs = list(zip(changes, frfs, strict=True))
+    quantities = (prior.quantity for prior in priors)
     return Problem(
         model=model,
         parameters=parameters,
-        conditions=tuple(taken),
-        quantities=tuple(quantity_of(prior.quantity) for prior in priors),
+        conditions=tuple(changes),
+        quantities=tuple(_Named(q) if isinstance(q, str) else q for q in quantities),
         omega=tuple(np.asarray(frf.omega) for frf in frfs),
-        measured=tuple(_known(np.asarray(frf.response)) for frf in frfs),
-        weights=tuple(np.zeros(shape) for shape in shapes),
-        mixings=(None,) * len(shapes),
+        # Where a response is unknown its weight is zero, and nan times zero is not.
+        measured=tuple(np.where(np.isfinite(x), x, 1.0) for x in measured),
+        weights=tuple(np.zeros((*x.shape, 2)) for x in measured),
+        mixings=(None,) * len(measured),
         prior=np.asarray(numbers, dtype=float).reshape(-1, 2),
-        aliases=tuple(_plan(model, *each) for each in zip(taken, frfs, strict=True)),
-        silent=tuple(
-            _silent_pairs(model, parameters, *each) for each in zip(taken, frfs, strict=True)
+        aliases=tuple(
+            plan_aliases(change(on_host(model)), frf) if hold_of(frf) else None
+            for change, frf in pairs
         ),
+        silent=tuple(_silent_pairs(model, parameters, *pair) for pair in pairs),
     )
-
-
-def _plan(model: PyTree, condition: Condition, frf: FrequencyResponse) -> Aliases | None:
-    return plan_aliases(condition(on_host(model)), frf) if hold_of(frf) else None
-
-
-def _known(response: Complex[np.ndarray, "..."]) -> Complex[np.ndarray, "..."]:
-    """Where a response is unknown its weight is zero, and nan times zero is not."""
-    return np.where(np.isfinite(response), response, 1.0)
 
 
 def on_device(model: PyTree) -> PyTree:
@@ -202,35 +188,37 @@ def _silent_pairs(
     moved = start + 0.1 * np.random.default_rng(0).uniform(0.5, 1.0, start.size)
     tried = condition(parameters.insert(model, moved))
     omega = np.asarray(frf.omega)[[0, frf.omega.size // 2, -1]]
-    found = np.asarray(_evaluate(tried, jax.device_put(omega)))
-    pairs = np.argwhere(np.all(found == 0, axis=0)).tolist()
+    response = np.asarray(_evaluate(tried, jax.device_put(omega)))
+    pairs = np.argwhere(np.all(response == 0, axis=0)).tolist()
     return tuple((output, source) for output, source in pairs)
 
 
 _evaluate = eqx.filter_jit(evaluate_response)
 
 
-def responses(z: Float[Array, " n"], problem: Problem) -> list[Complex[Array, "..."]]:
-    """The model's responses in every record's condition, as its samples show them."""
-    model = problem.parameters.insert(problem.model, z)
-    where = zip(problem.omega, problem.aliases, strict=True)
-    terms = zip(problem.conditions, where, strict=True)
-    return [evaluate_sampled(condition(model), *each) for condition, each in terms]
-
-
 Part = Float[Array, "outputs inputs frequencies"]
 
 
 def _log_ratios(z: Float[Array, " n"], problem: Problem) -> list[tuple[Part, Part]]:
-    """`ln|T/T^|` and wrapped phase of `T/T^` in rad, per record."""
+    """`ln|T/T^|` and wrapped phase of `T/T^` in rad, per record in its condition."""
     # Frequencies come last until all is done: derivatives are then fast loops over them.
-    logs = []
-    parts = zip(responses(z, problem), problem.measured, problem.silences, strict=True)
-    for model, measured, silent in parts:
+    model, logs = problem.parameters.insert(problem.model, z), []
+    records = zip(problem.conditions, problem.omega, problem.aliases, strict=True)
+    responses = [evaluate_sampled(change(model), w, aliases) for change, w, aliases in records]
+    for response, measured, silent in zip(
+        responses, problem.measured, problem.silences, strict=True
+    ):
+        if response.shape != measured.shape:  # broadcasting would fit one output to all of them
+            raise ValueError(
+                Message(
+                    f"the model's response has shape {response.shape}, the measured one "
+                    f"{measured.shape} (frequencies, outputs, inputs): «pick channels with "
+                    "jq.records.select», or extend the model"
+                )
+            )
         # Of a response that is zero the logarithm would be infinite: such pairs count as explained.
-        model = _of_same_shape(model, measured)
-        model = jnp.where(silent, measured, model) if np.any(silent) else model
-        here, there = (jnp.moveaxis(x, 0, -1) for x in (model, measured))
+        response = jnp.where(silent, measured, response) if np.any(silent) else response
+        here, there = (jnp.moveaxis(x, 0, -1) for x in (response, measured))
         power = jnp.real(there) ** 2 + jnp.imag(there) ** 2
         c, s = jnp.real(there) / power, jnp.imag(there) / power
         logs.append(_logarithm(*_rotate(jnp.real(here), jnp.imag(here), c, s)))
@@ -255,23 +243,8 @@ def _rotate(real: Part, imag: Part, c: Part, s: Part) -> tuple[Part, Part]:
     return real * c + imag * s, imag * c - real * s
 
 
-def _of_same_shape(
-    model: Complex[Array, "..."], measured: Complex[Numbers, "frequencies outputs inputs"]
-) -> Complex[Array, "frequencies outputs inputs"]:
-    # Broadcasting would fit one output to all of them silently.
-    if model.shape != measured.shape:
-        raise ValueError(
-            Message(
-                f"the model's response has shape {model.shape}, the measured one {measured.shape} "
-                "(frequencies, outputs, inputs): «pick channels with jq.records.select», or extend "
-                "the model"
-            )
-        )
-    return model
-
-
 def prior_misfits(z: Float[Numbers, " n"], problem: Problem) -> Float[Array, " priors"]:
-    """Known quantities: departure in standard errors."""
+    """Departures of the priors' quantities, in standard errors."""
     model = problem.parameters.insert(problem.model, z)
     values = [quantity(model) for quantity in problem.quantities]
     if not values:
@@ -296,7 +269,7 @@ def weigh_parts(problem: Problem, k: int, magnitude: Part, phase: Part) -> tuple
     """Misfits of record `k`, or slopes of them, as the residuals count them."""
     weight = problem.weights[k]
     both = zip((magnitude, phase), (weight[..., 0], weight[..., 1]), strict=True)
-    return mix_parts(problem.mixings[k], *(p * jnp.moveaxis(each, 0, -1) for p, each in both))
+    return mix_parts(problem.mixings[k], *(part * jnp.moveaxis(w, 0, -1) for part, w in both))
 
 
 def misfits(z: Float[Array, " n"], problem: Problem) -> Float[Array, " residuals"]:
@@ -308,13 +281,6 @@ def misfits(z: Float[Array, " n"], problem: Problem) -> Float[Array, " residuals
     return jnp.concatenate([*parts, prior_misfits(z, problem)])
 
 
-def quantity_of(name_or_function: str | Condition) -> Condition:
-    """A prior's quantity as a function of the model."""
-    if not isinstance(name_or_function, str):
-        return name_or_function
-    return _Named(name_or_function)
-
-
 class _Named(NamedTuple):
     """Reads one named number; equal for equal names, so that it does not recompile."""
 
@@ -324,3 +290,54 @@ class _Named(NamedTuple):
         place = find_place(model, self.name, "for a prior")
         leaves = jax.tree.leaves(eqx.filter(model, eqx.is_inexact_array))
         return leaves[place.leaf].reshape(-1)[place.index]
+
+
+_FEW = 5  # frequencies of the trial
+_OURS = (LaggedIntegrator, StateSpace, TransferFunction)
+_sound: set[tuple] = set()  # what was tried before
+
+
+def require_model(function: str, model: object) -> None:
+    """Raise ValueError for what is no model to start from."""
+    if isinstance(model, type):
+        raise ValueError(
+            f"{function} needs a model with the values to start from, not the class "
+            f"{model.__name__}: give {model.__name__}(...)"
+        )
+    if not isinstance(model, eqx.Module) or isinstance(model, FrequencyResponse):
+        raise ValueError(
+            f"{function} needs a model to start from, such as jq.LaggedIntegrator(gain, lag, "
+            f"delay), not a {type(model).__name__}; it comes first: jq.{function}(model, data)"
+        )
+
+
+def require_model_response(model: PyTree, frf: FrequencyResponse) -> None:
+    """Raise ValueError for a model whose response is none of this shape, or is not complex."""
+    if isinstance(model, _OURS):
+        return
+    leaves, structure = jax.tree.flatten(model)
+    kind = (structure, tuple(map(np.shape, leaves)), frf.response.shape[1:])
+    if kind in _sound:
+        return
+    name = f"{type(model).__name__}.frequency_response(omega)"
+    respond = getattr(model, "frequency_response", None)
+    if respond is None:
+        raise ValueError(f"{type(model).__name__} has no frequency_response(omega) to fit: add it")
+    omega = jax.ShapeDtypeStruct((_FEW,), np.float64)
+    try:
+        result = eqx.filter_eval_shape(lambda model, w: model.frequency_response(w), model, omega)
+    except jax.errors.TracerArrayConversionError as error:
+        raise ValueError(
+            f"{name} computes with NumPy, which has no derivatives: use jax.numpy in it"
+        ) from error
+    shape, pairs = np.shape(result), frf.response.shape[1:]
+    alone = shape == (_FEW,) and pairs == (1, 1)
+    if not alone and shape != (_FEW, *pairs):
+        raise ValueError(
+            f"{name} has the shape {shape} for {_FEW} frequencies, but the measured response has "
+            f"{pairs[0]} outputs and {pairs[1]} inputs: return {(_FEW, *pairs)}"
+            f"{f' or ({_FEW},)' if pairs == (1, 1) else ''}"
+        )
+    if not np.issubdtype(result.dtype, np.complexfloating):
+        raise ValueError(f"{name} is real: return complex numbers, with magnitude and phase")
+    _sound.add(kind)

@@ -13,9 +13,8 @@ from jaxtyping import Array, Complex, Float, PyTree
 from jaxquad._core import pytree_node
 from jaxquad.spectra import FrequencyResponse
 
-from ._condition import Condition
 from ._cost import Band, Cost, MaximumLikelihood, Points, Range
-from ._parameters import Free, Parameters, Positive, Real, Tie, with_values
+from ._parameters import Condition, Free, Parameters, Positive, Real, Tie, with_values
 from ._problem import on_device, Prior
 
 
@@ -125,7 +124,8 @@ class Bands(NamedTuple):
 
     def overlap(self, name: str) -> bool | None:
         """Whether the 95 % intervals of both halves overlap; None where one determines nothing."""
-        halves = [half for half in (self.lower, self.upper) if _determines(half, name)]
+        both = (self.lower, self.upper)
+        halves = [fit for fit in both if fit is not None and _determines(fit, name)]
         if len(halves) < 2:
             return None
         (low, high), (other_low, other_high) = (half.interval(name) for half in halves)

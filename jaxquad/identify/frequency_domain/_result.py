@@ -23,8 +23,8 @@ from ..uncertainty._curves import (
     StepBand,
 )
 from ..uncertainty._derived import derive, Tied, tied_parameters
-from ..uncertainty._discrepancy import Discrepancy
 from ..uncertainty._draw_models import draw_models, known_covariance
+from ..uncertainty._error_budget import Discrepancy
 from ..uncertainty._verdict import (
     Combination,
     pooled_freedom,

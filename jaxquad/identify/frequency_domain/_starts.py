@@ -12,6 +12,7 @@ from jaxquad._core import (
     CONVERGED,
     decrement,
     Descent,
+    Message,
     minimise,
     Normal,
     RUNNING,
@@ -123,21 +124,21 @@ def solve_from_many(
 
     - `ValueError`: no start has a finite response.
     """
-    stops = _solve_all(problem, np.asarray(starts), solver, max_steps)
-    host = jax.tree.map(np.asarray, stops)
-    found = _distinct(problem.parameters, host)
-    if not any(np.isfinite(point.cost) for point in found):
+    stops: _Stops = jax.tree.map(
+        np.asarray, _solve_all(problem, np.asarray(starts), solver, max_steps)
+    )
+    minima = _distinct(problem.parameters, stops)
+    if not any(np.isfinite(point.cost) for point in minima):
         raise ValueError(
             f"the model's response is not finite at any of {len(starts)} starts: check the model "
             "at its starting values with model.frequency_response(omega)"
         )
-    best = min(found, key=lambda point: (not point.is_minimum, point.cost))
-    k = best.starts[0]
-    status, steps = int(host.status[k]), int(host.steps[k])
+    best = min(minima, key=lambda point: (not point.is_minimum, point.cost))
+    status, steps = (int(part[best.starts[0]]) for part in (stops.status, stops.steps))
     message = "" if best.is_minimum else best.kind
     if message and status in (RUNNING, STALLED):
         message = stopped_early(status, steps)
-    return solution_at(problem, best.z, message, steps), found
+    return solution_at(problem, best.z, message, steps), minima
 
 
 class _Stops(NamedTuple):
@@ -173,18 +174,20 @@ def _solve_all(problem, starts, solver, max_steps) -> _Stops:
 
 def _distinct(parameters: Parameters, stops: _Stops) -> tuple[Minimum, ...]:
     """The distinct stops: those within a millionth of the cost are one."""
-    z, normal = stops.z, stops.normal
-    order = [int(k) for k in np.argsort(normal.cost) if np.isfinite(normal.cost[k])]
-    groups: list[list[int]] = []
-    for k in order:
-        for group in groups:
-            if _same(np.asarray(z[group[0]] - z[k]), normal, group[0], k):
-                group.append(k)
-                break
-        else:
-            groups.append([k])
+    z, costs, groups = stops.z, stops.normal.cost, []
+
+    def same(one: int, other: int) -> bool:
+        floor, difference = 1e-6 * (costs[one] + 1e-6), np.asarray(z[one] - z[other])
+        if abs(costs[other] - costs[one]) > floor:
+            return False
+        near = bool(np.max(np.abs(difference)) <= 1e-4)
+        return near or bool(0.5 * difference @ stops.normal.hessian[one] @ difference <= floor)
+
+    for k in (int(k) for k in np.argsort(costs) if np.isfinite(costs[k])):
+        group = next((group for group in groups if same(group[0], k)), None)
+        groups.append([k]) if group is None else group.append(k)
     points = [_point(parameters, stops, group) for group in groups]
-    lost = tuple(k for k in range(len(z)) if not np.isfinite(normal.cost[k]))
+    lost = tuple(k for k in range(len(z)) if not np.isfinite(costs[k]))
     if lost:
         first = np.asarray(z[lost[0]])
         values = np.asarray(parameters.values(first))
@@ -192,63 +195,46 @@ def _distinct(parameters: Parameters, stops: _Stops) -> tuple[Minimum, ...]:
     return tuple(points)
 
 
-def _same(difference: np.ndarray, normal: Normal, one: int, other: int) -> bool:
-    floor = 1e-6 * (normal.cost[one] + 1e-6)
-    if abs(normal.cost[other] - normal.cost[one]) > floor:
-        return False
-    near = bool(np.max(np.abs(difference)) <= 1e-4)
-    return near or bool(0.5 * difference @ normal.hessian[one] @ difference <= floor)
-
-
 def _point(parameters: Parameters, stops: _Stops, group: list[int]) -> Minimum:
-    k = group[0]
-    left, cost = float(stops.decrement[k]), float(stops.normal.cost[k])
-    curvature = _curvature(np.asarray(stops.bent[k]))
-    return Minimum(
-        cost=2 * cost,
-        z=np.asarray(stops.z[k]),
-        values=np.asarray(parameters.values(np.asarray(stops.z[k]))),
-        starts=tuple(sorted(group)),
-        decrement=left,
-        curvature=curvature,
-        kind=_kind(int(stops.status[k]), left, cost, curvature),
-    )
-
-
-def _curvature(hessian: Float[np.ndarray, "parameters parameters"]) -> float:
-    if not np.all(np.isfinite(hessian)):
-        return -np.inf
-    size = np.sqrt(np.maximum(np.abs(np.diagonal(hessian)), 1e-300))
-    return float(np.linalg.eigvalsh(hessian / np.outer(size, size))[0])
-
-
-def _kind(status: int, left: float, cost: float, curvature: float) -> str:
+    k, curvature = group[0], -np.inf
+    z, left, cost = np.asarray(stops.z[k]), float(stops.decrement[k]), float(stops.normal.cost[k])
+    hessian = stops.bent[k]
+    if np.all(np.isfinite(hessian)):
+        size = np.sqrt(np.maximum(np.abs(np.diagonal(hessian)), 1e-300))
+        curvature = float(np.linalg.eigvalsh(hessian / np.outer(size, size))[0])
     # Noise-free data leave a cost of rounding errors, of which no share means anything.
     if left > 1e-6 * cost + 1e-12:
-        return UNFINISHED if status == RUNNING else WALL
-    if curvature < -1e-6:
-        return SADDLE
-    return MINIMUM if curvature > 1e-9 else FLAT
+        kind = UNFINISHED if int(stops.status[k]) == RUNNING else WALL
+    elif curvature < -1e-6:
+        kind = SADDLE
+    else:
+        kind = MINIMUM if curvature > 1e-9 else FLAT
+    values = np.asarray(parameters.values(z))
+    return Minimum(2 * cost, z, values, tuple(sorted(group)), left, curvature, kind)
 
 
 _NEAR = 1.5  # ratio of costs within which another minimum is a rival
 
 
-def remarks_on_minima(problem: Problem, is_saddle: bool, minima: tuple[Minimum, ...]) -> list[str]:
+def remarks_on_minima(
+    problem: Problem, is_saddle: bool, minima: tuple[Minimum, ...]
+) -> list[Message]:
     """Remarks on a saddle instead of a minimum, and on other minima of nearly the best cost."""
     remarks = []
     if is_saddle:
-        remarks.append(
+        text = (
             "stationary, but no minimum: the cost falls to one side; «start from other values»"
             "«, or give starts=20»"
         )
-    found = [point for point in minima if point.is_minimum]
-    rivals = [p for p in found[1:] if p.cost <= _NEAR * found[0].cost]
+        remarks.append(Message(text, "saddle"))
+    true = [point for point in minima if point.is_minimum]
+    rivals = [point for point in true[1:] if point.cost <= _NEAR * true[0].cost]
     if rivals:
         values = ", ".join(f"{x:.4g}" for x in rivals[0].values)
-        remarks.append(
+        text = (
             f"{len(rivals)} other minima cost less than {_NEAR:g} times the best; the next costs "
             f"{rivals[0].cost:.4g} at {', '.join(problem.parameters.names)} = {values}: record "
             "more, or over a wider band, to know which is right"
         )
+        remarks.append(Message(text, "other minima"))
     return remarks

@@ -12,7 +12,7 @@ from jaxtyping import PyTree
 from jaxquad.models import LaggedIntegrator
 from jaxquad.spectra import FrequencyResponse
 
-from ..uncertainty._discrepancy import FOLLOWS
+from ..uncertainty._error_budget import FOLLOWS
 from ._cost import Band, Cost, MaximumLikelihood
 from ._fit import check_options, fit_with, require_responses
 from ._fit_content import counted
@@ -223,7 +223,16 @@ def fit_damped(fit: Fit, *, unmodelled: float = 0.05) -> Fit:
             best = damped if best is None or damped.cost < best.cost else best
         if best is not None and best.cost <= fit.cost and best.verdict.kind != "no minimum":
             break
-    if best is None or not _is_significant(best, fit, origin):
+    if best is None:
+        return fit
+    # Whether the damping is more than the noise, and the misfit, make of none.
+    k = best.names.index(_NAME)
+    error = best.standard_errors[k] if best.determined[k] else np.inf
+    shows = best.values[k] > max(_SIGNIFICANT * error, 0.0)
+    shows = shows and not any(bound.name == _NAME for bound in best.verdict.bounds)
+    if isinstance(origin.options.cost, MaximumLikelihood):
+        shows = shows and (fit.cost - best.cost) / max(1.0, best.chi_squared) > _DROP
+    if not shows:
         return fit
     best = _with_unmodelled(best, fit, unmodelled * low)
     units = dict(zip(fit.names, fit.parameter_units, strict=False)) | {_NAME: "1/s"}
@@ -249,18 +258,6 @@ def damping_by_phase(fit: Fit, origin: Origin) -> float:
         turned, weight = turned + float(share @ (some * lead)), weight + float(np.sum(share))
     by_phase = turned / weight if weight else 0.0
     return float(np.clip(by_phase, _LOWEST * low, high))
-
-
-def _is_significant(damped: Fit, plain: Fit, origin: Origin) -> bool:
-    """Whether the damping is more than the noise, and the misfit, make of none."""
-    k = damped.names.index(_NAME)
-    if any(bound.name == _NAME for bound in damped.verdict.bounds) or not damped.values[k] > 0:
-        return False
-    error = damped.standard_errors[k] if damped.determined[k] else np.inf
-    exceeds = bool(damped.values[k] > _SIGNIFICANT * error)
-    if not isinstance(origin.options.cost, MaximumLikelihood):
-        return exceeds
-    return exceeds and bool((plain.cost - damped.cost) / max(1.0, damped.chi_squared) > _DROP)
 
 
 def _with_unmodelled(damped: Fit, plain: Fit, damping: float) -> Fit:

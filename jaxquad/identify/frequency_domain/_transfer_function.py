@@ -52,10 +52,9 @@ class Structure(NamedTuple):
 
 
 class _Data(NamedTuple):
-    """A response pair and structure, checked; `reason` says why there is nothing to fit."""
+    """A response pair; `reason` says why there is nothing to fit."""
 
     pair: FrequencyResponse
-    structure: Structure
     points: Points
     reason: str | None
 
@@ -106,9 +105,9 @@ def fit_transfer_function(
     """
     require_x64("a fit")
     check_options(cost, band, min_coherence, max_steps)
-    orders, channels = (zeros, poles, integrators, delay), (output, input)
-    data = _prepare(frf, orders, channels, cost, band, min_coherence)
-    pair, structure, points, reason = data
+    structure = require_structure(zeros, poles, integrators, delay)
+    data = _prepare(frf, structure, (output, input), cost, band, min_coherence)
+    pair, points, reason = data
     if reason is not None:
         return _unfitted(structure, reason, tuple(pair.remarks))
     samples = _usable_samples(points, structure, cost)
@@ -178,27 +177,20 @@ def guess_transfer_function(
     """
     require_x64("a transfer function")
     check_options(cost, band, min_coherence, 1)
-    orders, channels = (zeros, poles, integrators, delay), (output, input)
-    data = _prepare(frf, orders, channels, cost, band, min_coherence)
+    structure = require_structure(zeros, poles, integrators, delay)
+    data = _prepare(frf, structure, (output, input), cost, band, min_coherence)
     if data.reason is not None:
         raise UndeterminedError(
             f"no transfer function from this record: {data.reason}; {_MORE_POINTS}"
         )
-    samples = _usable_samples(data.points, data.structure, cost)
-    return _in_seconds(_search(samples, data.structure), samples, data.structure)
+    samples = _usable_samples(data.points, structure, cost)
+    return _in_seconds(_search(samples, structure), samples, structure)
 
 
-def _prepare(
-    frf: object,
-    orders: tuple[int, int, int, Delay],
-    channels: tuple[int | str, int | str],
-    cost: Cost,
-    band: Band,
-    min_coherence: float | None,
-) -> _Data:
-    """Raise ValueError for several responses, and for orders of no proper transfer function."""
-    zeros, poles, integrators, delay = orders
-    for name, value in zip(("zeros", "poles", "integrators"), orders, strict=False):
+def require_structure(zeros: int, poles: int, integrators: int, delay: Delay) -> Structure:
+    """Orders that make a proper transfer function. Raise ValueError for others."""
+    orders = {"zeros": zeros, "poles": poles, "integrators": integrators}
+    for name, value in orders.items():
         if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 0:
             raise ValueError(f"{name}={value!r}: give a whole number, 0 or more")
     if not max(zeros, integrators) <= poles:
@@ -206,10 +198,22 @@ def _prepare(
             f"zeros={zeros}, poles={poles}, integrators={integrators}: a proper transfer function "
             "has at most as many zeros as poles, and the integrators count among the poles"
         )
-    free = isinstance(delay, str) and delay == "free"
-    if not free and (isinstance(delay, str | bool) or not 0 <= delay < np.inf):
+    if isinstance(delay, str) and delay == "free":
+        return Structure(zeros, poles, integrators, None)
+    if isinstance(delay, str | bool) or not 0 <= delay < np.inf:
         raise ValueError(f'delay={delay!r}: give "free", or 0 or more in s')
-    structure = Structure(zeros, poles, integrators, None if free else float(delay))
+    return Structure(zeros, poles, integrators, float(delay))
+
+
+def _prepare(
+    frf: object,
+    structure: Structure,
+    channels: tuple[int | str, int | str],
+    cost: Cost,
+    band: Band,
+    min_coherence: float | None,
+) -> _Data:
+    """The pair, its usable points, and whether these are enough; ValueError for several pairs."""
     frfs = require_responses(frf)
     if len(frfs) > 1:
         raise ValueError(
@@ -227,7 +231,7 @@ def _prepare(
             f"{describe_usable([pair], count, least)}, and {structure.unknowns} coefficients "
             f"need at least {needed}"
         )
-    return _Data(pair, structure, points, reason)
+    return _Data(pair, points, reason)
 
 
 def select_pair(frf: FrequencyResponse, output: int | str, input: int | str) -> FrequencyResponse:

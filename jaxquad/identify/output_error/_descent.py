@@ -98,12 +98,15 @@ def descend(
             "Start from other values, cut the record with jq.records.trim, or fit in the "
             "frequency domain with jq.fit"
         )
-    stop, status, steps = minimise_on_host(start, type(start).moved, max_steps, tolerance=tolerance)
-    if isinstance(stop, FilteredPoint) and not stop.is_precise:
-        start = _point(problem, stop.z)
-        stop, status, steps = minimise_on_host(start, Point.moved, max_steps, tolerance=tolerance)
-    if isinstance(stop, FilteredPoint):
-        stop = Point(problem, stop.z, stop.evaluation)
+    options = {"max_steps": max_steps, "tolerance": tolerance}
+    if isinstance(start, FilteredPoint):
+        end, status, steps = minimise_on_host(start, FilteredPoint.moved, **options)
+        precise = end.is_precise
+        stop = Point(problem, end.z, end.evaluation) if precise else _point(problem, end.z)
+    else:
+        precise, stop, status, steps = False, start, RUNNING, 0
+    if not precise:
+        stop, status, steps = minimise_on_host(stop, Point.moved, **options)
     message = ""
     if status == RUNNING:
         message = f"the maximum of {steps} steps was reached"
@@ -195,10 +198,20 @@ def descend_with_noise(
     is far off itself.
     Source: Ljung, System Identification, sec. 7.2 and 13.4 (direct method in a closed loop).
     """
+
+    def akaike(end: _End) -> float:
+        """Akaike's criterion, with the deviation of all samples' shocks that of those predicted."""
+        total = 0.0
+        sizes = sizes_of(end.problem, end.stop.evaluation)
+        for term, size, models in zip(end.problem.terms, sizes, end.models, strict=True):
+            total += 2 * len(term.y) * float(np.sum(np.log(size / np.asarray(term.weights))))
+            total += 2 * sum(sum(model.order) for model in models)
+        return total if np.isfinite(total) else np.inf
+
     ends: list[_End] = []
     for begin in (_at_start,) if near else (_at_start, _after_output_error):
         ends.append(_alternate(begin(problem, max_steps), noise, max_steps, ends))
-    plain, problem, stop, steps, message, residuals, models = min(ends, key=_akaike)
+    plain, problem, stop, steps, message, residuals, models = min(ends, key=akaike)
     noises = []
     for term, residual, row in zip(plain.terms, residuals, models, strict=True):
         blocks = [shock_slopes(v, model) for v, model in zip(residual.T, row, strict=True)]
@@ -244,7 +257,8 @@ def _alternate(start: _Start, noise: Noise, max_steps: int, ends: Sequence[_End]
     for turn in range(_TURNS):
         models = _estimate_all(residuals, kinds)
         if turn >= _FREE:
-            kinds = [[_same_order(model) for model in row] for row in models]
+            of_order = lambda p, z: ARMA(p, z) if z else AutoRegressive(p)
+            kinds = [[of_order(*model.order) for model in row] for row in models]
         # The problem of the shocks, in units of their deviation.
         terms = [
             dataclasses.replace(
@@ -273,16 +287,6 @@ def _distance(stop: Point, change: Vector) -> float:
     return float(np.sqrt(max(change @ stop.slopes()[1] @ change, 0.0)))
 
 
-def _akaike(end: _End) -> float:
-    """Akaike's criterion, with the deviation of all samples' shocks that of those predicted."""
-    total = 0.0
-    sizes = sizes_of(end.problem, end.stop.evaluation)
-    for term, size, models in zip(end.problem.terms, sizes, end.models, strict=True):
-        total += 2 * len(term.y) * float(np.sum(np.log(size / np.asarray(term.weights))))
-        total += 2 * sum(sum(model.order) for model in models)
-    return total if np.isfinite(total) else np.inf
-
-
 def _estimate_all(residuals: Residuals, kinds: list[list[Noise]]) -> Models:
     # Residuals have unit size, unless the record is exact and they are rounding.
     estimate = lambda v, kind: estimate_noise(v, kind) if np.mean(v**2) > 0.25 else WHITE
@@ -290,11 +294,6 @@ def _estimate_all(residuals: Residuals, kinds: list[list[Noise]]) -> Models:
         [estimate(v, kind) for v, kind in zip(residual.T, row, strict=True)]
         for residual, row in zip(residuals, kinds, strict=True)
     ]
-
-
-def _same_order(model: NoiseModel) -> Noise:
-    poles, zeros = model.order
-    return ARMA(poles, zeros) if zeros else AutoRegressive(poles)
 
 
 def _residuals(plain: Evaluation, models: Models) -> Residuals:

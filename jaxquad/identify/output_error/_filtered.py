@@ -24,8 +24,8 @@ from jaxtyping import Array, Float, PyTree
 from jaxquad._core import Normal
 from jaxquad.models import sample_rational, TransferFunction
 
-from ..frequency_domain._evaluate import evaluate, Frame, take_apart
 from ..frequency_domain._parameters import Numbers
+from ..frequency_domain._solve import evaluate, Frame, take_apart
 from ..uncertainty._accuracy import row_products
 from ._problem import Evaluation, insert_parameters, OutputError, RecordTerm
 from ._simulated import band_filter, linear_model

@@ -15,9 +15,8 @@ from jaxquad.models import with_arrays
 from jaxquad.records import Record
 
 from ..frequency_domain._fit import check_priors
-from ..frequency_domain._model_checks import require_model
 from ..frequency_domain._parameters import Free, select_parameters, Tie
-from ..frequency_domain._problem import make_problem, Prior, require_priors
+from ..frequency_domain._problem import make_problem, Prior, require_model, require_priors
 from ..frequency_domain._refits import free_again
 from ..frequency_domain._result import Fit
 from ._descent import descend_by_turns, descend_with_noise
@@ -111,7 +110,32 @@ def refine(
     if isinstance(model, Record):
         require_model("refine", model)
     records = [record] if isinstance(record, Record) else list(record)
-    _check(records, noise, loop, band, max_steps)
+    if not records or not all(isinstance(one, Record) for one in records):
+        kinds = ", ".join(sorted({type(one).__name__ for one in records})) or "nothing"
+        raise ValueError(f"refine needs a jq.Record or a list of them, not {kinds}: see jq.read")
+    if max_steps < 1:
+        raise ValueError(f"max_steps is {max_steps}: give at least 1")
+    for one in records:
+        still = [n for n, y in zip(one.output_names, one.outputs.T, strict=True) if not np.ptp(y)]
+        if still:
+            raise ValueError(
+                Message(f"output {still[0]} is constant: leave it out« with jq.records.select»")
+            )
+    if not (noise in (None, "auto") or isinstance(noise, AutoRegressive | ARMA)):
+        raise ValueError(
+            f"noise is {noise!r}: give None (white), jq.identify.AutoRegressive(order), "
+            'jq.identify.ARMA(poles, zeros) or "auto"'
+        )
+    if noise is not None and band is not None:
+        raise ValueError(
+            f"band {band} rad/s and a noise model exclude each other: outside the band there is no "
+            "noise left to model. Give noise alone: it weights each frequency by its noise"
+        )
+    if loop is not None and band is not None:
+        raise ValueError(
+            f"band {band} rad/s and a loop exclude each other: leave the band out, a noise model "
+            'weights each frequency by its noise (noise="auto")'
+        )
     longest = max(one.samples for one in records)
     near = isinstance(model, Fit)
     if isinstance(model, Fit):  # its choice of parameters holds where no other is given
@@ -140,42 +164,6 @@ def refine(
             descent = descend_with_noise(problem, noise, max_steps, near=near)
         check_priors(base, descent.solution)
         return assess_output_error(descent, records)
-
-
-def _check(
-    records: list[Record],
-    noise: Noise | None,
-    loop: KnownController | None,
-    band: tuple[float, float] | None,
-    max_steps: int,
-) -> None:
-    """Raise ValueError for arguments that make no sense."""
-    if not records or not all(isinstance(one, Record) for one in records):
-        kinds = ", ".join(sorted({type(one).__name__ for one in records})) or "nothing"
-        raise ValueError(f"refine needs a jq.Record or a list of them, not {kinds}: see jq.read")
-    if max_steps < 1:
-        raise ValueError(f"max_steps is {max_steps}: give at least 1")
-    for one in records:
-        still = [n for n, y in zip(one.output_names, one.outputs.T, strict=True) if not np.ptp(y)]
-        if still:
-            raise ValueError(
-                Message(f"output {still[0]} is constant: leave it out« with jq.records.select»")
-            )
-    if not (noise in (None, "auto") or isinstance(noise, AutoRegressive | ARMA)):
-        raise ValueError(
-            f"noise is {noise!r}: give None (white), jq.identify.AutoRegressive(order), "
-            'jq.identify.ARMA(poles, zeros) or "auto"'
-        )
-    if noise is not None and band is not None:
-        raise ValueError(
-            f"band {band} rad/s and a noise model exclude each other: outside the band there is no "
-            "noise left to model. Give noise alone: it weights each frequency by its noise"
-        )
-    if loop is not None and band is not None:
-        raise ValueError(
-            f"band {band} rad/s and a loop exclude each other: leave the band out, a noise model "
-            'weights each frequency by its noise (noise="auto")'
-        )
 
 
 def _term(

@@ -77,7 +77,14 @@ def assess_output_error(descent: Descent, records: Sequence[Record]) -> Fit:
     covariance = calibrated_covariance(bread, noise)
     taken = float(np.trace(scaled_inverse(bread) @ noise.data))
     step = scaled_inverse(bread) @ gradient
-    decrement, explained = 0.5 * float(gradient @ step), _explained(projected, problem.terms)
+    decrement = 0.5 * float(gradient @ step)
+    # The share of the outputs' power that the inputs explain, without initial state and trim.
+    total = 0.0
+    for one, term in zip(projected, problem.terms, strict=True):
+        basis = one.nuisance.reshape(-1, one.nuisance.shape[2])
+        output = np.asarray(term.measured).reshape(-1)
+        total += float(np.sum(output**2) - np.sum((basis.T @ output) ** 2))
+    explained = 1 - data_cost / total if total > 0 else 1.0
     # In units of what the noise moves: a share of the cost would grow with the record.
     if decrement > count * max(taken, 1.0) or is_unfinished(solution, step, covariance):
         remedy = "«start from other values», for instance those of jq.fit"
@@ -160,17 +167,6 @@ def _reduce_rows(
     return Reduced(root, aim, noise, output)
 
 
-def _explained(projected: Sequence[Projected], terms: Sequence[RecordTerm]) -> float:
-    """The share of the outputs' power that the inputs explain, without initial state and trim."""
-    left = total = 0.0
-    for one, term in zip(projected, terms, strict=True):
-        basis = one.nuisance.reshape(-1, one.nuisance.shape[2])
-        output = np.asarray(term.measured).reshape(-1)
-        total += float(np.sum(output**2) - np.sum((basis.T @ output) ** 2))
-        left += float(np.sum(one.misfit**2))
-    return 1 - left / total if total > 0 else 1.0
-
-
 def _verdict(
     descent: Descent, reduced: Reduced, prior: PriorRows, covariance: Matrix, units: Vector
 ) -> tuple[Verdict, Verdict]:
@@ -233,12 +229,12 @@ def _same_outputs(descent: Descent, values: Float[np.ndarray, " parameters"]) ->
 
 def _remarks_on_output_error(
     descent: Descent, records: Sequence[Record], decrement: float, taken: float, verdict: Verdict
-) -> list[str]:
+) -> list[Message]:
     """Runaway parameters, missing convergence, and feedback."""
     solution, no_minimum = descent.solution, decrement > _LEFT * max(taken, 1.0)
     remarks = runaways(descent.problem.base, solution, verdict)
     if not solution.converged and (no_minimum or not remarks):
-        remarks.append(f"the solver stopped early: {solution.message}")
+        remarks.append(Message(f"the solver stopped early: {solution.message}", "stopped early"))
     if no_minimum:
         remarks.append(
             Message(
@@ -261,19 +257,20 @@ def _remarks_on_output_error(
                 "compare",
                 "",
             )
-        remarks.append(
+        text = (
             f"the record has references ({', '.join(names)}), so a loop may have been closed: "
             f"{doubt} the joint estimate{instead}"
             "«joint estimate|, jq.frequency_response(..., estimator=jq.spectra.JointInputOutput())»"
         )
-    remarks.append(
+        remarks.append(Message(text, "feedback"))
+    text = (
         "the noise level is estimated from the residuals, so misfit / random error is 1 for any "
         "model: check the model by «jq.verify» on another record"
     )
-    return remarks
+    return [*remarks, Message(text, "noise level")]
 
 
-def _remarks_on_colour(descent: Descent, bread: Matrix, covariance: Matrix) -> list[str]:
+def _remarks_on_colour(descent: Descent, bread: Matrix, covariance: Matrix) -> list[Message]:
     """Remark on residuals whose colour changes the standard errors."""
     white = np.diagonal(scaled_inverse(bread))
     ratio = np.sqrt(np.diagonal(covariance) / np.maximum(white, 1e-300))
@@ -288,7 +285,8 @@ def _remarks_on_colour(descent: Descent, bread: Matrix, covariance: Matrix) -> l
         subject, advice = "the noise model leaves the residuals", "try one of higher order"
     else:
         subject, advice = "the residuals are", 'noise="auto" weights them by their spectrum'
-    return [
+    text = (
         f"{subject} coloured (lag-one correlation {correlation:.2f}): standard errors allow for "
         f"it, and are up to {most:.2g} times those under white noise; {advice}"
-    ]
+    )
+    return [Message(text, "coloured residuals")]

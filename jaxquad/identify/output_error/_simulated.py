@@ -280,8 +280,8 @@ def unknown_motions(plant: TransferFunction | StateSpace, duration: float) -> Mo
             return np.eye(len(A), int(np.sum(inside)))
         from scipy.linalg import schur
 
-        _, vectors, count = schur(A, output="real", sort=lambda re, im: low < -re <= high)
-        return vectors[:, : int(count)]
+        parts = schur(A, output="real", sort=lambda re, im: low < -re <= high)
+        return parts[1][:, : int(parts[-1])]
 
     slow = basis(-np.inf, edges[0])
     parts = [basis(low, high) for low, high in zip(edges, edges[1:], strict=False)]

@@ -11,7 +11,7 @@ from jaxtyping import Complex, Float
 
 from jaxquad.spectra import FrequencyResponse
 
-from ..frequency_domain._mixing import expected_cost, mix, mix_twice, Mixing
+from ..frequency_domain._cost import expected_cost, mix, mix_twice, Mixing
 
 
 Matrix = Float[np.ndarray, "parameters parameters"]
@@ -97,8 +97,8 @@ def blocks_of(records: Sequence[ResponseTerm]) -> list[Block]:
         weights, used = record.weights, record.weights[..., 0] > 0
         residual = mix(record.mixing, weights * record.misfit)
         rows = mix(record.mixing, weights[..., None] * record.slopes)
-        known = np.where(used, error, 0.0)
-        expected = expected_cost(record.mixing, weights * known[..., None])
+        noise = np.where(used, error, 0.0)
+        expected = expected_cost(record.mixing, weights * noise[..., None])
         for o, i in np.ndindex(error.shape[1:]):
             at = (slice(None), o, i)
             parts = residual[at], rows[at], record.slopes[at], weights[at], error[at]
@@ -110,31 +110,27 @@ def noise_effect(
     records: Sequence[ResponseTerm], blocks: list[Block], prior: PriorRows, count: int
 ) -> Noise:
     """The responses' errors, with all their correlation, seen through weights and slopes."""
-    data = sum(map(_through_fit, records), np.zeros((count, count)))
+    data = np.zeros((count, count))
+    for record in records:
+        pulls, used = record.pulls, record.weights[..., 0] > 0
+        model = np.where(used, np.asarray(record.frf.response) / record.ratio, 1.0)
+        off = np.where(used, np.abs(record.ratio), 1.0) ** (1 - record.error_exponent)
+        # Magnitude and phase of the misfit are the parts of dT over T.
+        columns = (pulls[..., 0, :] + 1j * pulls[..., 1, :]) / (model.conj() * off)[..., None]
+        errors = record.frf.errors
+        # A bound method of an `eqx.Module` is made like a model.
+        data = data + type(errors).project(errors, np.where(used[..., None], columns, 0.0))
     cost = sum(block.expected for block in blocks)
     return Noise(data, prior.slopes[:, :count].T @ prior.slopes[:, :count], cost)
 
 
-def _through_fit(record: ResponseTerm) -> Matrix:
-    weighted = record.pulls
-    used = record.weights[..., :1] > 0
-    model = np.where(used[..., 0], np.asarray(record.frf.response) / record.ratio, 1.0)
-    off = np.where(used[..., 0], np.abs(record.ratio), 1.0) ** (1 - record.error_exponent)
-    # Magnitude and phase of the misfit are the parts of dT over T.
-    columns = (weighted[..., 0, :] + 1j * weighted[..., 1, :]) / (model.conj() * off)[..., None]
-    errors = record.frf.errors
-    # A bound method of an `eqx.Module` is made like a model.
-    return type(errors).project(errors, np.where(used, columns, 0.0))
-
-
-def calibrated_covariance(bread: Matrix, noise: Noise, inflation: float = 1.0) -> Matrix:
+def calibrated_covariance(bread: Matrix, noise: Noise) -> Matrix:
     """Sandwich covariance: (J'WJ)^-1 J'W S W J (J'WJ)^-1, S the covariance of the errors.
 
     It holds for any weights, and counts neighbouring frequencies that share their noise once only.
-    `inflation` multiplies S.
     """
     inverse = scaled_inverse(bread)
-    return inverse @ (inflation * noise.data + noise.priors) @ inverse
+    return inverse @ (noise.data + noise.priors) @ inverse
 
 
 def degrees_of_freedom(
@@ -158,8 +154,8 @@ def degrees_of_freedom(
         if covariance is not None:
             doubt += np.einsum("fop,fg,gop->p", share, covariance, share, optimize=True)
     with np.errstate(divide="ignore", invalid="ignore"):
-        found = 2 * variance**2 / doubt
-    return np.where(doubt > 0, np.maximum(found, 1.0), np.inf)
+        freedom = 2 * variance**2 / doubt
+    return np.where(doubt > 0, np.maximum(freedom, 1.0), np.inf)
 
 
 def misfit_ratio(cost: float, bread: Matrix, noise: Noise) -> float:
@@ -216,6 +212,7 @@ def condition_number(bread: Matrix) -> float:
 _LEAST = 4  # of the record's own frequencies on either side that are averaged into one
 _SHARE = 0.1  # of the frequency, as far as the average reaches above that
 _FLOOR = 0.05  # of a frequency that the fit leaves to the noise, at least
+_WELL = 1e-3  # smallest eigenvalue of the products of columns of unit length for two rounds
 
 
 def projected_noise(
@@ -237,26 +234,28 @@ def projected_noise(
     length = int(next_fast_len(2 * samples, real=True) or 2 * samples)
     # Two series at once share the vectors of the processor; more of them only take memory.
     turn = lambda series: np.asarray(rfft(series, length))
-    rest, seen, smooth, left = [], [], [], []
+    rest, driven, smooth, left = [], [], [], []
     windows = _windows(length // 2 + 1, length / samples)
     for o in range(outputs):
-        seen.append(turn(columns[:, o].T))
+        driven.append(turn(columns[:, o].T))
         others = np.vstack([residual[:, o], nuisance[:, o].T])
         pairs = (turn(others[k : k + 2]) for k in range(0, len(others), 2))
         first = next(pairs)
         rest.append(first[0])
-        taken = _power(seen[o][:count]) + _power(first[1:]) + sum(map(_power, pairs))
+        taken = _power(driven[o][:count]) + _power(first[1:]) + sum(map(_power, pairs))
         smooth.append(_averaged(_power(first[:1]) / samples, windows))
         left.append(np.sqrt(np.maximum(1 - _averaged(taken / samples, windows), _FLOOR)))
     twice = np.full(length // 2 + 1, 2.0 / length)
     twice[0] = 1.0 / length
     twice[-1] /= 2.0 if length % 2 == 0 else 1.0
     total = np.zeros((columns.shape[2],) * 2)
+    # The real part of a sum of conj(weight one) other over the bins.
+    product = lambda one, weight, other: (weight * one).view(float) @ other.view(float).T
     for o in range(outputs):
-        total += _product(seen[o], twice * smooth[o] / left[o] ** 2, seen[o])
+        total += product(driven[o], twice * smooth[o] / left[o] ** 2, driven[o])
     for i, j in itertools.permutations(range(outputs), 2):
         cross = _averaged(rest[i].conj() * rest[j] / samples, windows)
-        total += _product(seen[i], twice * cross / (left[i] * left[j]), seen[j])
+        total += product(driven[i], twice * cross / (left[i] * left[j]), driven[j])
     return 0.5 * (total + total.T)
 
 
@@ -267,28 +266,16 @@ def _power(spectra: Complex[np.ndarray, "series bins"]) -> Float[np.ndarray, " b
     return squares[::2] + squares[1::2]
 
 
-def _product(
-    one: Complex[np.ndarray, "columns bins"],
-    weight: Float[np.ndarray, " bins"] | Complex[np.ndarray, " bins"],
-    other: Complex[np.ndarray, "columns bins"],
-) -> Float[np.ndarray, "columns columns"]:
-    """The real part of the sum of conj(weight one) other over the bins."""
-    return (weight * one).view(float) @ other.view(float).T
-
-
 def orthonormal(
     columns: Float[np.ndarray, "samples outputs columns"],
 ) -> Float[np.ndarray, "samples outputs columns"]:
     """An orthonormal basis of what the columns span over all samples and outputs."""
     flat = columns.reshape(-1, columns.shape[2])
     scale = np.sqrt([column @ column for column in flat.T])
-    seen = scale > 1e-12 * np.max(scale, initial=0.0)
-    if not np.all(seen):
-        flat = flat / np.where(seen, scale, np.inf)
+    shows = scale > 1e-12 * np.max(scale, initial=0.0)
+    if not np.all(shows):
+        flat = flat / np.where(shows, scale, np.inf)
     return orthogonal_factors(flat)[0].reshape(columns.shape)
-
-
-_WELL = 1e-3  # smallest eigenvalue of the products of columns of unit length for two rounds
 
 
 def row_products(rows: Float[np.ndarray, "rows samples"]) -> Float[np.ndarray, "rows rows"]:
@@ -302,7 +289,7 @@ def row_products(rows: Float[np.ndarray, "rows samples"]) -> Float[np.ndarray, "
 def orthogonal_factors(
     columns: Float[np.ndarray, "rows columns"],
 ) -> tuple[Float[np.ndarray, "rows columns"], Float[np.ndarray, "columns columns"]]:
-    """Orthonormal columns and the triangle that makes the given ones of them.
+    """Orthonormal columns and the triangle that makes these ones of them.
 
     By their products, twice, where they are far from dependent: for tall matrices that takes a
     third of the time of reflections, and is as orthogonal.
@@ -325,23 +312,16 @@ def orthogonal_factors(
     return basis.T, triangle
 
 
-class _Windows(NamedTuple):
-    """Of a moving mean: its first bin and the one after its last, in a mirrored spectrum."""
-
-    start: np.ndarray
-    stop: np.ndarray
-    mirrored: int  # bins before the first and after the last
-
-
 @ft.lru_cache(maxsize=8)
-def _windows(bins: int, finer: float) -> _Windows:
+def _windows(bins: int, finer: float) -> tuple[np.ndarray, np.ndarray, int]:
+    """Of a moving mean in a mirrored spectrum: first bins, those after the last, bins mirrored."""
     reach = np.ceil(np.maximum(_LEAST * finer, _SHARE * np.arange(bins))).astype(int)
     furthest = min(int(reach.max()), bins - 1)
     reach, centre = np.minimum(reach, furthest), np.arange(bins) + furthest
-    return _Windows(centre - reach, centre + reach + 1, furthest)
+    return centre - reach, centre + reach + 1, furthest
 
 
-def _averaged(x: np.ndarray, windows: _Windows) -> np.ndarray:
+def _averaged(x: np.ndarray, windows: tuple[np.ndarray, np.ndarray, int]) -> np.ndarray:
     """The mean over the windows around each bin, mirrored at the ends."""
     start, stop, furthest = windows
     mirrored = np.concatenate([x[furthest:0:-1].conj(), x, x[-2 : -furthest - 2 : -1].conj()])

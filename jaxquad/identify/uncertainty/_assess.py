@@ -12,11 +12,11 @@ from jaxquad.models import LaggedIntegrator, StateSpace, TransferFunction
 from jaxquad.spectra import FrequencyResponse
 
 from ..frequency_domain._cost import widen_band
-from ..frequency_domain._held import remarks_on_hold
 from ..frequency_domain._parameters import Parameters, Place
 from ..frequency_domain._problem import on_device, Problem
 from ..frequency_domain._refits import Origin
 from ..frequency_domain._result import Fit
+from ..frequency_domain._sampled import remarks_on_hold
 from ..frequency_domain._solve import is_saddle, same_responses, Solution
 from ..frequency_domain._starts import Minimum, remarks_on_minima
 from ..output_error._noise import NoiseModel
@@ -37,8 +37,15 @@ from ._accuracy import (
     PriorRows,
     scaled_inverse,
 )
-from ._discrepancy import Discrepancy
-from ._error_budget import error_budget, ErrorBudget, records_of, Units, units_of, Weighting
+from ._error_budget import (
+    Discrepancy,
+    error_budget,
+    ErrorBudget,
+    records_of,
+    Units,
+    units_of,
+    Weighting,
+)
 from ._fit_remarks import (
     DOUBT,
     fed_back,
@@ -225,7 +232,7 @@ def _costs_by_noise(
 
 def _remarks_on_growth(
     model: PyTree, frfs: Sequence[FrequencyResponse], used: Sequence[np.ndarray]
-) -> list[str]:
+) -> Sequence[str]:
     """Remark on a model that grows within the band of a direct estimate: no open loop does."""
     lags = isinstance(model, LaggedIntegrator) and not np.asarray(model.lag) < 0
     if lags or not any(frf.method == "direct" for frf in frfs):

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Complex, Float, Inexact, PyTree
 
 from jaxquad._compile import hasty_options, Jit
-from jaxquad.models import evaluate_response, simulate_linear, StateSpace, TransferFunction
+from jaxquad.models import evaluate_response, simulate_linear, TransferFunction
 
 from ..output_error._simulated import linear_model
 from ._accuracy import Matrix
@@ -17,6 +17,7 @@ from ._verdict import reach_of_interval
 
 
 _CHANGE = 1e-5  # of a parameter: central differences are then exact to about 1e-10
+_AT_ONCE = 512  # frequencies of a program, so that all curves of a model share it
 
 
 class ResponseBand(NamedTuple):
@@ -72,13 +73,9 @@ def step_response(
     dt = float(t[-1] / (t.size - 1))
     if isinstance(plant, TransferFunction):
         return np.asarray(simulate_linear(plant, np.ones(t.size), dt))[:, None, None]
-    return np.stack([_step_of(plant, k, t.size, dt) for k in range(plant.G.shape[1])], axis=-1)
-
-
-def _step_of(plant: StateSpace, k: int, samples: int, dt: float) -> np.ndarray:
-    u = np.zeros((samples, plant.G.shape[1]))
-    u[:, k] = 1.0
-    return np.asarray(simulate_linear(plant, u, dt))
+    inputs = np.eye(plant.G.shape[1])
+    steps = (np.broadcast_to(unit, (t.size, len(inputs))) for unit in inputs)
+    return np.stack([np.asarray(simulate_linear(plant, u, dt)) for u in steps], axis=-1)
 
 
 @ft.partial(Jit, options=hasty_options)
@@ -86,15 +83,12 @@ def _response(model: PyTree, omega: Float[Array | np.ndarray, " frequencies"]) -
     return evaluate_response(model, jnp.asarray(omega))
 
 
-_AT_ONCE = 512  # frequencies of a program, so that all curves of a model share it
-
-
 def model_response(
     model: PyTree, omega: Float[np.ndarray, " frequencies"]
 ) -> Complex[np.ndarray, "frequencies outputs inputs"]:
     """The response of a model at frequencies in rad/s, by one program whatever their number."""
     padded = np.pad(omega, (0, -omega.size % _AT_ONCE), mode="edge").reshape(-1, _AT_ONCE)
-    parts = [np.asarray(_response(model, each)) for each in padded]
+    parts = [np.asarray(_response(model, part)) for part in padded]
     return np.concatenate(parts)[: omega.size]
 
 
@@ -128,10 +122,10 @@ def pole_reach(fit: PyTree, covariance: Matrix) -> Complex[np.ndarray, " poles"]
     start = linear_model(fit.model).poles
 
     def poles(model: PyTree) -> Complex[np.ndarray, " poles"]:
-        left, found = list(linear_model(model).poles), []
-        for pole in start:  # in the order of the fit's own
-            found.append(left.pop(int(np.argmin(np.abs(np.array(left) - pole)))))
-        return np.array(found, complex)
+        left, ordered = list(linear_model(model).poles), []
+        for pole in start:  # in the order of the fit's poles
+            ordered.append(left.pop(int(np.argmin(np.abs(np.array(left) - pole)))))
+        return np.array(ordered, complex)
 
     slopes = _slopes(fit, poles)[1]
     return _reach(fit, np.real(slopes), covariance) + 1j * _reach(fit, np.imag(slopes), covariance)
@@ -144,21 +138,20 @@ def _slopes(
 
     By differences: the program of the curve itself serves, whatever the model.
     """
-    value = curve(fit.model)
-    changed = lambda k, by: curve(fit.parameters.replace(fit.model, _moved(fit, k, by)))
-    rows = [
-        (changed(k, _CHANGE) - changed(k, -_CHANGE)) / (2 * _CHANGE)
-        if fit.values[k]  # a lag or delay of 0 has no lower neighbour
-        else (changed(k, _CHANGE) - value) / _CHANGE
-        for k in range(len(fit.names))
-    ]
+    value, rows = curve(fit.model), []
+
+    def changed(k: int, by: float) -> Inexact[np.ndarray, "..."]:
+        values = np.array(fit.values, float)
+        values[k] += by * fit.units[k]
+        return curve(fit.parameters.replace(fit.model, values))
+
+    for k in range(len(fit.names)):
+        above = changed(k, _CHANGE)
+        if fit.values[k]:
+            rows.append((above - changed(k, -_CHANGE)) / (2 * _CHANGE))
+        else:  # a lag or delay of 0 has no lower neighbour
+            rows.append((above - value) / _CHANGE)
     return value, np.stack(rows)
-
-
-def _moved(fit: PyTree, k: int, by: float) -> Float[np.ndarray, " parameters"]:
-    values = np.array(fit.values, float)
-    values[k] += by * fit.units[k]
-    return values
 
 
 def _reach(
@@ -171,5 +164,5 @@ def _reach(
         shares = flat**2 * np.diagonal(covariance)[:, None]
         doubt = np.sum(shares / fit.degrees_of_freedom[:, None], axis=0)
         freedom = np.where(doubt > 0, np.sum(shares, axis=0) / doubt, np.inf)
-    reach = np.array([reach_of_interval(each) for each in freedom])
+    reach = np.array([reach_of_interval(number) for number in freedom])
     return (reach * np.sqrt(np.maximum(variance, 0.0))).reshape(slopes.shape[1:])

@@ -34,14 +34,32 @@ def draw_models(
 
     - `UndeterminedError`, `ValueError`: as `Fit.ensemble`.
     """
-    spread = _spread_of(fit, hold_undetermined)
-    replaced = _replaced(fit.parameters, fit.model, spread, as_array(scores))
+    check_drawable(fit, hold_undetermined)
+    covariance = known_covariance(fit)
+    logarithmic = np.array(fit.parameters.logarithmic[: len(fit.names)])
+    here, units = np.asarray(fit.values), np.asarray(fit.units)
+    at_zero = [fit.names.index(bound.name) for bound in fit.verdict.bounds]
+    along = covariance[at_zero] / np.diagonal(covariance)[at_zero, None]
+    # In other units than its value a parameter is mixed up with others near zero.
+    scaled = logarithmic & (here != 0) & ~np.isclose(units, here, rtol=1e-9, atol=0.0)
+    mixed_up = np.setdiff1d(np.flatnonzero(scaled), at_zero)
+    relative = np.asarray(fit.relative_covariance)[mixed_up]
+    along = np.concatenate([along, relative / relative[np.arange(len(relative)), mixed_up, None]])
+    at_zero += mixed_up.tolist()
+    logarithmic[at_zero] = False
+    variances, directions = np.linalg.eigh(covariance)
+    root = directions * np.sqrt(np.maximum(variances, 0.0))
+    spread = _Spread(root, tuple(at_zero), along, here, units, logarithmic)
+    drawn = jax.tree.leaves(_drawn(fit.parameters, fit.model, spread, as_array(scores)))
     places = (*fit.parameters.places[: len(fit.names)], *(p for p, _ in fit.parameters.ties))
-    touched, structure = {place.leaf for place in places}, jax.tree.structure(fit.model)
-    floating = [k for k, x in enumerate(jax.tree.leaves(fit.model)) if _is_inexact(x)]
-    drawn = {floating[leaf] for leaf in touched}
-    pairs = zip(jax.tree.leaves(fit.model), jax.tree.leaves(replaced), strict=True)
-    leaves = [new if k in drawn else x for k, (x, new) in enumerate(pairs)]
+    leaves, structure = jax.tree.flatten(fit.model)
+    floating = [
+        k
+        for k, x in enumerate(leaves)
+        if isinstance(x, jax.Array | np.ndarray) and jnp.issubdtype(x.dtype, jnp.inexact)
+    ]
+    for k in {floating[place.leaf] for place in places}:
+        leaves[k] = drawn[k]
     return jax.tree.unflatten(structure, leaves)
 
 
@@ -56,39 +74,14 @@ class _Spread(NamedTuple):
     logarithmic: Bool[np.ndarray, " parameters"]
 
 
-def _spread_of(fit: "Fit", hold_undetermined: bool) -> _Spread:
-    check_drawable(fit, hold_undetermined)
-    covariance = known_covariance(fit)
-    logarithmic = np.array(fit.parameters.logarithmic[: len(fit.names)])
-    here, units = np.asarray(fit.values), np.asarray(fit.units)
-    at_zero = [fit.names.index(bound.name) for bound in fit.verdict.bounds]
-    along = covariance[at_zero] / np.diagonal(covariance)[at_zero, None]
-    # In other units than its own value a parameter is mixed up with others near zero.
-    scaled = logarithmic & (here != 0) & ~np.isclose(units, here, rtol=1e-9, atol=0.0)
-    mixed_up = np.setdiff1d(np.flatnonzero(scaled), at_zero)
-    relative = np.asarray(fit.relative_covariance)[mixed_up]
-    along = np.concatenate([along, relative / relative[np.arange(len(relative)), mixed_up, None]])
-    at_zero += mixed_up.tolist()
-    logarithmic[at_zero] = False
-    return _Spread(_root(covariance), tuple(at_zero), along, here, units, logarithmic)
-
-
 @eqx.filter_jit  # as one program: eager, it would be half a dozen for each number of members
-def _replaced(
+def _drawn(
     parameters: Parameters,
     model: PyTree,
     spread: _Spread,
     scores: Float[Array, "parameters members"],
 ) -> PyTree:
     """The models, with the members on the last axis of every array."""
-    values = _drawn_values(spread, scores)
-    return jax.vmap(lambda v: parameters.replace(model, v), in_axes=-1, out_axes=-1)(values)
-
-
-def _drawn_values(
-    spread: _Spread, scores: Float[Array, "parameters members"]
-) -> Float[Array, "parameters members"]:
-    """Physical values of the free parameters."""
     changes = spread.root @ scores
     here, units = spread.here[:, None], spread.units[:, None]
     for k, along in zip(spread.at_zero, spread.along, strict=True):
@@ -100,7 +93,8 @@ def _drawn_values(
     # Several that go along with each other may have pushed one back.
     near = np.isin(np.arange(len(linear)), spread.at_zero)[:, None]
     linear = jnp.where(near, jnp.copysign(linear, units), linear)
-    return jnp.where(spread.logarithmic[:, None], here * jnp.exp(changes), linear)
+    values = jnp.where(spread.logarithmic[:, None], here * jnp.exp(changes), linear)
+    return jax.vmap(lambda v: parameters.replace(model, v), in_axes=-1, out_axes=-1)(values)
 
 
 def check_drawable(fit: "Fit", hold_undetermined: bool) -> None:
@@ -112,29 +106,29 @@ def check_drawable(fit: "Fit", hold_undetermined: bool) -> None:
         raise ValueError(
             f"the fit did not converge, so there is nothing to draw from: {stopped[0]}"
         )
-    lost = fit.verdict.undetermined
-    known = fit.standard_errors[fit.determined]
-    if not (np.all(np.isfinite(fit.relative_covariance)) and np.all(np.isfinite(known))):
+    errors = fit.standard_errors[fit.determined]
+    if not (np.all(np.isfinite(fit.relative_covariance)) and np.all(np.isfinite(errors))):
         raise ValueError(
             "the fit's standard errors are not finite, so there is nothing to draw from: use a "
             "response with random errors, and fit again"
         )
+    lost = fit.verdict.undetermined
     if lost and not hold_undetermined:
-        raise UndeterminedError(_refusal(fit, lost))
+        names, sums = ", ".join(lost), " and ".join(c.name for c in fit.combinations)
+        raise UndeterminedError(
+            f"the record does not determine {names}{f' (only {sums} is)' if sums else ''}, so they "
+            "cannot be drawn: fix them at measured values as far as needed, give a "
+            "jq.identify.Prior or a second record; or, for quantities that depend on determined "
+            "combinations alone, give hold_undetermined=True"
+        )
 
 
 def known_covariance(fit: "Fit") -> Matrix:
     """The covariance of relative changes, without the directions that are not determined.
 
-    Quantities that depend on none of these keep their variance.
+    These are undetermined exactly or by the noise; quantities that depend on none of them keep
+    their variance.
     """
-    held = _held_directions(fit)
-    keep = np.eye(len(fit.names)) - held.T @ held
-    return keep @ fit.relative_covariance @ keep
-
-
-def _held_directions(fit: "Fit") -> Float[np.ndarray, "held parameters"]:
-    """Orthonormal relative changes that the fit calls undetermined, exactly or by its noise."""
     verdict, names = fit.verdict, fit.names
     shares = [[row.get(name, 0.0) for name in names] for row in verdict.null_directions]
     null = np.array(shares).reshape(-1, len(names))
@@ -143,23 +137,6 @@ def _held_directions(fit: "Fit") -> Float[np.ndarray, "held parameters"]:
     rest = null - null @ verdict.exact.T @ verdict.exact
     count = len(null) - len(verdict.exact)
     noisy = np.linalg.svd(rest, full_matrices=False)[2][:count] if count > 0 else rest[:0]
-    return np.linalg.qr(np.concatenate([verdict.exact, noisy, single]).T)[0].T
-
-
-def _root(covariance: Matrix) -> Matrix:
-    variances, directions = np.linalg.eigh(covariance)
-    return directions * np.sqrt(np.maximum(variances, 0.0))
-
-
-def _refusal(fit: "Fit", lost: tuple[str, ...]) -> str:
-    names, known = ", ".join(lost), " and ".join(c.name for c in fit.combinations)
-    determined = f" (only {known} is)" if known else ""
-    return (
-        f"the record does not determine {names}{determined}, so they cannot be drawn: fix them at "
-        "measured values as far as needed, give a jq.identify.Prior or a second record; or, for "
-        "quantities that depend on determined combinations alone, give hold_undetermined=True"
-    )
-
-
-def _is_inexact(x: object) -> bool:
-    return isinstance(x, jax.Array | np.ndarray) and jnp.issubdtype(x.dtype, jnp.inexact)
+    lost = np.linalg.qr(np.concatenate([verdict.exact, noisy, single]).T)[0].T
+    keep = np.eye(len(names)) - lost.T @ lost
+    return keep @ fit.relative_covariance @ keep

@@ -241,8 +241,13 @@ def _analyse_groups(
     sparse = _sparse(exact) if len(exact) else exact
     for block in (np.array(sorted(group)) for group in groups):
         mine = sparse[np.any(sparse[:, block], axis=1)]
-        moved = {kind: _moved_along(mine, kind, information) for kind in KINDS if len(mine)}
-        moved = {kind: values for kind, values in moved.items() if information.same(values)}
+        moved = {}
+        if len(mine):  # a finite way along null directions, at constant products and sums
+            shares = np.arange(1, len(mine) + 1)[:, None] / len(mine)
+            change = _MOVE * np.sum(mine * shares, axis=0)
+            values, units = information.values[: null.shape[1]], information.units[: null.shape[1]]
+            moved = {"product": values * np.exp(change), "sum": values + units * change}
+            moved = {kind: x for kind, x in moved.items() if information.same(x)}
         kinds = tuple(moved) if len(mine) else KINDS
         # Combinations of the members that no null direction moves.
         directions = null[:, block][np.any(null[:, block], axis=1)]
@@ -255,15 +260,6 @@ def _analyse_groups(
         alternatives += moved.values()
         curved += [information.names[k] for k in block] if not kinds and len(rows) else []
     return combinations, alternatives, curved
-
-
-def _moved_along(directions: Directions, kind: str, information: Information) -> Vector:
-    """Values a finite way along null directions, at constant products or at constant sums."""
-    count, number = len(information.covariance), len(directions)
-    shares = np.arange(1, number + 1)[:, None] / number
-    change = _MOVE * np.sum(directions * shares, axis=0)
-    values, units = information.values[:count], information.units[:count]
-    return values * np.exp(change) if kind == "product" else values + units * change
 
 
 def _describe(

@@ -50,10 +50,10 @@ def _require_level(level: float | int) -> None:
 
 
 def pooled_freedom(
-    each: Float[np.ndarray, " parameters"], shares: Float[np.ndarray, " parameters"]
+    freedom: Float[np.ndarray, " parameters"], shares: Float[np.ndarray, " parameters"]
 ) -> float:
     """Degrees of freedom of a quantity whose variance has these `shares` of the parameters'."""
-    doubt = float(np.sum(shares / each))
+    doubt = float(np.sum(shares / freedom))
     return float(np.sum(shares)) / doubt if doubt > 0 else np.inf
 
 
@@ -155,13 +155,13 @@ class Verdict:
     def summary(self) -> str:
         """The verdict in one line."""
         if self.identifiable:
-            known = "identifiable: the record determines every free parameter individually"
-            return "; ".join([known, *map(str, self.bounds)])
+            text = "identifiable: the record determines every free parameter individually"
+            return "; ".join([text, *map(str, self.bounds)])
         if self.kind != "not identifiable":
             return " ".join(self._refusal())
-        known = ", ".join(str(combination) for combination in self.combinations)
+        determined = ", ".join(str(combination) for combination in self.combinations)
         it = "it" if len(self.undetermined) == 1 else "them"
-        rest = f"only {known}" if known else f"nothing about {it} is determined"
+        rest = f"only {determined}" if determined else f"nothing about {it} is determined"
         lost = " and ".join(self.undetermined)
         return f"not identifiable from this record, individually: {lost}; {rest}"
 
@@ -189,17 +189,20 @@ class Verdict:
                 *(f"  {reason}" for reason in self.reasons),
                 *(f"  {bound}" for bound in self.bounds),
             ]
-        return "\n".join([*lines, *self._remedied()])
+        if self.remedies:
+            first, *others = self.remedies
+            lines += [f"  to resolve it: {first}", *(f"  or {other}" for other in others)]
+        return "\n".join(lines)
 
     def _determined(self) -> list[str]:
         it = "it" if len(self.undetermined) == 1 else "them"
         lines = [f"  nothing about {it} is determined by this record"]
         if self.combinations:
-            known = " and ".join(combination.name for combination in self.combinations)
+            names = " and ".join(combination.name for combination in self.combinations)
             rows = self.null_directions
             every = all(name in self.undetermined for row in rows for name in row)
             only = "only " if every else ""  # else one in it is determined, too
-            lines = [f"  {only}{known} is determined by this record"]
+            lines = [f"  {only}{names} is determined by this record"]
         elif self.curved and not self.reasons:
             curved = ", ".join(self.curved)
             lines = [f"  what it determines of {curved} is neither a product nor a sum of them"]
@@ -210,12 +213,6 @@ class Verdict:
                 f"  null direction (relative changes that leave the responses unchanged): {parts}"
             )
         return lines
-
-    def _remedied(self) -> list[str]:
-        if not self.remedies:
-            return []
-        first, *others = self.remedies
-        return [f"  to resolve it: {first}", *(f"  or {other}" for other in others)]
 
 
 def remedies_for(lost: tuple[str, ...]) -> tuple[Message, ...]:

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from ..frequency_domain._bounds import linearise, Linearised, polish
+from ..frequency_domain._bounds import linearise, polish
 from ..frequency_domain._problem import Problem
 from ..frequency_domain._solve import Solution, solution_at
 from ._accuracy import Matrix, scaled_inverse
@@ -101,6 +101,23 @@ def one_sided_limits(
     jacobian = local.jacobian
     slope = max(float(jacobian[:, k] @ local.residual), 0.0)
     curvature = 1 / max(float(scaled_inverse(jacobian.T @ jacobian)[k, k]), 1e-300)
+
+    def growth_for(wanted: float, times: float) -> float:
+        """By which factor parameter `k` grows until the cost has risen by what is wanted."""
+        low, high = 1.0, np.inf
+        for _ in range(_EVALUATIONS):
+            z = np.asarray(solution.z).copy()
+            z[k] += np.log(times)
+            cost = polish(problem, z, [k], solution)[1].cost
+            rise = cost - local.cost if np.isfinite(cost) else np.inf
+            if abs(rise - wanted) <= _CLOSE * wanted:
+                return float(times)
+            low, high = (times, high) if rise < wanted else (low, times)
+            times *= np.clip(np.sqrt(wanted / max(rise, 1e-300)), 0.2, 5.0)
+            if not low < times < high:
+                times = np.sqrt(low * min(high, 100 * low))
+        return float(times if np.isfinite(high) else np.inf)
+
     limits = []
     for inflation in inflations:
         wanted = _RISE * inflation
@@ -108,27 +125,8 @@ def one_sided_limits(
             limits.append(unit * np.inf)
             continue
         guess = (np.sqrt(slope**2 + curvature * wanted) - slope) / curvature
-        limits.append(unit * _growth(problem, solution, local, k, wanted, 1 + guess))
+        limits.append(unit * growth_for(wanted, 1 + guess))
     return limits, abs(unit) * slope / curvature
-
-
-def _growth(
-    problem: Problem, solution: Solution, local: Linearised, k: int, wanted: float, times: float
-) -> float:
-    """By which factor parameter `k` grows until the cost has risen by what is wanted."""
-    low, high = 1.0, np.inf
-    for _ in range(_EVALUATIONS):
-        z = np.asarray(solution.z).copy()
-        z[k] += np.log(times)
-        cost = polish(problem, z, [k], solution)[1].cost
-        rise = cost - local.cost if np.isfinite(cost) else np.inf
-        if abs(rise - wanted) <= _CLOSE * wanted:
-            return float(times)
-        low, high = (times, high) if rise < wanted else (low, times)
-        times *= np.clip(np.sqrt(wanted / max(rise, 1e-300)), 0.2, 5.0)
-        if not low < times < high:
-            times = np.sqrt(low * min(high, 100 * low))
-    return float(times if np.isfinite(high) else np.inf)
 
 
 def bounds_among(

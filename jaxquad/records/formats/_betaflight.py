@@ -16,7 +16,7 @@ from jaxtyping import Float, Int, UInt
 from .._clock import unwrap
 from .._errors import ReadError
 from .._log import Log, number_in, Table
-from ._betaflight_frames import ADJUSTMENT, Frames, Payload, payload
+from ._betaflight_frames import ADJUSTMENT, Frames, payload
 from ._betaflight_header import Header, headers, MARKER, scaled, with_derived
 from ._betaflight_mixer import with_mixed_axes
 from ._betaflight_predict import (
@@ -68,14 +68,35 @@ def _log(data: bytes, header: Header) -> tuple[dict[str, Table], list[str]]:
     rows, as_scheduled = trusted_rows(main, header, parts, content.events)
     if not rows.size:
         raise ReadError("the log holds no readable frame", offset=header.payload)
-    remarks = _remarks(content, rows)
+    count = lambda number, noun: f"{number} {noun}{'s' if number > 1 else ''}"
+    remarks = []
+    if content.damage:
+        size = sum(damage.size for damage in content.damage)
+        remarks.append(
+            f"{count(len(content.damage), 'damaged block')} ({size} bytes) without frames skipped, "
+            f"the first at byte {content.damage[0].offset}"
+        )
+    frames = main.offsets.size
+    if frames > rows.size:
+        mask = np.ones(frames, bool)
+        mask[rows] = False
+        remarks.append(
+            f"{frames - rows.size} of {frames} frames were left out, because they refer "
+            f"to lost or damaged ones or are out of order, the first at byte "
+            f"{main.offsets[mask.argmax()]}"
+        )
+        main = Frames(*(part[rows] for part in main))
+    changed = [event for event in content.events if event.name == ADJUSTMENT]
+    if changed:
+        remarks.append(
+            f"{count(len(changed), 'setting')} changed in flight, first at byte "
+            f"{changed[0].offset}: the gains in the header do not hold for the whole log"
+        )
     if not as_scheduled:
         remarks.append(
             "the frames between key frames differ from the I and P intervals of the header: "
             "loopIteration is not reliable, and lost frames cannot be detected"
         )
-    if main.offsets.size > rows.size:
-        main = Frames(*(part[rows] for part in main))
     counter = np.ascontiguousarray(main.coded[:, 1])
     start = int(counter[:1].view(np.uint32)[0])
     passed = np.cumsum(elapsed(counter), dtype=np.int64)
@@ -138,33 +159,6 @@ def _slow_tables(
         values[:, frame.predictors == 10] += main.coded[before[rows], 1][:, None]
         tables[name] = _table(values, letter, time[before[rows]], header)
     return tables
-
-
-def _remarks(content: Payload, rows: np.ndarray) -> list[str]:
-    count = lambda number, noun: f"{number} {noun}{'s' if number > 1 else ''}"
-    remarks = []
-    if content.damage:
-        size = sum(damage.size for damage in content.damage)
-        remarks.append(
-            f"{count(len(content.damage), 'damaged block')} ({size} bytes) without frames skipped, "
-            f"the first at byte {content.damage[0].offset}"
-        )
-    offsets = content.main.offsets
-    if offsets.size > rows.size:
-        mask = np.ones(offsets.size, bool)
-        mask[rows] = False
-        remarks.append(
-            f"{offsets.size - rows.size} of {mask.size} frames were left out, because they refer "
-            f"to lost or damaged ones or are out of order, the first at byte "
-            f"{offsets[mask.argmax()]}"
-        )
-    changed = [event for event in content.events if event.name == ADJUSTMENT]
-    if changed:
-        remarks.append(
-            f"{count(len(changed), 'setting')} changed in flight, first at byte "
-            f"{changed[0].offset}: the gains in the header do not hold for the whole log"
-        )
-    return remarks
 
 
 Values = Float[np.ndarray, "rows columns"]

@@ -138,8 +138,13 @@ def load(path: Path) -> Log:
         )
     tables = {}
     for number, kind in kinds.items():
-        if offsets[number].size:
-            rows = _events_of(data, kind, offsets[number])
+        places, size = offsets[number], kind.layout.itemsize
+        if places.size:
+            if (np.diff(places) == size).all():  # a view where nothing is between them
+                rows = np.frombuffer(data, kind.layout, places.size, int(places[0]))
+            else:
+                raw = np.frombuffer(data, np.uint8)
+                rows = raw[places[:, None] + np.arange(size)].view(kind.layout)[:, 0]
             names = [name for name in kind.layout.names or () if name not in (_ID, _TIME)]
             units = {name: unit for name in names if (unit := _UNITS.get(name.partition(".")[0]))}
             time = unwrap(rows[_TIME])[0] / per_second
@@ -187,12 +192,3 @@ def _text(data: bytes, at: int) -> tuple[str, int]:
     if end < 0 or not text.isascii() or not text.isprintable() or not text:
         raise ReadError("a name in the description of events is damaged", offset=at)
     return text, end + 1
-
-
-def _events_of(data: bytes, kind: _Kind, offsets: np.ndarray) -> np.ndarray:
-    """The events of one type as a structured array: a view where nothing is between them."""
-    size = kind.layout.itemsize
-    if (np.diff(offsets) == size).all():
-        return np.frombuffer(data, kind.layout, offsets.size, int(offsets[0]))
-    buffer = np.frombuffer(data, np.uint8)
-    return buffer[offsets[:, None] + np.arange(size)].view(kind.layout)[:, 0]

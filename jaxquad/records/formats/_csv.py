@@ -29,7 +29,20 @@ def load(path: Path) -> Log:
     the columns are those of a matrix `data`. In a table of several topics the cells of a column are
     blank where its topic has no message. Raises ReadError with the line and the column.
     """
-    content = _as_utf8(path.read_bytes())
+    content = path.read_bytes()
+    if content.startswith((b"\xff\xfe", b"\xfe\xff")):
+        content = content.decode("utf-16", "replace").encode()
+    zero = content.find(b"\0")
+    if zero >= 0:
+        raise ReadError("the file is not text: it holds a zero byte", offset=zero)
+    try:
+        if not content.isascii():
+            content.decode()
+    except UnicodeDecodeError:  # other 8-bit text is taken as Latin-1
+        content = content.decode("latin-1").encode()
+    content = content.removeprefix(b"\xef\xbb\xbf")
+    if b"\r" in content:
+        content = content.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
     header = _header(content)
     try:
         values = _rows(content, header)
@@ -118,24 +131,6 @@ def _topics(
     if empty := [name for name in header.names if not counts[name]]:
         remarks.append(f"columns without any value were left out: {', '.join(empty)}")
     return columns, {name: filled[name] for name in columns if name in partly}, tuple(remarks)
-
-
-def _as_utf8(content: bytes) -> bytes:
-    """Text in UTF-8 with the line ends of Unix; other 8-bit text is taken as Latin-1."""
-    if content.startswith((b"\xff\xfe", b"\xfe\xff")):
-        content = content.decode("utf-16", "replace").encode()
-    zero = content.find(b"\0")
-    if zero >= 0:
-        raise ReadError("the file is not text: it holds a zero byte", offset=zero)
-    try:
-        if not content.isascii():
-            content.decode()
-    except UnicodeDecodeError:
-        content = content.decode("latin-1").encode()
-    content = content.removeprefix(b"\xef\xbb\xbf")
-    if b"\r" in content:
-        content = content.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
-    return content
 
 
 def _header(content: bytes) -> _Header:

@@ -88,7 +88,17 @@ def load(path: Path) -> Log:
     remarks += left_out
     if odd:
         remarks.append(f"messages with an inconsistent format were left out: {', '.join(odd)}")
-    scaled = _scaling(rows, {kind: layout.name for kind, layout in formats.items()})
+    unit_labels = dict(_cells(rows.get("UNIT"), "Id", "Label"))
+    multipliers = dict(_cells(rows.get("MULT"), "Id", "Mult"))
+    scaled = Scaling(
+        {chr(letter & 0xFF): text(label) for letter, label in unit_labels.items()},
+        {chr(letter & 0xFF): mult for letter, mult in multipliers.items() if 0 < mult < np.inf},
+        {
+            formats[kind].name: (text(units), text(mults))
+            for kind, units, mults in _cells(rows.get("FMTU"), "FmtType", "UnitIds", "MultIds")
+            if kind in formats
+        },
+    )
     tables: dict[str, Table] = {}
     for layout in formats.values():
         if layout.name in rows and layout.name not in ABOUT:
@@ -253,22 +263,6 @@ def _next_message(data: bytes, place: int, lengths: list[int]) -> int:
 def text(field: bytes) -> str:
     """A padded field as text; where a log is damaged, it may not be UTF-8."""
     return field.split(b"\0")[0].decode("latin-1").strip()
-
-
-def _scaling(rows: Mapping[str, np.ndarray], names: Mapping[int, str]) -> Scaling:
-    """From the rows of UNIT, MULT and FMTU, where the log has them."""
-    units = dict(_cells(rows.get("UNIT"), "Id", "Label"))
-    multipliers = dict(_cells(rows.get("MULT"), "Id", "Mult"))
-    letters = {
-        names[kind]: (text(unit_ids), text(mult_ids))
-        for kind, unit_ids, mult_ids in _cells(rows.get("FMTU"), "FmtType", "UnitIds", "MultIds")
-        if kind in names
-    }
-    return Scaling(
-        {chr(letter & 0xFF): text(label) for letter, label in units.items()},
-        {chr(letter & 0xFF): mult for letter, mult in multipliers.items() if 0 < mult < np.inf},
-        letters,
-    )
 
 
 _KINDS = {

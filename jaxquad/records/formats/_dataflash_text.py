@@ -47,7 +47,23 @@ def load_text(path: Path) -> Log:
             "missing",
             offset=0,
         )
-    scaled = _text_scaling(lines, {layout.kind: layout.name for layout in formats})
+    names = {layout.kind: layout.name for layout in formats}
+    units, mults = (
+        {
+            chr(int(cells[-2])): cells[-1]
+            for cells in _split(lines.get(name, []))
+            if len(cells) >= 2 and cells[-2].isdecimal() and len(cells[-2]) <= 3
+        }
+        for name in ("UNIT", "MULT")
+    )
+    letters = {
+        names[int(kind)]: (unit_ids, mult_ids)
+        for kind, unit_ids, mult_ids in (c[-3:] for c in _split(lines.get("FMTU", [])) if c[2:])
+        if kind.isdecimal() and len(kind) < 9 and int(kind) in names
+    }
+    factors = {letter: number_in(text) for letter, text in mults.items()}
+    factors = {letter: factor for letter, factor in factors.items() if 0 < factor < np.inf}
+    scaled = Scaling(units, factors, letters)
     tables: dict[str, Table] = {}
     for layout in formats:
         if layout.name in lines and layout.name not in ABOUT:
@@ -56,12 +72,12 @@ def load_text(path: Path) -> Log:
             tables |= tables_of(layout, columns, scaled, applied=True)
     remarks += [f"{skipped} lines that match no format were left out"] if skipped else []
     remarks += find_rate_unit(tables, scaled)
-    names = next((layout.columns for layout in formats if layout.name == "PARM"), ())
+    columns = next((layout.columns for layout in formats if layout.name == "PARM"), ())
     name, value = -2, -1  # Later versions log a parameter's default behind its value.
-    if {"Name", "Value"} <= set(names):
-        name, value = names.index("Name"), names.index("Value")
+    if {"Name", "Value"} <= set(columns):
+        name, value = columns.index("Name"), columns.index("Value")
     cells = [c for c in _split(lines.get("PARM", [])) if len(c) >= max(2, name + 1, value + 1)]
-    timed = names[:1] == ("TimeUS",)
+    timed = columns[:1] == ("TimeUS",)
     stamped = [(1e-6 * number_in(c[0]) if timed else None, c[name], c[value]) for c in cells]
     settings = {name: value for _, name, value in stamped}
     changes = changes_of(stamped, lambda time: time)
@@ -124,26 +140,6 @@ def _text_formats(lines: Sequence[bytes]) -> list[Format]:
             layout = Format(int(kind[:9]), int(length[:9]), name, codes, tuple(columns))
             formats.setdefault(name, layout)
     return list(formats.values())
-
-
-def _text_scaling(lines: dict[str, list[bytes]], names: dict[int, str]) -> Scaling:
-    units, mults = (
-        {
-            chr(int(cells[-2])): cells[-1]
-            for cells in _split(lines.get(name, []))
-            if len(cells) >= 2 and cells[-2].isdecimal() and len(cells[-2]) <= 3
-        }
-        for name in ("UNIT", "MULT")
-    )
-    letters = {
-        names[int(kind)]: (unit_ids, mult_ids)
-        for kind, unit_ids, mult_ids in (c[-3:] for c in _split(lines.get("FMTU", [])) if c[2:])
-        if kind.isdecimal() and len(kind) < 9 and int(kind) in names
-    }
-    factors = {
-        letter: mult for letter, text in mults.items() if 0 < (mult := number_in(text)) < np.inf
-    }
-    return Scaling(units, factors, letters)
 
 
 def _text_columns(lines: list[bytes], layout: Format) -> tuple[dict[str, np.ndarray], int]:

@@ -39,26 +39,23 @@ def load(path: Path) -> Log:
             members = [member for member in archive.infolist() if not member.filename.endswith("/")]
             check_size("the archive", sum(member.file_size for member in members), size)
             for member in members:
-                add_columns(arrays, _member(archive, member), remarks)
+                name = member.filename.removesuffix(".npy")
+                try:
+                    with archive.open(member) as file:
+                        if file.read(len(_MAGIC)) != _MAGIC:
+                            continue
+                        file.seek(0)
+                        columns = _named(name, _read_array(name, file, member.file_size))
+                except ReadError:
+                    raise
+                except Exception as error:
+                    reason = f"{type(error).__name__}: {printable(str(error))}"
+                    raise ReadError(
+                        f"the array {printable(name)!r} is cut off or damaged ({reason})",
+                        offset=member.header_offset,
+                    ) from error
+                add_columns(arrays, columns, remarks)
     return Log({"": Table(arrays)}, tuple(remarks))
-
-
-def _member(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> dict[str, np.ndarray]:
-    name = member.filename.removesuffix(".npy")
-    try:
-        with archive.open(member) as stream:
-            if stream.read(len(_MAGIC)) != _MAGIC:
-                return {}
-            stream.seek(0)
-            return _named(name, _read_array(name, stream, member.file_size))
-    except ReadError:
-        raise
-    except Exception as error:
-        reason = f"{type(error).__name__}: {printable(str(error))}"
-        raise ReadError(
-            f"the array {printable(name)!r} is cut off or damaged ({reason})",
-            offset=member.header_offset,
-        ) from error
 
 
 def _named(name: str, array: np.ndarray) -> dict[str, np.ndarray]:

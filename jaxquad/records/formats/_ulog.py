@@ -4,7 +4,7 @@ import bisect
 import dataclasses
 import re
 import struct
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import NamedTuple
 
@@ -102,21 +102,21 @@ def load(path: Path) -> Log:
             f"the logger lost data {len(lost)} times, {sum(lost)} ms in all, the longest dropout "
             f"{max(lost)} ms: samples are missing there"
         )
-    changes = changes_of(messages.stamped, lambda place: _time_before(data, messages, place))
+
+    def time_before(place: int) -> float | None:
+        """Of the last data message before a byte of the file; None before the first."""
+        latest, last = None, -1
+        for topic in messages.topics.values():
+            k = bisect.bisect_left(topic.offsets, place)
+            if k and topic.offsets[k - 1] > last:
+                latest, last = topic, topic.offsets[k - 1]
+        if latest is None:
+            return None
+        stamp = last + (latest.dtype.fields or {})["timestamp"][1]
+        return 1e-6 * int.from_bytes(data[stamp : stamp + 8], "little")
+
+    changes = changes_of(messages.stamped, time_before)
     return Log(tables, tuple(remarks), "px4", messages.settings, changes)
-
-
-def _time_before(data: bytes, messages: _Messages, place: int) -> float | None:
-    """The time of the last data message before a byte of the file; None before the first."""
-    latest, last = None, -1
-    for topic in messages.topics.values():
-        k = bisect.bisect_left(topic.offsets, place)
-        if k and topic.offsets[k - 1] > last:
-            latest, last = topic, topic.offsets[k - 1]
-    if latest is None:
-        return None
-    stamp = last + (latest.dtype.fields or {})["timestamp"][1]
-    return 1e-6 * int.from_bytes(data[stamp : stamp + 8], "little")
 
 
 def _scan(data: bytes) -> tuple[_Messages, list[tuple[int, int]], int]:
@@ -234,16 +234,6 @@ _KNOWN = {
 _ENDINGS = {"_m_s2": "m/s^2", "_m_s": "m/s", "_rad": "rad", "_rad_s": "rad/s", "_v": "V", "_a": "A"}
 
 
-def _units_of(topic: str, columns: Iterable[str]) -> dict[str, str]:
-    """The unit of each column whose unit is known, by topic or by the ending of its name."""
-    units = dict(_KNOWN.get(topic, {}))
-    for name in columns:
-        for ending, unit in _ENDINGS.items():
-            if name.endswith(ending):
-                units.setdefault(name, unit)
-    return units
-
-
 _APPENDED = 1  # the one incompatible flag that is understood
 _NUMBERS = {"float": "<f", "int32_t": "<i", "uint32_t": "<I", "uint64_t": "<Q", "double": "<d"}
 
@@ -268,7 +258,17 @@ def _interpret(kind: int, body: bytes, place: int, messages: _Messages) -> None:
         return
     try:
         if letter == "F":
-            _define(body.decode(), place, messages)
+            text = body.decode()  # `name:type field;type[4] field;`
+            name, colon, rest = text.partition(":")
+            parts = [part.strip() for part in rest.split(";") if part.strip()]
+            matches = [_FIELD.fullmatch(part) for part in parts]
+            if not name or not colon or not parts or not all(matches):
+                raise ReadError(f"{text[:60]!r} is not a definition of a format", offset=place)
+            fields = tuple(
+                Field(m[1], None if m[2] is None else int(m[2]), m[3]) for m in matches if m
+            )
+            if messages.formats.setdefault(name, fields) != fields:
+                raise ReadError(f"the format {name!r} is defined twice, differently", offset=place)
         elif letter == "A":
             _subscribe(body, place, messages)
         elif letter == "R":
@@ -293,18 +293,6 @@ def _interpret(kind: int, body: bytes, place: int, messages: _Messages) -> None:
             messages.notes.append(f"message {letter} at byte {place} was left out: {reason}")
 
 
-def _define(text: str, place: int, messages: _Messages) -> None:
-    """Take `name:type field;type[4] field;`."""
-    name, colon, body = text.partition(":")
-    parts = [part.strip() for part in body.split(";") if part.strip()]
-    matches = [_FIELD.fullmatch(part) for part in parts]
-    if not name or not colon or not parts or not all(matches):
-        raise ReadError(f"{text[:60]!r} is not a definition of a format", offset=place)
-    fields = tuple(Field(m[1], None if m[2] is None else int(m[2]), m[3]) for m in matches if m)
-    if messages.formats.setdefault(name, fields) != fields:
-        raise ReadError(f"the format {name!r} is defined twice, differently", offset=place)
-
-
 def _subscribe(body: bytes, place: int, messages: _Messages) -> None:
     instance, number = struct.unpack_from("<BH", body)
     messages.current.pop(number, None)
@@ -321,5 +309,10 @@ def _subscribe(body: bytes, place: int, messages: _Messages) -> None:
     if "timestamp" not in (dtype.names or ()) or dtype["timestamp"] != np.dtype("<u8"):
         raise ReadError(f"the format {name!r} has no timestamp", offset=place)
     label = f"{name}[{instance}]" if instance else name
-    topic = _Topic(dtype, _units_of(name, dtype.names or ()))
+    units = dict(_KNOWN.get(name, {}))  # by topic, else by the ending of a column's name
+    for column in dtype.names or ():
+        for ending, unit in _ENDINGS.items():
+            if column.endswith(ending):
+                units.setdefault(column, unit)
+    topic = _Topic(dtype, units)
     messages.current[number] = messages.topics.setdefault(label, topic)

@@ -71,10 +71,6 @@ class Flight(NamedTuple):
 _MOVING = 0.03  # of full deflection; corrections of a hover stay below
 
 
-def _hold_of_no_parameter(log: Log) -> tuple[float | None, tuple[str, ...]]:
-    return None, ()
-
-
 def one_flight(log: Log) -> tuple[Flight, ...]:
     """All of the log."""
     clocks = [t.time for t in log.tables.values() if t.time is not None and t.time.size]
@@ -82,10 +78,6 @@ def one_flight(log: Log) -> tuple[Flight, ...]:
         return ()
     span = min(float(t[0]) for t in clocks), max(float(t[-1]) for t in clocks)
     return (Flight(1, "", *span, None, {}, {}),)
-
-
-def _no_remark(log: Log, setup: Setup, spans: Spans) -> tuple[str, ...]:
-    return ()
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -117,13 +109,13 @@ class FirmwareLog:
     rates: Sequence[str] = ()
     setpoints: Sequence[str] = ()
     throttle: Sequence[tuple[str, float]] = ()
-    hold: Callable[[Log], tuple[float | None, tuple[str, ...]]] = _hold_of_no_parameter
+    hold: Callable[[Log], tuple[float | None, tuple[str, ...]]] = lambda log: (None, ())
     of_loop: tuple[str, ...] = ()
     learned: tuple[str, ...] = ()
     settings: bool = True
     release: str = ""
     flights: Callable[[Log], tuple[Flight, ...]] = one_flight
-    remarks_on: Callable[[Log, Setup, Spans], tuple[str, ...]] = _no_remark
+    remarks_on: Callable[[Log, Setup, Spans], tuple[str, ...]] = lambda log, setup, spans: ()
     numbers_chirps: bool = False
     gyro_cutoffs: tuple[str, ...] = ()
     reader: Reader | None = None

@@ -1,10 +1,9 @@
 """When a vehicle flies: ground, landing and crash at the ends of a log are no flight."""
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from .._firmwares import firmware_log
 from .._log import flattened, Log, Signals
@@ -97,7 +96,16 @@ def flown_span(log: Log) -> FlownSpan:
     flying = powered
     if rest.size * _WINDOW >= _SHORTEST / 4:
         flying = powered & (power > _REST**2 * np.quantile(rest, 0.1))
-    controlled = flying & ~_is_lost(grid, signals, names, firmware.setpoints)
+    controlled = flying.copy()  # where no rate is far from its set-point
+    for rate, setpoint in zip(names, firmware.setpoints, strict=False):
+        setpoint = _logged(signals, setpoint)
+        times = _clock(signals, rate), _clock(signals, setpoint) if setpoint else None
+        if times[0] is None or times[1] is None:
+            continue
+        factor = 180 / np.pi if array_of(signals, rate)[1] == "rad/s" else 1.0
+        wanted = np.interp(times[0], times[1], values_of(signals, setpoint))
+        square = grid.mean(signals, rate, (factor * (values_of(signals, rate) - wanted)) ** 2)
+        controlled &= ~(np.nan_to_num(square) > _LOST**2)
     # From the first two windows of flight to the last two.
     first = np.flatnonzero(flying[:-1] & flying[1:])
     last = np.flatnonzero(controlled[:-1] & controlled[1:])
@@ -154,20 +162,3 @@ def _clock(signals: Signals, name: str) -> np.ndarray | None:
     array = name if name in signals.arrays else name.rpartition("[")[0]
     signal = signals.arrays.get(array)
     return None if signal is None else signals.clocks.get(signal.clock)
-
-
-def _is_lost(
-    grid: _Windows, signals: Signals, rates: Sequence[str], setpoints: Sequence[str]
-) -> Bool[np.ndarray, " windows"]:
-    """Whether a rate is far from its set-point."""
-    lost = np.zeros(grid.count, bool)
-    for rate, setpoint in zip(rates, setpoints, strict=False):
-        setpoint = _logged(signals, setpoint)
-        times = _clock(signals, rate), _clock(signals, setpoint) if setpoint else None
-        if times[0] is None or times[1] is None:
-            continue
-        factor = 180 / np.pi if array_of(signals, rate)[1] == "rad/s" else 1.0
-        wanted = np.interp(times[0], times[1], values_of(signals, setpoint))
-        square = grid.mean(signals, rate, (factor * (values_of(signals, rate) - wanted)) ** 2)
-        lost |= np.nan_to_num(square) > _LOST**2
-    return lost

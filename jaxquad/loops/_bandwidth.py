@@ -2,20 +2,25 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Bool, Float
+from jaxtyping import Array, ArrayLike, Float
 
-from ._basis import (
+from ._curve import (
+    ambiguous,
     Basis,
     basis_of,
+    crossed,
+    Curve,
+    curve_of,
     degrees,
     evaluate_curve,
+    first,
     lines,
     Numbers,
     only_finite,
+    Response,
     shown,
     with_coherence,
 )
-from ._curve import ambiguous, crossed, Curve, curve_of, first, Response
 
 
 def missing_bandwidth(result: "Bandwidth") -> list[str]:
@@ -89,11 +94,6 @@ def doubtful_bandwidth(result: "Bandwidth") -> list[str]:
 _POINTS = 64  # of a model, even in frequency from w180 to 2 w180
 
 
-def top_of_clear(curve: Curve, clear: Bool[Array, " intervals"]) -> Float[Array, ""]:
-    """Frequency in rad/s up to which the phase's branch is known: `clear` holds from the lowest."""
-    return jnp.where(jnp.all(clear), curve.omega[-1], curve.omega[jnp.argmin(clear)])
-
-
 def two_point_delay(
     curve: Curve, phase: Float[Array, " frequencies"], w180: Float[Array, ""], top: Float[Array, ""]
 ) -> Float[Array, ""]:
@@ -121,7 +121,11 @@ def fitted_delay(
         points = curve.omega
         inside = (points >= start) & (points <= 2 * start)
         weights = jnp.where(inside, (1.58 * (1 - jnp.exp(-curve.coherence))) ** 2, 0.0)
-    slope = _slope(points / start, _phase_at(curve, phase, points), weights)
+    x, y = points / start, _phase_at(curve, phase, points)
+    total = jnp.maximum(jnp.sum(weights), jnp.finfo(x.dtype).tiny)
+    centred = x - jnp.sum(weights * x) / total
+    spread = jnp.sum(weights * centred**2)
+    slope = jnp.sum(weights * centred * y) / jnp.where(spread > 0, spread, 1.0)
     return jnp.where(exists & (jnp.sum(weights > 0) >= 3), -slope / (2 * start), jnp.nan)
 
 
@@ -133,15 +137,6 @@ def _phase_at(
     branch = jax.lax.stop_gradient(branch)
     turned = curve(omega) * jnp.exp(jax.lax.complex(jnp.zeros_like(branch), -branch))
     return branch + jnp.angle(turned)
-
-
-def _slope(
-    x: Float[Array, " points"], y: Float[Array, " points"], weights: Float[Array, " points"]
-) -> Float[Array, ""]:
-    total = jnp.maximum(jnp.sum(weights), jnp.finfo(x.dtype).tiny)
-    centred = x - jnp.sum(weights * x) / total
-    spread = jnp.sum(weights * centred**2)
-    return jnp.sum(weights * centred * y) / jnp.where(spread > 0, spread, 1.0)
 
 
 _PHASE_MARGIN = np.pi / 4
@@ -258,7 +253,8 @@ def _numbers(curve: Curve, start: Float[Array, ""] | None) -> tuple[Numbers, Num
     by_phase = _falls_through(curve, phase, clear, _PHASE_MARGIN - jnp.pi)
     w180 = _falls_through(curve, phase, clear, -jnp.pi)
     by_gain, crossings = _gain_bandwidth(curve, values, w180)
-    top = top_of_clear(curve, clear)
+    # Up to the top the phase's branch is certain: all is clear from the lowest frequency on.
+    top = jnp.where(jnp.all(clear), curve.omega[-1], curve.omega[jnp.argmin(clear)])
     targets = (-jnp.pi, _PHASE_MARGIN - jnp.pi)
     passes = [jnp.sum(crossed(phase - target, "both") & clear) for target in targets]
     numbers = {

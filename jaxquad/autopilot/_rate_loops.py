@@ -15,25 +15,23 @@ import numpy as np
 from jaxtyping import Bool, Complex, Float
 
 from jaxquad._core import Number
-from jaxquad.identify import filter_response
+from jaxquad.identify import draw_models, filter_response, Fit, GainOverThrottle, KnownFilter
 
-from ._firmware import Parameter
+from ._firmware import OuterLoop, Parameter
 from ._law import RateLoop
 from ._parameters import PARAMETERS, store_parameters
 
 
 Gains = Float[np.ndarray, "designs gains"]
 Paths = Complex[np.ndarray, "designs frequencies"]
+Loops = Float[np.ndarray, "designs plants frequencies"]
+Frequencies = Float[np.ndarray, " frequencies"]
+Response = Complex[np.ndarray, " frequencies"]
 FIELDS = ("p", "i", "d")
 
 
 class OuterQualities(NamedTuple):
-    """What an angle loop gives, for each plant.
-
-    **Attributes:**
-
-    - `stable`; `peak`: Ms; `resonance`: of the response from set-point to angle.
-    """
+    """What an angle loop gives, for each plant; the resonance is from set-point to angle."""
 
     stable: Bool[np.ndarray, " plants"]
     peak: Float[np.ndarray, " plants"]
@@ -88,17 +86,17 @@ class RateLoops:
     - `others`: loops at other throttles, under the law there; their plants count, too.
     """
 
-    omega: Float[np.ndarray, " frequencies"]
+    omega: Frequencies
     feedback: Complex[np.ndarray, "gains frequencies"]
     ahead: Complex[np.ndarray, "gains frequencies"]
     plants: Complex[np.ndarray, "plants frequencies"]
-    noise: Float[np.ndarray, " frequencies"]
-    passed: Complex[np.ndarray, " frequencies"]
+    noise: Frequencies
+    passed: Response
     ceiling: float = 1.0
-    chain: Complex[np.ndarray, " frequencies"] | None = None
+    chain: Response | None = None
     relaxed: bool = False
-    forward: Complex[np.ndarray, " frequencies"] | None = None
-    angle: Complex[np.ndarray, " frequencies"] | None = None
+    forward: Response | None = None
+    angle: Response | None = None
     others: tuple["RateLoops", ...] = ()
 
     @property
@@ -151,32 +149,26 @@ class RateLoops:
 
         `filters` are the responses of other filters over those that flew.
         """
-        qualities = [self._own_qualities(gains, filters)]
-        qualities += [loops.qualities(gains, filters) for loops in self.others]
-        return qualities[0] if len(qualities) == 1 else together(qualities)
-
-    def _own_qualities(self, gains: Gains, filters: Filters | None) -> LoopQualities:
-        base = self._qualities(*self.paths(gains, filters))
-        if self.ceiling == 1:
-            return base
-        return _worst_of(base, self._moved(gains, filters, (1.0, 1.0, self.ceiling)))
+        qualities = self._qualities(*self.paths(gains, filters))
+        if self.ceiling != 1:
+            raised = gains * np.array([[1.0, 1.0, self.ceiling]])
+            qualities = _worst_of(qualities, self._qualities(*self.paths(raised, filters)))
+        parts = [qualities, *(loops.qualities(gains, filters) for loops in self.others)]
+        return together(parts) if self.others else qualities
 
     def relaxed_qualities(self, gains: Gains) -> LoopQualities:
         """With the integral held where it can be held in flight, D as set and at its ceiling."""
         parts = []
         for group in self.groups:
             if not group.relaxed:
-                parts.append(group._own_qualities(gains, None))
+                parts.append(group.qualities(gains))
                 continue
-            base = group._moved(gains, None, (1.0, 0.0, 1.0))
-            raised = group._moved(gains, None, (1.0, 0.0, group.ceiling))
+            base, raised = (
+                group._qualities(*group.paths(gains * np.array([[1.0, 0.0, factor]])))
+                for factor in (1.0, group.ceiling)
+            )
             parts.append(_worst_of(base, raised))
         return together(parts)
-
-    def _moved(
-        self, gains: Gains, filters: Filters | None, factors: tuple[float, ...]
-    ) -> LoopQualities:
-        return self._qualities(*self.paths(gains * np.array([factors]), filters))
 
     def open_loops(
         self, gains: Float[np.ndarray, " gains"]
@@ -216,7 +208,14 @@ class RateLoops:
 
     def _qualities(self, feedback: Paths, ahead: Paths) -> LoopQualities:
         plants, cells, gain = _power(self.plants), cells_of(self.omega), _power(feedback)
-        real, imaginary = _one_plus(feedback, self.plants)
+        # Real and imaginary part of 1 + L, each in one piece of memory.
+        a, b = np.real(feedback)[:, None], np.imag(feedback)[:, None]
+        c, d = (np.ascontiguousarray(x) for x in (np.real(self.plants), np.imag(self.plants)))
+        real, product = a * c, b * d
+        real -= product
+        real += 1
+        imaginary = a * d
+        imaginary += np.multiply(b, c, out=product)
         stable = _is_stable(real, imaginary)
         distance, product = real**2, imaginary**2
         distance += product
@@ -233,22 +232,6 @@ class RateLoops:
             np.sqrt(np.einsum("dpf,pf->dp", inverse, plants / self.omega**2 * cells)),
             np.sqrt(np.einsum("dpf,df->dp", inverse, gain * self.noise)),
         )
-
-
-def _one_plus(
-    feedback: Paths, plants: Complex[np.ndarray, "plants frequencies"]
-) -> tuple[
-    Float[np.ndarray, "designs plants frequencies"], Float[np.ndarray, "designs plants frequencies"]
-]:
-    """Real and imaginary part of 1 + L, each in one piece of memory."""
-    a, b = np.real(feedback)[:, None], np.imag(feedback)[:, None]
-    c, d = (np.ascontiguousarray(part) for part in (np.real(plants), np.imag(plants)))
-    real, product = a * c, b * d
-    real -= product
-    real += 1
-    imaginary = a * d
-    imaginary += np.multiply(b, c, out=product)
-    return real, imaginary
 
 
 def _worst_of(one: LoopQualities, other: LoopQualities) -> LoopQualities:
@@ -276,16 +259,13 @@ def _power(response: Complex[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
     return np.real(response) ** 2 + np.imag(response) ** 2
 
 
-def cells_of(omega: Float[np.ndarray, " frequencies"]) -> Float[np.ndarray, " frequencies"]:
+def cells_of(omega: Frequencies) -> Frequencies:
     """The width around each frequency, by the trapezoidal rule."""
     edges = np.concatenate([omega[:1], (omega[1:] + omega[:-1]) / 2, omega[-1:]])
     return np.diff(edges)
 
 
-def _is_stable(
-    real: Float[np.ndarray, "designs plants frequencies"],
-    imaginary: Float[np.ndarray, "designs plants frequencies"],
-) -> Bool[np.ndarray, "designs plants"]:
+def _is_stable(real: Loops, imaginary: Loops) -> Bool[np.ndarray, "designs plants"]:
     """Whether 1 + L turns from -pi, of the double integrator, to 0; 2 pi for each unstable pair."""
     size = imaginary.shape[-1]
     upper = (imaginary >= 0).ravel()
@@ -302,7 +282,7 @@ def _is_stable(
 
 
 def delay_margin(
-    loop: Complex[np.ndarray, "plants frequencies"], omega: Float[np.ndarray, " frequencies"]
+    loop: Complex[np.ndarray, "plants frequencies"], omega: Frequencies
 ) -> Float[np.ndarray, " plants"]:
     """The delay in s that brings each open loop to -1, at the worst of its crossings of 1."""
     size, angle = np.log(np.abs(loop)), np.angle(loop)
@@ -316,25 +296,26 @@ def delay_margin(
 
 
 def law_paths(
-    law: RateLoop, axis: int, omega: Float[np.ndarray, " frequencies"]
+    law: RateLoop, axis: int, omega: Frequencies
 ) -> tuple[Complex[np.ndarray, "gains frequencies"], Complex[np.ndarray, "gains frequencies"]]:
     """Per unit of P, I and D: from the filtered rate to minus the command, from the set-point."""
     bare = law.without_gyro_filters()  # the logged rate is behind them: they are in the plant
-    responses = [law_responses(_alone(bare, name), axis, omega) for name in FIELDS]
+    fields, responses = (*FIELDS, *law.feed_forward), []
+    for name in FIELDS:  # a gain of 1, none of the other two and no feed-forward
+        gains = [jnp.full_like(vars(law)["p"], float(field == name)) for field in fields]
+        # What `replace` would check anew is known to be right.
+        alone = eqx.tree_at(lambda law: [vars(law)[field] for field in fields], bare, gains)
+        responses.append(law_responses(alone, axis, omega))
     ahead, back = np.stack(responses, axis=1)
     return -back, ahead
 
 
-def gyro_chain_response(
-    law: RateLoop, omega: Float[np.ndarray, " frequencies"]
-) -> Complex[np.ndarray, " frequencies"]:
+def gyro_chain_response(law: RateLoop, omega: Frequencies) -> Response:
     """Of all filters of the gyro."""
     return filter_response(law.gyro_chains(), omega)
 
 
-def forward_path(
-    law: RateLoop, axis: int, omega: Float[np.ndarray, " frequencies"]
-) -> Complex[np.ndarray, " frequencies"] | None:
+def forward_path(law: RateLoop, axis: int, omega: Frequencies) -> Response | None:
     """Of the law's feed-forward, from the set-point to the command; of Betaflight's sticks none."""
     if law.of_sticks or not any(np.any(vars(law)[name]) for name in law.feed_forward):
         return None
@@ -345,16 +326,8 @@ def forward_path(
     return law_responses(without, axis, omega)[0]
 
 
-def _alone(law: RateLoop, name: str) -> RateLoop:
-    """The law with a gain of 1, none of the other two and no feed-forward."""
-    fields = (*FIELDS, *law.feed_forward)
-    of = lambda law: [vars(law)[field] for field in fields]
-    gains = [jnp.full_like(vars(law)["p"], float(field == name)) for field in fields]
-    return eqx.tree_at(of, law, gains)  # what `replace` would check anew is known to be right
-
-
 def law_responses(
-    law: RateLoop, axis: int, omega: Float[np.ndarray, " frequencies"]
+    law: RateLoop, axis: int, omega: Frequencies
 ) -> Complex[np.ndarray, "inputs frequencies"]:
     """From the set-point and from the rate, both in rad/s, to the command."""
     linear = law.linear(axis)
@@ -370,7 +343,7 @@ def hold_plants(
     gain: Float[np.ndarray, "plants 1"],
     lag: Float[np.ndarray, "plants 1"],
     delay: Float[np.ndarray, "plants 1"],
-    omega: Float[np.ndarray, " frequencies"],
+    omega: Frequencies,
     dt: float,
     damping: Float[np.ndarray, "plants 1"] | None = None,
 ) -> Complex[np.ndarray, "plants frequencies"]:
@@ -439,3 +412,85 @@ def gains_in(
         if row.field in FIELDS and row.axis == axis and row.name in parameters:
             gains[FIELDS.index(row.field)] = parameters[row.name]
     return gains
+
+
+Drawn = Float[np.ndarray, "plants 1"]
+_LOWEST = 0.05  # rad/s, below which only the integrals count
+_FREQUENCIES = 300
+_AT_ONCE = 256  # draws: each other number would be compiled anew
+
+
+@dataclasses.dataclass(frozen=True)
+class PlantSource:
+    """What plants are drawn from.
+
+    **Attributes:**
+
+    - `fit`: up to what the gyro's filters are given, in `unit`.
+    - `over`: the gain over the throttle, whose plants take the place of those of `fit`.
+    - `span`: the lowest and the highest throttle of these.
+    - `filters`: of the gyro, as measured; None takes those of the law.
+    """
+
+    fit: Fit
+    unit: str
+    over: GainOverThrottle | None = None
+    span: tuple[float, float] = (0.0, 1.0)
+    filters: Sequence[KnownFilter] | None = None
+
+    @property
+    def damping(self) -> float:
+        """Of the rate in 1/s, as the fit has it."""
+        return float(np.asarray(vars(self.fit.model).get("damping", 0.0)))
+
+    def loops(
+        self, law: RateLoop, axis: int, count: int, seed: int, *,
+        omega: Frequencies | None = None, throttle: float | None = None,
+        angle: OuterLoop | None = None,
+    ) -> RateLoops:  # fmt: skip
+        """The loops of a law with so many plants, and an angle loop around them.
+
+        All are at one `throttle`, or each is at its own, evenly over the span.
+
+        Raises ValueError where a drawn gain is not above 0.
+        """
+        if omega is None:
+            omega = np.geomspace(_LOWEST, 0.999 * np.pi / law.dt, _FREQUENCIES)
+        back, ahead = law_paths(law, axis, omega)
+        chain = gyro_chain_response(law, omega)
+        passed = chain if self.filters is None else filter_response(self.filters, omega)
+        gain, lag, delay, damping = self._drawn(count, seed, throttle)
+        if np.any(gain <= 0):
+            raise ValueError(
+                f"the gain from the command to the rate is not above 0 in {int(np.sum(gain <= 0))} "
+                f"of {count} plants drawn from the fit: check the sign of the input, or fly more "
+                "excitation"
+            )
+        per_radian = np.pi / 180 if self.unit == "deg/s" else 1.0
+        plants = hold_plants(per_radian * gain, lag, delay, omega, law.dt, damping)
+        white = cells_of(omega) * np.abs(passed) ** 2
+        return RateLoops(
+            omega, back, ahead, plants * passed, white, passed, law.d_ceiling(axis), chain,
+            law.holds_integral(axis), forward_path(law, axis, omega),
+            None if angle is None else angle.path(omega),
+        )  # fmt: skip
+
+    def _drawn(
+        self, count: int, seed: int, throttle: float | None
+    ) -> tuple[Drawn, Drawn, Drawn, Drawn]:
+        """Gain, lag, delay and damping."""
+        if self.over is None:
+            names = len(self.fit.names)
+            scores = np.zeros((names, -(-count // _AT_ONCE) * _AT_ONCE))
+            scores[:, :count] = np.random.default_rng(seed).standard_normal((names, count))
+            models = draw_models(self.fit, jnp.asarray(scores))
+            wide = lambda x: np.broadcast_to(np.asarray(x, float), scores[0].shape)[:count, None]
+            return wide(models.gain), wide(models.lag), wide(models.delay), wide(models.damping)
+        if throttle is None:
+            drawn = self.over.draw(np.linspace(*self.span, count), count, seed=seed)
+            gain = np.diagonal(drawn.gain)
+        else:
+            drawn = self.over.draw(np.array([throttle]), count, seed=seed)
+            gain = drawn.gain[0]
+        lag, delay = drawn.lag[:, None], drawn.delay[:, None]
+        return gain[:, None], lag, delay, np.full_like(lag, self.damping)

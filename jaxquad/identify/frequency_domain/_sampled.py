@@ -16,6 +16,8 @@ _COUNTS = (16, 64)  # aliases to either side
 _NODES = (6, 12)  # frequencies between which the sum over the aliases is interpolated
 _TRIED = 32  # frequencies at which the two are chosen
 _TOLERANCE = 1e-8  # of the response, to which they are chosen
+_FLAT = 0.3  # of the sum, over which its window stays at 1
+_SECOND = 0.7  # length of a second window over that of the first
 
 
 Numbers = Array | np.ndarray
@@ -46,19 +48,19 @@ class Aliases:
 
     def total(
         self,
-        own: Complex[Numbers, "frequencies outputs inputs"],
+        direct: Complex[Numbers, "frequencies outputs inputs"],
         others: Complex[Numbers, "others outputs inputs"],
     ) -> Complex[Numbers, "frequencies outputs inputs"]:
         """The response, from the model's at the frequencies themselves and at `omega`."""
-        columns = (1,) * (own.ndim - 1)
+        columns = (1,) * (direct.ndim - 1)
         ratio = others / _imaginary(self.omega).reshape(-1, *columns)
         upper, lower = ratio[: len(ratio) // 2], ratio[len(ratio) // 2 :]
-        terms = (upper + lower.conj()).reshape(*self.upper.shape, *own.shape[1:])
+        terms = (upper + lower.conj()).reshape(*self.upper.shape, *direct.shape[1:])
         weights = self.weights.astype(terms.dtype).reshape(1, -1, *columns)
         at_nodes = (terms * weights).sum(1)
         aliased = self.spread @ at_nodes.reshape(len(at_nodes), -1)
-        own = self.direct.reshape(-1, *columns).astype(own.dtype) * own
-        return own + aliased.reshape(own.shape)
+        direct = self.direct.reshape(-1, *columns).astype(direct.dtype) * direct
+        return direct + aliased.reshape(direct.shape)
 
 
 def evaluate_sampled(
@@ -96,10 +98,10 @@ def as_sampled(model: PyTree, frf: FrequencyResponse) -> PyTree:
 
     **Returns:** the model itself, or one whose response has the hold and its aliases.
     """
-    return held(model, hold_of(frf))
+    return behind_hold(model, hold_of(frf))
 
 
-def held(model: PyTree, hold: float) -> PyTree:
+def behind_hold(model: PyTree, hold: float) -> PyTree:
     """The model behind an input that is held for `hold` s; itself for 0."""
     return SampledModel(model, hold) if hold else model
 
@@ -114,7 +116,7 @@ def hold_of(frf: FrequencyResponse) -> float:
 
 def remarks_on_hold(
     frfs: Sequence[FrequencyResponse], used: Sequence[Bool[np.ndarray, "..."]]
-) -> list[str]:
+) -> list[Message]:
     """Remark on inputs of which nobody said how they are held, where it would show.
 
     What is held for a sample loses (w dt)^2 / 24 of its magnitude, beside a delay of half a sample.
@@ -128,13 +130,15 @@ def remarks_on_hold(
         over = np.where(mine, lost / np.maximum(np.asarray(frf.random_error), 1e-7), 0.0)
         k = np.unravel_index(np.argmax(over), over.shape)
         if over[k] > 1:
-            return [
+            omega = np.asarray(frf.omega)[k[0]]
+            text = (
                 "it is not known how long the input keeps each value: if it is held for a sample "
                 f"({1e3 * frf.dt:.3g} ms), the gain is {100 * lost[k]:.2g} % too low at "
-                f"{_frequency(np.asarray(frf.omega)[k[0]])}, {over[k]:.2g} times the random error, "
-                "and the delay half a sample too long; give «hold=» in s, the loop's period for a "
-                "command, 0 for a quantity that was measured« (jq.Record, jq.read)»"
-            ]
+                f"{omega:.3g} rad/s ({omega / (2 * np.pi):.3g} Hz), {over[k]:.2g} times the random "
+                "error, and the delay half a sample too long; give «hold=» in s, the loop's period "
+                "for a command, 0 for a quantity that was measured« (jq.Record, jq.read)»"
+            )
+            return [Message(text, "hold")]
     return []
 
 
@@ -148,29 +152,39 @@ def plan_aliases(model: PyTree, frf: FrequencyResponse) -> Aliases:
     """
     hold, omega = hold_of(frf), np.asarray(frf.omega)
     tried = omega[np.unique(np.linspace(0, omega.size - 1, _TRIED).round().astype(int))]
-    every = _aliases_at(tried, hold, _COUNTS[-1])
-    found = np.asarray(_evaluate(model, tried, every.omega))
-    _require_finite(found, tried, every.omega)
-    terms = _Terms(tried, hold, every, found[: tried.size], found[tried.size :])
-    best = terms.total(_COUNTS[-1], None)
-    close = lambda *plan: bool(np.all(np.abs(terms.total(*plan) - best) <= _TOLERANCE * abs(best)))
-    count = next(count for count in _COUNTS if close(count, None))
-    for nodes in _NODES if omega.size > _NODES[-1] else ():
-        if close(count, places := _places(tried, nodes)):
-            return _aliases_at(omega, hold, count, tried[places])
-    return _aliases_at(omega, hold, count)
-
-
-def _require_finite(response: np.ndarray, omega: np.ndarray, others: Float[Numbers, "..."]) -> None:
+    aliases = _aliases_at(tried, hold, _COUNTS[-1])
+    response = np.asarray(_evaluate(model, tried, aliases.omega))
     bad = ~np.isfinite(response).all(axis=tuple(range(1, response.ndim)))
     if bad.any():
-        first = np.concatenate([omega, np.ravel(others)])[int(np.argmax(bad))]
+        first = np.concatenate([tried, np.ravel(aliases.omega)])[int(np.argmax(bad))]
         raise ValueError(
             Message(
                 "the response of the model is not finite at its starting values, first at "
                 f"{first:.4g} rad/s: «start from other values»"
             )
         )
+    direct, others = response[: tried.size], response[tried.size :]
+    others = others.reshape(2, *aliases.upper.shape, *direct.shape[1:])
+
+    def total(count: int, nodes: np.ndarray | None) -> np.ndarray:
+        """The response from fewer aliases, and interpolated between some of the frequencies."""
+        some = others[:, slice(None) if nodes is None else nodes, :count]
+        plan = _aliases_at(tried, hold, count, None if nodes is None else tried[nodes])
+        return np.asarray(plan.total(direct, some.reshape(-1, *direct.shape[1:])))
+
+    best = total(_COUNTS[-1], None)
+    close = lambda *plan: bool(np.all(np.abs(total(*plan) - best) <= _TOLERANCE * abs(best)))
+    count = next(count for count in _COUNTS if close(count, None))
+    for number in _NODES if omega.size > _NODES[-1] else ():
+        # The frequencies nearest to Chebyshev's points between the first and the last.
+        turns = np.cos(np.pi * (np.arange(number) + 0.5) / number)
+        left = list(range(tried.size))
+        for target in tried[0] + (tried[-1] - tried[0]) * (1 - turns) / 2:
+            left.remove(min(left, key=lambda k: abs(tried[k] - target)))
+        nodes = np.setdiff1d(np.arange(tried.size), left)
+        if close(count, nodes):
+            return _aliases_at(omega, hold, count, tried[nodes])
+    return _aliases_at(omega, hold, count)
 
 
 def _is_numpy(x: Numbers) -> bool:
@@ -187,76 +201,29 @@ def _evaluate(model, omega, others):
     return evaluate_response(model, jnp.concatenate([omega, others]))
 
 
-@pytree_node
-class _Terms:
-    """A model's response at some frequencies and at all of their aliases."""
-
-    omega: Float[np.ndarray, " frequencies"]
-    hold: float
-    aliases: Aliases
-    own: Complex[np.ndarray, "frequencies outputs inputs"]
-    others: Complex[np.ndarray, "others outputs inputs"]
-
-    def total(
-        self, count: int, nodes: np.ndarray | None
-    ) -> Complex[np.ndarray, "frequencies outputs inputs"]:
-        """The response from fewer aliases, and interpolated between some of the frequencies."""
-        shape = (2, *self.aliases.upper.shape, *self.own.shape[1:])
-        kept = slice(None) if nodes is None else nodes
-        others = self.others.reshape(shape)[:, kept, :count].reshape(-1, *self.own.shape[1:])
-        at = None if nodes is None else self.omega[nodes]
-        return np.asarray(_aliases_at(self.omega, self.hold, count, at).total(self.own, others))
-
-
-def _places(omega: Float[np.ndarray, " frequencies"], count: int) -> np.ndarray:
-    """Which of the frequencies lie nearest to Chebyshev's points between the first and the last."""
-    turns = np.cos(np.pi * (np.arange(count) + 0.5) / count)
-    wanted = omega[0] + (omega[-1] - omega[0]) * (1 - turns) / 2
-    left = list(range(omega.size))
-    for target in wanted:
-        left.remove(min(left, key=lambda k: abs(omega[k] - target)))
-    return np.setdiff1d(np.arange(omega.size), left)
-
-
 def _aliases_at(omega, hold: float, count: int, nodes: np.ndarray | None = None) -> Aliases:
     """The aliases of all frequencies, or of the nodes between which they are interpolated."""
     at = (omega if nodes is None else nodes)[:, None]
     steps = 2 * np.pi / hold * np.arange(1, count + 1)[None]
     exp = np.exp if _is_numpy(omega) else jnp.exp
     turn = (1 - exp(-hold * _imaginary(omega))) / hold
-    across = np.eye(len(omega)) if nodes is None else _interpolation(np.asarray(omega), nodes)
+    across = np.eye(len(omega))
+    if nodes is not None:  # from values at the nodes to the polynomial through them
+        middle, half = 0.5 * (nodes[-1] + nodes[0]), 0.5 * (nodes[-1] - nodes[0])
+        basis = lambda x: np.polynomial.chebyshev.chebvander((x - middle) / half, nodes.size - 1)
+        across = np.linalg.solve(basis(nodes).T, basis(np.asarray(omega)).T).T
+    # A smooth end makes the rest of a sum that turns with a delay vanish faster than any power; of
+    # one that does not turn it is a series in 1 / count, of which two lengths cancel the first term
+    # (Richardson's extrapolation).
+    place = np.arange(1, count + 1) / (count + 1)
+    weights = (_step(place) - _SECOND * _step(place / _SECOND)) / (1 - _SECOND)
     return Aliases(
         direct=turn / _imaginary(omega),
         spread=turn[:, None] * across.astype(turn.dtype),
         upper=at + steps,
         lower=steps - at,
-        weights=_window(count),
+        weights=weights,
     )
-
-
-def _interpolation(
-    omega: Float[np.ndarray, " frequencies"], nodes: Float[np.ndarray, " nodes"]
-) -> Float[np.ndarray, "frequencies nodes"]:
-    """The matrix from values at the nodes to the polynomial through them at all frequencies."""
-    middle, half = 0.5 * (nodes[-1] + nodes[0]), 0.5 * (nodes[-1] - nodes[0])
-    basis = lambda at: np.polynomial.chebyshev.chebvander((at - middle) / half, nodes.size - 1)
-    return np.linalg.solve(basis(nodes).T, basis(omega).T).T
-
-
-_FLAT = 0.3  # of the sum, over which its window stays at 1
-_SECOND = 0.7  # length of a second window beside the first
-
-
-def _window(count: int) -> Float[np.ndarray, " aliases"]:
-    """Weights of the first aliases in a sum that goes on for ever.
-
-    A smooth end makes the rest of a sum that turns with a delay vanish faster than any power; of
-    one that does not turn it is a series in 1 / count, of which two lengths cancel the first term
-    (Richardson's extrapolation).
-    """
-    place = np.arange(1, count + 1) / (count + 1)
-    first, second = _step(place), _step(place / _SECOND)
-    return (first - _SECOND * second) / (1 - _SECOND)
 
 
 def _step(place: Float[np.ndarray, " aliases"]) -> Float[np.ndarray, " aliases"]:
@@ -265,7 +232,3 @@ def _step(place: Float[np.ndarray, " aliases"]) -> Float[np.ndarray, " aliases"]
     with np.errstate(divide="ignore", over="ignore"):
         rise, fall = np.exp(-1 / x), np.exp(-1 / (1 - x))
     return fall / (rise + fall)
-
-
-def _frequency(omega: float) -> str:
-    return f"{omega:.3g} rad/s ({omega / (2 * np.pi):.3g} Hz)"

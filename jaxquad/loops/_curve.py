@@ -1,6 +1,6 @@
-"""One response, measured or of a model, that can be asked at any frequency."""
+"""One response, measured or of a model, that can be asked at any frequency, and its numbers."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 import equinox as eqx
 import jax
@@ -115,8 +115,13 @@ def curve_of(
     grid = np.geomspace(*_GRID) if omega is None else omega
     _require_grid(grid)
     grid = jnp.asarray(grid, jnp.result_type(float))
-    outputs, inputs = _channels(response, grid)
-    names = [tuple(f"{k}" for k in range(n)) for n in (outputs, inputs)]
+    shape = eqx.filter_eval_shape(lambda m, w: m.frequency_response(w), response, grid).shape
+    if len(shape) != 3 or shape[0] != grid.size:
+        raise ValueError(
+            f"{type(response).__name__}.frequency_response gave the shape {shape} for {grid.size} "
+            f"frequencies: it must be ({grid.size}, outputs, inputs)"
+        )
+    names = [tuple(f"{k}" for k in range(n)) for n in shape[1:]]
     pair = (_position("output", output, names[0]), _position("input", input, names[1]))
     model = _Opaque(response) if jax.tree.leaves(response) == [response] else response
     return Curve(model, grid, None, pair, integrations, 0)
@@ -163,9 +168,17 @@ def _measured(
 ) -> Curve:
     o, i = _position("output", output, frf.output_names), _position("input", input, frf.input_names)
     values, error = (np.asarray(x)[:, o, i] for x in (frf.response, frf.random_error))
-    wanted = _wanted(np.asarray(frf.omega), omega)
+    measured, wanted = np.asarray(frf.omega), np.full(frf.omega.shape, True)
+    if omega is not None:
+        unknown = np.asarray(omega)[~np.isin(omega, measured)]
+        if unknown.size:
+            raise ValueError(
+                f"omega holds {unknown[0]:.6g} rad/s, at which nothing was measured: choose from "
+                "the omega of the response, as in frf.omega[5:60]"
+            )
+        wanted = np.isin(measured, omega)
     usable = wanted & np.isfinite(values) & np.isfinite(error) & (values != 0)
-    grid = np.asarray(frf.omega)[usable]
+    grid = measured[usable]
     _require_grid(grid)
     level, phase = np.log(np.abs(values[usable])), np.unwrap(np.angle(values[usable]))
     with np.errstate(divide="ignore", invalid="ignore"):  # where there is no number
@@ -176,31 +189,6 @@ def _measured(
     return Curve(
         Interpolated(*numbers), jnp.asarray(grid), coherence, (0, 0), integrations, dropped
     )
-
-
-def _wanted(
-    measured: Float[np.ndarray, " frequencies"], omega: Float[ArrayLike, " some"] | None
-) -> Bool[np.ndarray, " frequencies"]:
-    if omega is None:
-        return np.full(measured.shape, True)
-    chosen = np.asarray(omega)
-    unknown = chosen[~np.isin(chosen, measured)]
-    if unknown.size:
-        raise ValueError(
-            f"omega holds {unknown[0]:.6g} rad/s, at which nothing was measured: choose from the "
-            "omega of the response, as in frf.omega[5:60]"
-        )
-    return np.isin(measured, chosen)
-
-
-def _channels(model: Model, omega: Float[Array, " frequencies"]) -> tuple[int, int]:
-    shape = eqx.filter_eval_shape(lambda m, w: m.frequency_response(w), model, omega).shape
-    if len(shape) != 3 or shape[0] != omega.size:
-        raise ValueError(
-            f"{type(model).__name__}.frequency_response gave the shape {shape} for {omega.size} "
-            f"frequencies: it must be ({omega.size}, outputs, inputs)"
-        )
-    return shape[1], shape[2]
 
 
 def _position(kind: str, wanted: str | int | None, names: tuple[str, ...]) -> int:
@@ -311,3 +299,159 @@ def _root(
         return y / jnp.where(steep == 0, jnp.finfo(y.dtype).tiny, steep)
 
     return jax.lax.custom_root(residual, low, bisect, divide)
+
+
+Numbers = dict[str, Array]
+Argument = Array | str | float | Callable | None
+
+
+class Basis(eqx.Module):
+    """What the numbers were found from; `remarks` and `str` of a result speak of it."""
+
+    band: Float[Array, "2"]  # rad/s, lowest and highest frequency searched
+    start_phase: Float[Array, ""]  # rad, at the lowest frequency
+    unclear: Float[Array, ""]  # rad/s, from which the phase is ambiguous; inf if nowhere
+    finite: Bool[Array, ""]
+    coherence: dict[str, float]  # measured, beside each frequency found
+    dropped: int = eqx.field(static=True, default=0)
+
+    @property
+    def where(self) -> str:
+        """The band in words."""
+        return f"within {float(self.band[0]):.4g}..{float(self.band[1]):.4g} rad/s"
+
+    @property
+    def remarks(self) -> list[str]:
+        """What concerns every number of the result."""
+        remarks = []
+        if not bool(self.finite):
+            remarks.append("the response is not finite at some frequency: no number is given")
+        if self.dropped:
+            remarks.append(f"{self.dropped} measured frequencies without a number are left out")
+        for name, value in self.coherence.items():
+            if value < 0.6:
+                remarks.append(f"the coherence at the {name} is {value:.2f}, below 0.6: unreliable")
+        return remarks
+
+
+def basis_of(
+    curve: Curve,
+    phase: Float[Array, " frequencies"],
+    finite: Bool[Array, ""],
+    heeded: Bool[Array, " intervals"] | bool = True,
+) -> Basis:
+    """The basis of what was found on a curve with this unwrapped phase, where it is `heeded`."""
+    jumps = ambiguous(phase) & heeded
+    unclear = jnp.where(jnp.any(jumps), curve.omega[jnp.argmax(jumps)], jnp.inf)
+    band = jnp.stack([curve.omega[0], curve.omega[-1]])
+    return Basis(band, phase[0], unclear, finite, {}, curve.dropped)
+
+
+def evaluate_curve(
+    numbers: Callable[..., tuple[Numbers, Numbers, Basis]], curve: Curve, *args: Argument
+) -> tuple[Numbers, Basis, Numbers]:
+    """Numbers, basis and standard errors of a curve; the last are empty for a model.
+
+    `numbers(curve, *args)` gives the numbers that have a standard error, those that have none, and
+    their basis. Raises ValueError for a response that is not finite; under jit the numbers
+    are `nan` then.
+    """
+    if curve.coherence is None:
+        (values, others, basis), errors = _evaluated(numbers, curve, *args), {}
+    else:
+        values, others, basis, errors = _propagated(numbers, curve, *args)
+    if is_concrete(basis.finite) and not bool(basis.finite):
+        bad = np.asarray(curve.omega)[~np.isfinite(np.asarray(curve(curve.omega)))]
+        where = (
+            f"at {bad[0]:.6g} rad/s" if bad.size else "once closed or multiplied with a spectrum"
+        )
+        raise ValueError(
+            f"the response is not finite {where}: choose omega= without the poles on the imaginary "
+            "axis (of 1 / (1 + L) too), and a spectrum of 0 or more"
+        )
+    return values | others, basis, errors
+
+
+def only_finite(values: Numbers, finite: Bool[Array, ""]) -> Numbers:
+    """`nan` for every number of a response that is not finite."""
+    return {name: jnp.where(finite, value, jnp.nan) for name, value in values.items()}
+
+
+def with_coherence(basis: Basis, curve: Curve, places: Mapping[str, ArrayLike]) -> Basis:
+    """The basis, with the lesser coherence of the two points beside each frequency found."""
+    if curve.coherence is None:
+        return basis
+    coherence = np.asarray(curve.coherence)
+    least = {
+        name: float(np.min(coherence[around(curve.omega, place)]))
+        for name, place in places.items()
+        if np.isfinite(place)
+    }
+    return eqx.tree_at(lambda b: b.coherence, basis, least)
+
+
+@eqx.filter_jit
+def _evaluated(numbers: Callable, curve: Curve, *args: Argument) -> tuple[Numbers, Numbers, Basis]:
+    return numbers(curve, *args)
+
+
+@eqx.filter_jit
+def _propagated(
+    numbers: Callable, curve: Curve, *args: Argument
+) -> tuple[Numbers, Numbers, Basis, Numbers]:
+
+    def perturbed(change):
+        model = curve.measured
+        moved = (model.log_magnitude + change[0], model.phase + change[1])
+        model = eqx.tree_at(lambda m: (m.log_magnitude, m.phase), model, moved)
+        values, *rest = numbers(eqx.tree_at(lambda c: c.model, curve, model), *args)
+        return values, (values, *rest)
+
+    def spread(slope: Float[Array, " *numbers 2 frequencies"]) -> Float[Array, " *numbers"]:
+        # dT/T is circular: the real part of conj(w) dT/T has half the variance of the total.
+        w = jax.lax.complex(slope[..., 0, :], slope[..., 1, :])
+        power = jnp.einsum("...f,fg,...g->...", jnp.conj(w), curve.measured.covariance, w)
+        return jnp.sqrt(jnp.maximum(jnp.real(power) / 2, 0.0))
+
+    still = jnp.zeros((2, curve.omega.size), curve.omega.dtype)
+    slopes, (values, others, basis) = jax.jacfwd(perturbed, has_aux=True)(still)
+    errors = {
+        name: jnp.where(jnp.isfinite(value), spread(slopes[name]), jnp.nan)
+        for name, value in values.items()
+    }
+    return values, others, basis, errors
+
+
+def shown(
+    value: Float[Array, ""] | float,
+    error: Float[Array, ""] | float | None,
+    unit: str,
+    scale: float = 1.0,
+) -> str:
+    """`value` times `scale` with its standard error."""
+    if not np.isfinite(value):
+        return "-"
+    doubt = "" if error is None else f" +- {float(error) * scale:.2g}"
+    return f"{float(value) * scale:.4g}{doubt} {unit}"
+
+
+def degrees(value: Float[Array, ""] | float, error: Float[Array, ""] | float | None) -> str:
+    """An angle in rad as degrees."""
+    return shown(value, error, "deg", float(np.degrees(1.0)))
+
+
+def decibels(value: Float[Array, ""] | float, error: Float[Array, ""] | float | None) -> str:
+    """A ratio in dB."""
+    if not np.isfinite(value):
+        return "-"
+    scale = 20 / np.log(10)
+    relative = None if error is None else np.asarray(error) / np.asarray(value)
+    doubt = "" if relative is None else f" +- {scale * float(relative):.2g}"
+    return f"{scale * np.log(float(value)):.4g}{doubt} dB"
+
+
+def lines(rows: list[tuple[str, str]], remarks: list[str]) -> str:
+    """Names and numbers in two columns, then the remarks."""
+    width = max(len(name) for name, _ in rows)
+    table = [f"  {name:<{width}}  {text}" for name, text in rows]
+    return "\n".join(table + [f"  ! {remark}" for remark in remarks])

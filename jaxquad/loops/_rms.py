@@ -8,8 +8,18 @@ from jaxtyping import Array, ArrayLike, Float
 
 from jaxquad._core import is_concrete
 
-from ._basis import Basis, basis_of, evaluate_curve, lines, Numbers, only_finite, shown
-from ._curve import Curve, curve_of, Response
+from ._curve import (
+    Basis,
+    basis_of,
+    Curve,
+    curve_of,
+    evaluate_curve,
+    lines,
+    Numbers,
+    only_finite,
+    Response,
+    shown,
+)
 
 
 def nodes_between(
@@ -144,7 +154,16 @@ def rms_response(
         raise ValueError(f'sides is {sides!r}: choose "one" or "two"')
     curve = curve_of(response, omega, output, input)
     if not callable(spectrum):
-        spectrum = _on_grid(spectrum, curve)
+        values = jnp.asarray(spectrum, curve.omega.dtype)
+        spectrum = jnp.full_like(curve.omega, 1.0) * values if values.ndim == 0 else values
+        if spectrum.shape != curve.omega.shape:
+            raise ValueError(
+                f"the spectrum has the shape {spectrum.shape} for {curve.omega.size} frequencies: "
+                "give one value for each, one for all, or a function of omega"
+            )
+        if is_concrete(spectrum) and not np.all(np.asarray(spectrum) >= 0):
+            least = np.min(np.asarray(spectrum))
+            raise ValueError(f"the spectrum goes down to {least:.4g}: a power is 0 or more")
     values, basis, errors = evaluate_curve(_numbers, curve, spectrum, _SIDES[sides])
     return RmsResponse(**values, standard_errors=errors, basis=basis)
 
@@ -152,8 +171,16 @@ def rms_response(
 def _numbers(
     curve: Curve, spectrum: Callable | Float[Array, " frequencies"], sides: float
 ) -> tuple[Numbers, Numbers, Basis]:
-    integrate = _of_model if curve.coherence is None else _of_data
-    powers, doubt = integrate(curve, spectrum)
+    if curve.coherence is None:
+        powers, rough = (_gauss(curve, spectrum, order) for order in _ORDERS)
+        total = jnp.sum(powers)
+        doubt = jnp.abs(jnp.sum(rough) / jnp.where(total > 0, total, 1.0) - 1) / 2
+    else:
+        density = spectrum(curve.omega) if callable(spectrum) else spectrum
+        power = jnp.abs(curve(curve.omega)) ** 2 / (1 + 2 * curve.measured.random_error**2)
+        y, x = power * density * curve.omega, jnp.log(curve.omega)
+        powers = logarithmic_mean(y[:-1], y[1:]) * jnp.diff(x)
+        doubt = jnp.zeros((), x.dtype)
     powers = powers * sides / (2 * jnp.pi)
     total = jnp.sum(powers)
     share = powers / jnp.where(total > 0, total, 1.0)
@@ -178,17 +205,10 @@ def _numbers(
     return numbers, only_finite(others, finite), basis_of(curve, phase, finite)
 
 
-def _of_model(
-    curve: Curve, spectrum: Callable | Float[Array, " frequencies"]
-) -> tuple[Float[Array, " intervals"], Float[Array, ""]]:
-    fine, rough = (_gauss(curve, spectrum, order) for order in _ORDERS)
-    total = jnp.sum(fine)
-    return fine, jnp.abs(jnp.sum(rough) / jnp.where(total > 0, total, 1.0) - 1) / 2
-
-
 def _gauss(
     curve: Curve, spectrum: Callable | Float[Array, " frequencies"], order: int
 ) -> Float[Array, " intervals"]:
+    """|T|^2 times the spectrum, integrated over each interval."""
     omega, part, weights = nodes_between(curve.omega, order)
     if callable(spectrum):
         density = spectrum(omega.reshape(-1)).reshape(omega.shape)
@@ -196,26 +216,3 @@ def _gauss(
         density = power_law(spectrum[:-1, None], spectrum[1:, None], part)
     power = jnp.abs(curve(omega.reshape(-1)).reshape(omega.shape)) ** 2
     return jnp.sum(power * density * omega * weights, axis=1)
-
-
-def _of_data(
-    curve: Curve, spectrum: Callable | Float[Array, " frequencies"]
-) -> tuple[Float[Array, " intervals"], Float[Array, ""]]:
-    density = spectrum(curve.omega) if callable(spectrum) else spectrum
-    power = jnp.abs(curve(curve.omega)) ** 2 / (1 + 2 * curve.measured.random_error**2)
-    y, x = power * density * curve.omega, jnp.log(curve.omega)
-    return logarithmic_mean(y[:-1], y[1:]) * jnp.diff(x), jnp.zeros((), x.dtype)
-
-
-def _on_grid(spectrum: Float[ArrayLike, "..."], curve: Curve) -> Float[Array, " frequencies"]:
-    values = jnp.asarray(spectrum, curve.omega.dtype)
-    if values.ndim == 0:
-        values = jnp.full_like(curve.omega, 1.0) * values
-    if values.shape != curve.omega.shape:
-        raise ValueError(
-            f"the spectrum has the shape {values.shape} for {curve.omega.size} frequencies: give "
-            "one value for each, one for all, or a function of omega"
-        )
-    if is_concrete(values) and not np.all(np.asarray(values) >= 0):
-        raise ValueError(f"the spectrum goes down to {np.min(values):.4g}: a power is 0 or more")
-    return values
