@@ -31,7 +31,7 @@ flight = jq.simulation.scenario(duration=0.5, dt=0.002, axes=1, reference=jq.sim
 print(jq.simulate(loop, flight).angle.tobytes().hex())
 axis = jq.LaggedIntegrator(280.0, 0.016, 0.011)
 print(jq.fit(axis, response_of(axis, seed=0)).values.tobytes().hex())
-print(*(any(each in name for name in traced) for each in ("_run", "_find")))
+print(*(any(each in name for name in traced) for each in ("_run", "_solve_by_default")))
 """
 
 

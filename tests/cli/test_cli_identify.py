@@ -106,8 +106,8 @@ def test_a_warning_of_the_reader_is_one_line_however_many_logs_have_it(tmp_path,
     noise = np.random.default_rng(2).standard_normal((time.size, 2))
     np.savez(tmp_path / "gap.npz", t=time, M=noise[:, 0], q=noise[:, 1])
     shutil.copy(tmp_path / "gap.npz", tmp_path / "again.npz")
-    words = (str(tmp_path / "again.npz"), "--out", str(tmp_path))
-    identify(tmp_path / "gap.npz", *words, channels=("M", "q"))
+    logs = [str(tmp_path / name) for name in ("gap.npz", "again.npz")]
+    main(["identify", *logs, "--input", "M", "--output", "q", "--out", str(tmp_path), "--quiet"])
     warning, error = capsys.readouterr().err.splitlines()
     assert warning.startswith("! gaps filled by interpolation") and error.startswith("jaxquad: ")
 
