@@ -40,8 +40,8 @@ class Alike(eqx.Module):
 
 def frf_of(response, coherence: float | np.ndarray = 0.95):
     like = response_of(START, omega=np.asarray(OMEGA)[: len(response)])
-    coherence = jnp.broadcast_to(jnp.asarray(coherence), like.coherence.shape)
-    return dataclasses.replace(like, response=jnp.asarray(response), coherence=coherence)
+    everywhere = jnp.broadcast_to(jnp.asarray(coherence), like.coherence.shape)
+    return dataclasses.replace(like, response=jnp.asarray(response), coherence=everywhere)
 
 
 def solved(responses, coherence: float | np.ndarray = 0.95, **options):

@@ -140,7 +140,7 @@ class Bands(NamedTuple):
             cells = []
             for fit in (self.full, self.lower, self.upper):
                 text = "the fit diverged" if fit is None else "not determined"
-                if _determines(fit, name):
+                if fit is not None and _determines(fit, name):
                     text = "{:.4g} .. {:.4g}".format(*fit.interval(name))
                 cells.append(text)
             rows.append((name, *cells, words[self.overlap(name)]))
@@ -150,7 +150,7 @@ class Bands(NamedTuple):
 
 
 def _determines(fit: PyTree, name: str) -> bool:
-    if fit is None or not fit.verdict.fitted:
+    if not fit.verdict.fitted:
         return False
     return bool(fit.determined[fit.names.index(name)])
 
