@@ -85,8 +85,12 @@ def identify_both(
     )
 
 
+def _gain(axis: jq.models.AttitudeAxis) -> jax.Array:
+    return axis.gain
+
+
 def gain_of(fit: jq.identify.Fit, *, model_error: bool = True) -> jq.identify.Combination:
-    return fit.derived(lambda axis: axis.gain, "L K_t / J_x", model_error=model_error)
+    return fit.derived(_gain, "L K_t / J_x", model_error=model_error)
 
 
 def draw_gains(

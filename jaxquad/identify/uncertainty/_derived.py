@@ -11,7 +11,7 @@ from jaxtyping import Array, Complex, Float, PyTree
 
 from jaxquad.models import TransferFunction
 
-from ..frequency_domain._parameters import number_at
+from ..frequency_domain._parameters import number_at, Parameters
 from ._identifiability import LIMIT
 from ._verdict import Combination, reach_of_interval, UndeterminedError, USUAL
 
@@ -90,25 +90,34 @@ def tied_parameters(fit: "Fit") -> tuple[Tied, ...]:
 
 def propagate(fit: "Fit", quantity: Quantity) -> Propagated:
     """Value and slope of a quantity, and whether it is left open."""
-    verdict, (arrays, rest) = fit.verdict, eqx.partition(fit.model, eqx.is_inexact_array)
-
-    def of_values(x, arrays):
-        value = quantity(fit.parameters.replace(eqx.combine(arrays, rest), x))
-        if jnp.shape(value):
-            raise ValueError(
-                "the quantity is an array: ask for each of its numbers, by a function of its own"
-            )
-        return value
-
-    function = jax.value_and_grad(of_values)
-    places = (fit.values, *verdict.alternatives)
-    value, *others = [function(jnp.asarray(values), arrays) for values in places]
+    verdict, places = fit.verdict, (fit.values, *fit.verdict.alternatives)
+    arguments = quantity, fit.parameters, fit.model
+    try:
+        value, *others = [_value_and_slope(*arguments, values) for values in places]
+    except jax.errors.ConcretizationTypeError:  # a quantity that asks for numbers
+        with jax.disable_jit():
+            value, *others = [_value_and_slope(*arguments, values) for values in places]
     value, slope = float(value[0]), np.asarray(value[1]) * fit.units
     differs = any(abs(float(other) - value) > 1e-6 * abs(value) for other, _ in others)
     # Whether it changes where the responses do not.
     along_null = np.abs(verdict.exact @ slope) > 1e-6 * np.linalg.norm(slope)
     on_curved = [slope[fit.names.index(name)] != 0 for name in verdict.curved]
     return Propagated(value, slope, bool(differs or np.any(along_null) or any(on_curved)))
+
+
+@eqx.filter_jit
+def _value_and_slope(
+    quantity: Quantity, parameters: Parameters, model: PyTree, values: Float[Array, " parameters"]
+) -> tuple[Float[Array, ""], Float[Array, " parameters"]]:
+    def of_values(x: Float[Array, " parameters"]) -> Float[Array, ""]:
+        value = quantity(parameters.replace(model, x))
+        if jnp.shape(value):
+            raise ValueError(
+                "the quantity is an array: ask for each of its numbers, by a function of its own"
+            )
+        return value
+
+    return jax.value_and_grad(of_values)(values)
 
 
 class Factor(NamedTuple):
