@@ -251,7 +251,8 @@ class ADRCAutopilot:
         lines += [f"  not modelled: {x}" for x in self.flown.unmodelled]
         lines += ["", str(self.plant)] if self.plant is not None else []
         again = [
-            f"flown loop at {x:.2f} throttle: {x.verdict}" for x, x in self.shown_again.items()
+            f"flown loop at {throttle:.2f} throttle: {loop.verdict}"
+            for throttle, loop in self.shown_again.items()
         ]
         lines += ["", *again] if again else []
         if self.proposal is not None:
