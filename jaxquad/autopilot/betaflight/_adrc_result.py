@@ -133,7 +133,10 @@ class ADRCAutopilot:
             "new": self.new,
             "words": [x._asdict() for x in self.words],
             "proposal": None if self.proposal is None else self.proposal.content(),
-            "reproduction": [{"throttle": x} | x.to_dict() for x, x in self.reproductions.items()],
+            "reproduction": [
+                {"throttle": throttle} | loop.to_dict()
+                for throttle, loop in self.reproductions.items()
+            ],
             "plant": None if self.plant is None else self.plant.to_dict(),
             "remarks": self.remarks,
             "settings": self.settings.content(),
