@@ -107,7 +107,10 @@ def propagate(fit: "Fit", quantity: Quantity) -> Propagated:
 
 @eqx.filter_jit
 def _value_and_slope(
-    quantity: Quantity, parameters: Parameters, model: PyTree, values: Float[Array, " parameters"]
+    quantity: Quantity,
+    parameters: Parameters,
+    model: PyTree,
+    values: Float[Array | np.ndarray, " parameters"],
 ) -> tuple[Float[Array, ""], Float[Array, " parameters"]]:
     def of_values(x: Float[Array, " parameters"]) -> Float[Array, ""]:
         value = quantity(parameters.replace(model, x))
@@ -117,7 +120,7 @@ def _value_and_slope(
             )
         return value
 
-    return jax.value_and_grad(of_values)(values)
+    return jax.value_and_grad(of_values)(jnp.asarray(values))
 
 
 class Factor(NamedTuple):
