@@ -407,8 +407,8 @@ def test_a_limit_that_rounding_hides_is_infinite_and_a_model_without_numbers_no_
     frf = response_of(jq.LaggedIntegrator(80.0, 1e-9, 0.02), error=0.05, seed=0)
     jq.fit(jq.LaggedIntegrator(70.0, 0.03, 0.02), frf, free=("gain", "lag"), cost=ML)
     [(problem, solution, k, inflations)] = calls
-    limits, _ = one_sided_limits(problem, solution, k, (-10.0, np.nan, *inflations))
-    assert limits[:2] == [np.inf, np.inf] and 0 < limits[2] < 0.01
+    limits, _ = one_sided_limits(problem, solution, k, (-10.0, np.nan, np.inf, *inflations))
+    assert limits[:3] == [np.inf] * 3 and 0 < limits[3] < 0.01
     for far in (700.0, 800.0, np.inf):
         z = np.where(np.arange(2) == k, far, solution.z)
         assert not np.isfinite(polish(problem, z, [k], solution)[1].cost)

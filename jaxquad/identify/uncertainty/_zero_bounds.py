@@ -121,7 +121,7 @@ def one_sided_limits(
     limits = []
     for inflation in inflations:
         wanted = _RISE * inflation
-        if not wanted > 0:  # of a variance that rounding left negative
+        if not 0 < wanted < np.inf:  # a variance that is infinite, or left negative by rounding
             limits.append(unit * np.inf)
             continue
         guess = (np.sqrt(slope**2 + curvature * wanted) - slope) / curvature
