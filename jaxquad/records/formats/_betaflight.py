@@ -22,8 +22,8 @@ from ._betaflight_frames import (
     Header,
     headers,
     MARKER,
-    payload,
     Payload,
+    payload,
     RESUME,
     STRAY,
 )
