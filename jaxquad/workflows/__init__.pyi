@@ -1,7 +1,6 @@
 from ._autopilot import autopilot as autopilot
 from ._batch import batch as batch, find_logs as find_logs
 from ._batch_workers import Job as Job
-from ._command_line import in_options as in_options
 from ._demo import (
     DEMO as DEMO,
     DEMO_TRUTH as DEMO_TRUTH,
@@ -34,6 +33,7 @@ from ._settings import (
     BatchSettings as BatchSettings,
     GROUPS as GROUPS,
     IdentifySettings as IdentifySettings,
+    in_options as in_options,
     Override as Override,
     TuneSettings as TuneSettings,
 )
