@@ -76,9 +76,7 @@ def identify_log(job: Job) -> Content:
     if fit.verdict.fitted:
         numbers = zip(fit.names, fit.values, fit.standard_errors, fit.determined, strict=True)
         # A table has no place for a mark: what is not determined has no number in it.
-        rows += [
-            (name, *((x, error) if sure else (None, None))) for name, x, error, sure in numbers
-        ]
+        rows += [(name, *(pair if sure else (None, None))) for name, *pair, sure in numbers]
     rows += [(x.name, x.value, x.standard_error) for x in result.combinations]
     plain = lambda x: None if x is None else float(x)
     return {
@@ -242,10 +240,8 @@ def perform_locally(
             late = [connection for connection, worker in busy.items() if worker.overdue()]
             for connection in [*ready, *late]:
                 worker = busy.pop(connection)  # pyright: ignore[reportArgumentType]
-                done, content = (
-                    worker.job,
-                    worker.give_up() if connection in late else worker.answer(),
-                )
+                done = worker.job
+                content = worker.give_up() if connection in late else worker.answer()
                 job, ended = next(jobs, None), worker.process.exitcode is not None
                 if job is None or ended:
                     worker.stop()

@@ -265,20 +265,14 @@ class Identification:
             return f"{Path(record.source).name}, {span}" if self.more else span
 
         write_report(
-            folder / "report.html",
-            fit=fit,
-            frf=self.frf,
-            others=self._other_responses,
+            folder / "report.html", fit=fit, frf=self.frf, others=self._other_responses,
             record={title(record): record for record in self.records},
             spectrum=self._record_with_throttle(),
             checks={} if self.check is None else {Path(sources[-1]).name: self.check},
-            derived=self.combinations,
-            provenance=origin,
-            filters=self.filters,
-            law=self._law_if_any(),
+            derived=self.combinations, provenance=origin, filters=self.filters,
+            law=self._law_if_any(), texts=self.supplements,
             formula="; ".join(filter(None, (self.formula, self.filters_text))),
-            texts=self.supplements,
-        )
+        )  # fmt: skip
         for earlier in (folder / "verification.png", *folder.glob("record_*.png")):
             if earlier.name not in self.figure_names:
                 earlier.unlink(missing_ok=True)
