@@ -406,8 +406,8 @@ def _event(data: bytes, at: int, stop: int) -> Event | None:
     kind, end = data[at + 1], at + 2
     if kind == 255:
         null = data.find(b"\0", end, min(stop, at + 80))
-        whole = null >= 0 and data.startswith(b"End of log", end)
-        return Event(at, LOG_END, null + 1) if whole else None
+        ended = null >= 0 and data.startswith(b"End of log", end)
+        return Event(at, LOG_END, null + 1) if ended else None
     if kind == 13:  # the number of a setting, and its value: of a float four bytes
         name, count = ADJUSTMENT, int(data[end] < 128)
         end += 1 if count else 5
