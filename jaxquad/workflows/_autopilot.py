@@ -26,11 +26,10 @@ from jaxquad.autopilot import (
 from jaxquad.records import AXES, Proposal
 
 from ._autopilot_adrc import flew_adrc, tune_adrc
-from ._command_line import in_options
 from ._identify import identify_plant
 from ._log import propose_settings, read_records
 from ._options import SettingsError
-from ._settings import AutopilotSettings, IdentifySettings
+from ._settings import AutopilotSettings, IdentifySettings, in_options
 
 
 def autopilot(

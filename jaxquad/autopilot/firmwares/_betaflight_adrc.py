@@ -37,8 +37,8 @@ from .._law import (
     Terms,
 )
 from .._parameters import list_parameters
-from ._header import betaflight_loop, FlownBetaflight
-from ._law import F_SCALE
+from ._betaflight import betaflight_loop, flies_adrc, FlownBetaflight
+from ._betaflight_law import F_SCALE
 
 
 class BetaflightADRC(RateLoop):
@@ -223,16 +223,6 @@ def adrc_parameters(values: Mapping[str, str]) -> dict[str, float]:
         for axis, value in zip(AXES, _three(values, line), strict=True)
     }  # fmt: skip
     return parameters | {name: float(values[name]) for name in _OF_ALL if name in values}
-
-
-def flies_adrc(values: Mapping[str, str]) -> bool:
-    """Whether a Betaflight header is of a flight with the proposed ADRC: pid_type is 1.
-
-    **Arguments:**
-
-    - `values`: the header's lines by name, `jq.records.read_settings(path).values`.
-    """
-    return values.get("pid_type", "0").strip().upper() in ("1", "ADRC")
 
 
 def betaflight_adrc_loop(

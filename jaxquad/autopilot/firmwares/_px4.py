@@ -44,7 +44,7 @@ from .._law import (
     sum_of,
     Terms,
 )
-from ._log import LOG
+from ._px4_log import LOG
 
 
 _FADED = np.deg2rad(400.0)  # rad/s of error at which the integral no longer grows

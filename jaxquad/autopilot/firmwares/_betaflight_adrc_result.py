@@ -22,9 +22,8 @@ from .._parameters import find_parameter
 from .._pilot_page import chains_of, change_rows, logged_terms, motor_rows, StepGrid, VERDICTS
 from .._rate_design import Kind
 from .._reproduce_flight import Reproduction
-from ._adrc import adrc_parameters, b0_law, FlownADRC
-from ._adrc_loops import ADRCFrame, Flown, make_adrc_loop
-from ._adrc_search import ADRCProposal
+from ._betaflight_adrc import adrc_parameters, b0_law, FlownADRC
+from ._betaflight_adrc_design import ADRCFrame, ADRCProposal, Flown, make_adrc_loop
 
 
 _BUILD = (2026, 6)  # whose names a file of the ADRC has

@@ -38,7 +38,7 @@ from .._law import (
     sum_of,
     Terms,
 )
-from ._log import LOG
+from ._crazyflie_log import LOG
 
 
 class CrazyflieRate(RateLoop):
