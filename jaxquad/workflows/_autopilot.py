@@ -41,11 +41,10 @@ from jaxquad.identify import gain_over_throttle, GainOverThrottle, UndeterminedE
 from jaxquad.records import AXES, Proposal, RecordError, RecordWarning
 from jaxquad.spectra import frequency_response, JointInputOutput, LocalPolynomial
 
-from ._command_line import in_options
 from ._identify import identify_plant
 from ._log import propose_settings, read_records
 from ._options import SettingsError
-from ._settings import AutopilotSettings, IdentifySettings
+from ._settings import AutopilotSettings, IdentifySettings, in_options
 
 
 def autopilot(
