@@ -24,7 +24,7 @@ from matplotlib.legend import Legend
 
 from jaxquad.plot import headless, Panels, visible
 
-from ._provenance import reason_of
+from ._results import reason_of
 
 
 class Cell(NamedTuple):

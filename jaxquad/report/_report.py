@@ -13,17 +13,16 @@ from jaxquad.records import Record
 from jaxquad.spectra import FrequencyResponse
 
 from ._answers import answer_section
-from ._fit import identifiability_section, parameter_section
 from ._loop import LawLoop, loop_section, step_section
-from ._measured import (
-    check_section,
-    GOOD_TIC,
-    record_section,
-    response_section,
-    spectrum_section,
+from ._measured import check_section, GOOD_TIC, record_section, response_section, spectrum_section
+from ._numbers import (
+    identifiability_section,
+    parameter_section,
+    tuned_section,
+    verdict_headlines,
 )
 from ._page import Headline, render_page
-from ._provenance import attempt, Provenance, provenance_section
+from ._results import attempt, Provenance, provenance_section
 
 
 if TYPE_CHECKING:
@@ -119,8 +118,6 @@ def write_report(
     headlines = [fit_headline(fit, len(remarks))]
     headlines += [check_headline(name, check, fit) for name, check in verified.items()]
     if tuned is not None:
-        from ._tuned import tuned_section, verdict_headlines  # the room of tuning takes 0.2 s
-
         headlines += verdict_headlines(tuned)
         sections["tuned"] = attempt(tuned_section, tuned, flights or {})
     sections["response"] = attempt(response_section, frfs, drawn, others or {})
@@ -135,15 +132,10 @@ def write_report(
     if verified:
         sections["verification"] = attempt(check_section, verified)
     text = render_page(
-        "report.html",
-        title=f"{headlines[0].word}: {title or ' / '.join(names)}",
-        title_text=title,
-        names=names,
-        headlines=headlines,
-        remarks=remarks,
-        formula=formula,
+        "report.html", title=f"{headlines[0].word}: {title or ' / '.join(names)}",
+        title_text=title, names=names, headlines=headlines, remarks=remarks, formula=formula,
         sections={name: sections[name] for name in _ORDER if sections.get(name) is not None},
-    )
+    )  # fmt: skip
     return write_file(path, text)
 
 
