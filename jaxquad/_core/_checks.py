@@ -64,11 +64,7 @@ def require_all_nonnegative(**values: Value) -> None:
 
 
 def _require(
-    name: str,
-    value: Value,
-    valid: Callable[[np.ndarray], np.ndarray],
-    limit: str,
-    remedy: str,
+    name: str, value: Value, valid: Callable[[np.ndarray], np.ndarray], limit: str, remedy: str
 ) -> None:
     if is_concrete(value) and not np.all(valid(np.asarray(value))):
         text = f"{name} is {value}, but it must be {limit}"

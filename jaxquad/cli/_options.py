@@ -46,12 +46,9 @@ class Command(NamedTuple):
 
     def add_to(self, commands: Any) -> None:  # argparse names the type of its subparsers nowhere
         declared = commands.add_parser(
-            self.name,
-            prog=f"jaxquad {self.name}",
-            description=self.help,
-            epilog=self.examples,
+            self.name, prog=f"jaxquad {self.name}", description=self.help, epilog=self.examples,
             formatter_class=argparse.RawDescriptionHelpFormatter,
-        )
+        )  # fmt: skip
         declared.set_defaults(run=self.declare(declared))
 
 
@@ -82,14 +79,9 @@ _FORCE = "overwrite the result of other settings; without it, that is kept, and 
 
 
 def add_output(
-    declared: argparse.ArgumentParser,
-    content: str,
-    *,
-    folder: str = "",
-    file: tuple[str, str] | None = None,
-    force: str = _FORCE,
-    quiet: bool = True,
-) -> None:
+    declared: argparse.ArgumentParser, content: str, *, folder: str = "",
+    file: tuple[str, str] | None = None, force: str = _FORCE, quiet: bool = True,
+) -> None:  # fmt: skip
     """Options on output, last in the help of a command; `content` is what --json prints.
 
     `folder` says where the command writes by default; a command that writes a `file` has the
@@ -129,12 +121,9 @@ def check_out(options: argparse.Namespace) -> None:
 
 
 def folder_to_write(
-    options: argparse.Namespace,
-    wanted: Path,
-    name: str,
-    same: Mapping[str, object],
+    options: argparse.Namespace, wanted: Path, name: str, same: Mapping[str, object],
     sources: Sequence[Path | str],
-) -> Path:
+) -> Path:  # fmt: skip
     """The folder that is wanted, or one beside it where that holds the result of other settings."""
     if options.force:
         return wanted

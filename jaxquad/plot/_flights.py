@@ -50,12 +50,9 @@ def channels_of(record: Record) -> list[tuple[str, str]]:
 
 
 def record_figure(
-    record: Record,
-    channels: Sequence[tuple[str, str]] | None = None,
-    *,
-    ax: AxesLike = None,
+    record: Record, channels: Sequence[tuple[str, str]] | None = None, *, ax: AxesLike = None,
     title: str = "",
-) -> Panels:
+) -> Panels:  # fmt: skip
     """Draw the channels of a record over time, stacked; angles in degrees.
 
     A long channel is drawn through its extremes, so that no peak is lost.
@@ -91,13 +88,9 @@ _TARGET: Style = {"color": "0.75", "ls": "-", "lw": 4.0, "zorder": 1}
 
 def histories(
     time: Float[ArrayLike, " samples"],
-    panels: Mapping[str, Mapping[str, Float[ArrayLike, " samples"]]],
-    *,
-    target: str | None = None,
-    limits: Mapping[str, tuple[float, float]] | None = None,
-    ax: AxesLike = None,
-    title: str = "",
-) -> Panels:
+    panels: Mapping[str, Mapping[str, Float[ArrayLike, " samples"]]], *, target: str | None = None,
+    limits: Mapping[str, tuple[float, float]] | None = None, ax: AxesLike = None, title: str = "",
+) -> Panels:  # fmt: skip
     """Draw curves over time in stacked panels; they differ in their lines as well as in colour.
 
     **Arguments:**
@@ -144,14 +137,9 @@ _BAR = 0.16  # inches, of the scale of colours
 
 
 def spectrogram(
-    record: Record,
-    channel: str | None = None,
-    *,
-    over: str = "time",
-    window: float | None = None,
-    ax: AxesLike = None,
-    title: str = "",
-) -> Panels:
+    record: Record, channel: str | None = None, *, over: str = "time", window: float | None = None,
+    ax: AxesLike = None, title: str = "",
+) -> Panels:  # fmt: skip
     """Draw the power spectral density of a channel over time, or over another channel.
 
     Over the throttle, motor harmonics are lines that rise with it, and resonances of the frame

@@ -24,14 +24,10 @@ Samples = Float[np.ndarray, " samples"]
 
 
 def compare(
-    models: PyTree | Mapping[str, PyTree] | Sequence[PyTree],
-    record: Record | None = None,
-    *,
-    band: tuple[float, float] | None = None,
-    hold: str | None = None,
-    ax: AxesLike = None,
+    models: PyTree | Mapping[str, PyTree] | Sequence[PyTree], record: Record | None = None, *,
+    band: tuple[float, float] | None = None, hold: str | None = None, ax: AxesLike = None,
     title: str = "",
-) -> Panels:
+) -> Panels:  # fmt: skip
     """Draw measured outputs and what models predict over time, with their differences below.
 
     The legend has the fit in per cent of each model. Angles are in degrees. A long curve is drawn
@@ -119,12 +115,9 @@ _LONGEST = 60.0  # s, where nothing says how long it lasts
 
 
 def step(
-    *shown: Thing,
-    duration: float | None = None,
-    pair: tuple[str, str] | None = None,
-    ax: AxesLike = None,
-    title: str = "",
-) -> Panels:
+    *shown: Thing, duration: float | None = None, pair: tuple[str, str] | None = None,
+    ax: AxesLike = None, title: str = "",
+) -> Panels:  # fmt: skip
     """Draw the answers of models, fits, closed loops and flown loops to a unit step.
 
     A fit has its 95 % band, model error included. Of a loop its first axis is simulated: the angle,
@@ -300,13 +293,9 @@ def residuals_of(frf: FrequencyResponse, model: Model, output: int, source: int)
 
 
 def resid(
-    model: PyTree,
-    data: FrequencyResponse | Record | None = None,
-    *,
-    pair: tuple[str, str] | None = None,
-    ax: AxesLike = None,
-    title: str = "",
-) -> Panels:
+    model: PyTree, data: FrequencyResponse | Record | None = None, *,
+    pair: tuple[str, str] | None = None, ax: AxesLike = None, title: str = "",
+) -> Panels:  # fmt: skip
     """Draw what a model leaves unexplained: of a response over frequency, of a record over time.
 
     Over frequency, measured minus model is in units of its random error, with the band that holds

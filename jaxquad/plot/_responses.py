@@ -45,12 +45,9 @@ class _Curve(NamedTuple):
 
 
 def bode(
-    *shown: Thing,
-    pair: tuple[str, str] | None = None,
-    omega: Float[ArrayLike, " frequencies"] | None = None,
-    ax: AxesLike = None,
-    title: str = "",
-) -> Panels:
+    *shown: Thing, pair: tuple[str, str] | None = None,
+    omega: Float[ArrayLike, " frequencies"] | None = None, ax: AxesLike = None, title: str = "",
+) -> Panels:  # fmt: skip
     """Draw magnitude, phase and coherence of measured responses and of models.
 
     The first measured response has points with a grey band that holds 95 % of its random error.
@@ -237,10 +234,7 @@ def _coherence_axis(axis: Axes) -> None:
 
 
 def coherence(
-    *shown: Thing,
-    pair: tuple[str, str] | None = None,
-    ax: AxesLike = None,
-    title: str = "",
+    *shown: Thing, pair: tuple[str, str] | None = None, ax: AxesLike = None, title: str = ""
 ) -> Panels:
     """Draw the coherence of measured responses over frequency.
 
@@ -339,12 +333,9 @@ _ELLIPSES = 30  # of a model, along its curve
 
 
 def nyquist(
-    *shown: Thing,
-    pair: tuple[str, str] | None = None,
-    omega: Float[ArrayLike, " frequencies"] | None = None,
-    ax: AxesLike = None,
-    title: str = "",
-) -> Panels:
+    *shown: Thing, pair: tuple[str, str] | None = None,
+    omega: Float[ArrayLike, " frequencies"] | None = None, ax: AxesLike = None, title: str = "",
+) -> Panels:  # fmt: skip
     """Draw responses in the complex plane, with -1 and the unit circle.
 
     Of a loop it is L, broken at the command and closed as 1 + L = 0. Negative frequencies are thin.

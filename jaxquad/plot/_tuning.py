@@ -155,13 +155,9 @@ _LETTER = 0.067  # inches, of a design's name
 
 
 def certificate_figure(
-    certificate: Certificate,
-    *,
-    quantities: Sequence[str] = ("itae", "sensitivity_peak"),
-    designs: Sequence[str] | None = None,
-    ax: AxesLike = None,
-    title: str = "",
-) -> Panels:
+    certificate: Certificate, *, quantities: Sequence[str] = ("itae", "sensitivity_peak"),
+    designs: Sequence[str] | None = None, ax: AxesLike = None, title: str = "",
+) -> Panels:  # fmt: skip
     """Draw every member of a certificate over its inertia: stability, then further quantities.
 
     Linearly unstable members have a cross, and no Ms or margin. Limits are dashed lines.
@@ -245,17 +241,11 @@ def _draw_members(
 
 
 def flight(
-    flown: PyTree,
-    loop: Loop | None = None,
-    ensemble: Ensemble | Members | None = None,
-    scenario: Scenario | None = None,
-    *,
-    axis: str | int = 0,
-    quantities: Sequence[str] = ("itae", "sensitivity_peak"),
-    command_unit: str = "",
-    ax: AxesLike = None,
-    title: str = "",
-) -> Panels:
+    flown: PyTree, loop: Loop | None = None, ensemble: Ensemble | Members | None = None,
+    scenario: Scenario | None = None, *, axis: str | int = 0,
+    quantities: Sequence[str] = ("itae", "sensitivity_peak"), command_unit: str = "",
+    ax: AxesLike = None, title: str = "",
+) -> Panels:  # fmt: skip
     """Draw how a tuned design flies: angle, command and disturbing torque over time.
 
     The nominal loop, and the members of the certificate that are worst in some quantity, are flown

@@ -37,25 +37,16 @@ _ORDER = (
 
 
 def write_report(
-    path: str | Path,
-    *,
-    fit: Fit,
-    frf: FrequencyResponse | Mapping[str, FrequencyResponse],
+    path: str | Path, *, fit: Fit, frf: FrequencyResponse | Mapping[str, FrequencyResponse],
     models: Mapping[str, Model] | None = None,
     others: Mapping[str, FrequencyResponse] | None = None,
-    record: Record | Mapping[str, Record] | None = None,
-    spectrum: Record | None = None,
-    filters: Sequence[KnownFilter] = (),
-    law: LawLoop | None = None,
+    record: Record | Mapping[str, Record] | None = None, spectrum: Record | None = None,
+    filters: Sequence[KnownFilter] = (), law: LawLoop | None = None,
     checks: Verification | Mapping[str, Verification] | None = None,
-    derived: Sequence[Combination] = (),
-    texts: Mapping[str, str] | None = None,
-    tuned: "Tuned | Certificate | None" = None,
-    flights: "Mapping[str, Simulation] | None" = None,
-    provenance: Provenance | None = None,
-    title: str = "",
-    formula: str = "",
-) -> Path:
+    derived: Sequence[Combination] = (), texts: Mapping[str, str] | None = None,
+    tuned: "Tuned | Certificate | None" = None, flights: "Mapping[str, Simulation] | None" = None,
+    provenance: Provenance | None = None, title: str = "", formula: str = "",
+) -> Path:  # fmt: skip
     """Write one self-contained HTML page on a fit, whole or not at all.
 
     The verdict and all remarks come first, then what the log can answer and what to fly next,

@@ -119,11 +119,9 @@ class Provenance(NamedTuple):
 
 
 def provenance(
-    *paths: str | Path,
-    command: str = "",
-    settings: Mapping[str, object] | None = None,
+    *paths: str | Path, command: str = "", settings: Mapping[str, object] | None = None,
     date: datetime | None = None,
-) -> Provenance:
+) -> Provenance:  # fmt: skip
     """Hash files, and note the installed versions and the time.
 
     **Arguments:**
