@@ -120,19 +120,16 @@ from .firmwares._betaflight import (
     FlownBetaflight as FlownBetaflight,
 )
 from .firmwares._betaflight_adrc import (
-    adrc_b0 as adrc_b0,
     adrc_parameters as adrc_parameters,
     b0_law as b0_law,
     betaflight_adrc_loop as betaflight_adrc_loop,
-    BetaflightADRC as BetaflightADRC,
+    Flown as Flown,
     FlownADRC as FlownADRC,
 )
 from .firmwares._betaflight_adrc_design import (
     ADRCProposal as ADRCProposal,
     ADRCStage as ADRCStage,
     ADRCTargets as ADRCTargets,
-    Flown as Flown,
-    gyro_filters as gyro_filters,
     propose_adrc as propose_adrc,
 )
 from .firmwares._betaflight_adrc_result import (
@@ -144,6 +141,8 @@ from .firmwares._betaflight_demo import (
     write_chirp_log as write_chirp_log,
 )
 from .firmwares._betaflight_law import (
+    adrc_b0 as adrc_b0,
+    BetaflightADRC as BetaflightADRC,
     BetaflightAngle as BetaflightAngle,
     BetaflightPID as BetaflightPID,
     DMax as DMax,
