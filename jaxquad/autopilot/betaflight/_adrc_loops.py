@@ -12,10 +12,10 @@ from jaxquad.identify import B0Schedule, draw_models, GainOverThrottle
 
 from .._filters import FilterChain, PT2
 from .._firmware import Parameter
+from .._law import law_responses
 from .._parameters import find_parameter
-from .._rate_design import Kind
-from .._rate_loops import cells_of, hold_plants, law_responses, LoopQualities, RateLoops
-from .._stages import beyond_limits
+from .._rate_loops import cells_of, hold_plants, LoopQualities, RateLoops
+from .._stages import beyond_limits, Kind
 from ._adrc import FlownADRC
 from ._header import FlownBetaflight
 

@@ -16,8 +16,8 @@ from jaxquad.identify import B0Law, B0Schedule, GainOverThrottle, ScaledB0, Unde
 from jaxquad.records import AXES
 
 from .._parameters import store_parameters
-from .._rate_design import Kind
 from .._rate_loops import LoopQualities
+from .._stages import Kind
 from ._adrc import FlownADRC
 from ._adrc_loops import (
     a_third,
