@@ -1,6 +1,6 @@
 """The interface of a firmware (law, parameters, channels, files), and the registry of all.
 
-A firmware is one file or folder: `px4/` is a short one, and CONTRIBUTING.md says how to add one.
+A firmware is one file: `firmwares/_px4.py` is a short one, and CONTRIBUTING.md says how to add one.
 """
 
 import abc
@@ -380,7 +380,7 @@ def firmware_named(name: str) -> Firmware:
     if name not in _FIRMWARES:
         if name not in firmware_names():
             raise ValueError(f"firmware is {name!r}: give one of {', '.join(firmware_names())}.")
-        _FIRMWARES[name] = importlib.import_module(f"{__package__}.{name}._firmware").FIRMWARE
+        _FIRMWARES[name] = importlib.import_module(f"{__package__}.firmwares._{name}").FIRMWARE
     return _FIRMWARES[name]
 
 

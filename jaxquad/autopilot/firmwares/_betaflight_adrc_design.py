@@ -1,47 +1,95 @@
 """From the gain over the throttle to the parameters of Betaflight's proposed ADRC.
 
-The observer's response is rational in exp(-j omega T) and b0 divides it, so that a design is a
-search over wc, wo and b0 on responses, as `_rate_gains` searches P, I and D.
+A design is a search over wc, wo and b0 on responses, as that of a PID is one over P, I and D.
 """
 
 import dataclasses
 import itertools
 from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
 from jaxquad._core import announce, plain_content
-from jaxquad.identify import B0Law, B0Schedule, GainOverThrottle, ScaledB0, UndeterminedError
+from jaxquad.identify import (
+    B0Law,
+    B0Schedule,
+    GainOverThrottle,
+    ScaledB0,
+    UndeterminedError,
+)
 from jaxquad.records import AXES
 
-from .._parameters import store_parameters
-from .._rate_loops import LoopQualities
-from .._stages import Kind
-from ._adrc import FlownADRC
-from ._adrc_loops import (
-    a_third,
+from .._parameters import find_parameter, store_parameters
+from .._rate_loops import LoopQualities, together
+from .._stages import beyond_limits, Kind
+from ._betaflight_adrc import (
+    adrc_loops,
     ADRCFrame,
-    ADRCLoop,
-    ADRCStage,
-    ADRCTargets,
-    beyond_targets,
+    ADRCLoops,
     Design,
     Designs,
     draw_at,
     Flown,
-    judge,
-    make_adrc_loop,
-    rows_of,
-    stages_of,
+    FlownADRC,
 )
 
 
 _LAW: B0Law = "SQRT"  # of the firmware by default
 _POINTS, _LEVELS, _ROUGH, _NARROWED = 5, 8, 5, 0.55  # the first levels on one plant each
 _RESERVE = 0.97  # of the limits, because fresh plants reach further than those that were tuned on
-_CERTIFICATES = 3
+_CERTIFICATES, _WORST = 3, 8
 _SPREAD = 4.0  # factor on b0 to either side
+_WORTH = 0.95  # of the flown effect of torque, above which other numbers are not worth a change
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ADRCTargets:
+    """What tuned ADRC parameters keep on every plant and at every throttle.
+
+    **Arguments:**
+
+    - `sensitivity`: greatest |S| at most.
+    - `resonance`: peak of the response from set-point to rate at most.
+    - `noise`: of the command, relative to what flew, of white noise before the gyro's filters.
+    - `change`: factor within which wc, wo and b0 stay of those that flew, where the ADRC flew.
+    """
+
+    sensitivity: float = 1.8
+    resonance: float = 1.4
+    noise: float = 1.5
+    change: float = 3.0
+
+    def __post_init__(self):
+        if not (self.sensitivity > 1 and self.resonance > 1 and self.noise > 0 and self.change > 1):
+            raise ValueError(
+                f"sensitivity {self.sensitivity:g}, resonance {self.resonance:g}, change "
+                f"{self.change:g} and noise {self.noise:g}: the first three must be above 1, the "
+                "last above 0"
+            )
+
+
+class ADRCStage(NamedTuple):
+    """What parameters give on fresh plants, over all throttles.
+
+    **Attributes:**
+
+    - `wc`, `wo`, `b0`: as the firmware stores them; nan of a PID that flew.
+    - `stable`: share of the loops; `peak`, `resonance`: the greatest of them.
+    - `crossover`: their median in rad/s.
+    - `rejection`, `noise`: relative to what flew, root mean square.
+    """
+
+    wc: float
+    wo: float
+    b0: float
+    stable: float
+    peak: float
+    resonance: float
+    crossover: float
+    rejection: float
+    noise: float
 
 
 @dataclasses.dataclass(frozen=True)
@@ -54,7 +102,7 @@ class ADRCProposal:
         parameters keep the targets.
     - `verdict`: the same in words.
     - `parameters`: of the firmware by name, empty where nothing is proposed.
-    - `schedule`: adrc_b0_law, adrc_hover_throttle and the limits of b0's scale.
+    - `frame`: what was not tuned.
     - `throttle`: at which the loops were certified.
     - `stages`: by name, what parameters give on fresh plants: "what flew", "proposed" and
         "defaults"; "a third of the way" where the ADRC flew.
@@ -65,7 +113,7 @@ class ADRCProposal:
     kind: Kind
     verdict: str
     parameters: Mapping[str, float]
-    schedule: B0Schedule
+    frame: ADRCFrame
     throttle: tuple[float, ...]
     stages: Mapping[str, ADRCStage]
     scaled: ScaledB0 | None = None
@@ -76,9 +124,9 @@ class ADRCProposal:
         return self.stages["proposed"]
 
     @property
-    def defaults(self) -> ADRCStage:
-        """Of the firmware's default wc, wo and b0."""
-        return self.stages["defaults"]
+    def schedule(self) -> B0Schedule:
+        """adrc_b0_law, adrc_hover_throttle and the limits of b0's scale."""
+        return self.frame.schedule
 
     @property
     def law(self) -> B0Law:
@@ -153,7 +201,7 @@ def propose_adrc(
 
     **Arguments:**
 
-    - `found`: of `jq.identify.gain_over_throttle`, with the filters of the gyro divided out.
+    - `plant`: of `jq.identify.gain_over_throttle`, with the filters of the gyro divided out.
     - `flown`: the loop of the log's header, `betaflight_loop` or `betaflight_adrc_loop`: its
         filters stay, and it is what noise and torque are compared with.
     - `axis`: "roll", "pitch" or "yaw".
@@ -184,33 +232,45 @@ def propose_adrc(
     """
     if axis not in AXES:
         raise ValueError(f"axis is {axis!r}: give one of {', '.join(AXES)}")
-    targets, one = targets or ADRCTargets(), plant.throttle.size == 1
+    targets, one, place = targets or ADRCTargets(), plant.throttle.size == 1, AXES.index(axis)
     grid = plant.throttle if one else np.linspace(plant.low.min(), plant.high.max(), bins)
-    frame, scaled, middle = _frame(plant, flown, hover)
-    make = lambda plants, seed: [
-        make_adrc_loop(plant, flown, AXES.index(axis), float(x), frame, plants, seed) for x in grid
+    frame, scaled, b0 = _frame(plant, flown, hover)
+    draw = lambda plants, seed: [
+        adrc_loops(plant, flown, place, float(x), frame, plants, seed) for x in grid
     ]
-    _require_gains(plant, grid, fresh, seed)
+    if min(float(draw_at(plant, float(x), fresh, seed)[0].min()) for x in grid) <= 0:
+        raise UndeterminedError(
+            "the log does not tell the gain from the command to the rate: 0 is within what it "
+            "leaves possible. Fly a chirp of the rate set-point, or stronger and quicker stick"
+        )
     edge = np.inf if plant.fit.origin is None else plant.fit.origin.band[1]
-    before, bounds = _flown_design(flown, axis), _bounds(flown, axis, middle, targets.change)
-    loops = make(max(1, members // len(grid)), seed)
-    attempt = 1
-    while True:
-        announce(f"searching wc, wo and b0 at {len(grid)} throttles")
-        best = _search(loops, bounds, targets, edge, before)
-        announce(f"certifying the whole numbers on {fresh} new plants")
-        new = make(fresh, seed + attempt)
-        stages = stages_of(new, axis, before, best)
-        if attempt == _CERTIFICATES or not beyond_targets(stages, targets, edge):
-            break
-        loops = [old.joined(fresh_loop, best) for old, fresh_loop in zip(loops, new, strict=True)]
-        attempt += 1
-    kind, verdict = judge(stages, targets, edge, fresh, grid)
-    values = _parameters(axis, best, frame) if kind == "proposed" else {}
-    stored = store_parameters("betaflight", values)
-    return ADRCProposal(
-        kind, verdict, stored, frame.schedule, tuple(map(float, grid)), stages, scaled
+    rows = [find_parameter("betaflight", f"adrc_{name}_{axis}") for name in ("wc", "wo", "b0")]
+    low, high, usual = (
+        np.array([getattr(row, name) for row in rows], float) for name in ("low", "high", "default")
     )
+    before = flown.design(place) if isinstance(flown, FlownADRC) else None
+    if before is not None:
+        ways = before / targets.change, before * targets.change
+        low, high = (np.clip(x, low, high) for x in ways)
+    else:
+        low[2], high[2] = np.clip([b0 / _SPREAD, b0 * _SPREAD], low[2], high[2])
+    loops = draw(max(1, members // len(grid)), seed)
+    for attempt in range(1, _CERTIFICATES + 1):
+        announce(f"searching wc, wo and b0 at {len(grid)} throttles")
+        best = _search(loops, (low, high), targets, edge, before)
+        announce(f"certifying the whole numbers on {fresh} new plants")
+        certified = draw(fresh, seed + attempt)
+        stages = _stages(certified, before, best, usual)
+        third = stages.get("a third of the way", stages["proposed"])
+        beyond = beyond_limits(stages["what flew"], third, stages["proposed"], targets, edge)
+        if not beyond:
+            break
+        worst = (x.worst(best[None], _WORST) for x in certified)
+        loops = [old.joined(new) for old, new in zip(loops, worst, strict=True)]
+    kind, verdict = _judge(stages, beyond, targets, fresh, grid)
+    values = {row.name: float(x) for row, x in zip(rows, best, strict=True)} | frame.parameters()
+    stored = store_parameters("betaflight", values if kind == "proposed" else {})
+    return ADRCProposal(kind, verdict, stored, frame, tuple(map(float, grid)), stages, scaled)
 
 
 def _frame(
@@ -220,79 +280,85 @@ def _frame(
     if hover is not None and not 0 < hover <= 1:
         raise ValueError(f"hover is {hover}: give the throttle at hover, above 0 and up to 1")
     if isinstance(flown, FlownADRC):
-        schedule = flown.schedule
-        if hover is not None and abs(hover - schedule.hover) > 0.005:
+        frame, flew = flown.frame, flown.schedule.hover
+        if hover is not None and abs(hover - flew) > 0.005:
             raise ValueError(
                 f"hover is {hover:g}, but the ADRC that flew has an adrc_hover_throttle of "
-                f"{100 * schedule.hover:.0f} %, which stays: leave hover out"
+                f"{100 * flew:.0f} %, which stays: leave hover out"
             )
-        law = flown.law
-        frame = ADRCFrame(
-            schedule, flown.lowpass_hz, float(law.setpoint_lowpass_hz), float(law.forgetting)
-        )
     else:
         lowest = float(plant.throttle[0]) if hover is None else hover
         frame = ADRCFrame(B0Schedule(_LAW, max(0.05, round(lowest, 2))))
-    at = frame.schedule.hover
+    schedule = frame.schedule
     if plant.throttle.size == 1:
         degrees = 1.0 if plant.output_unit == "deg/s" else 180 / np.pi
-        scale = float(frame.schedule.scale(plant.throttle[0]))
+        scale = float(schedule.scale(plant.throttle[0]))
         return frame, None, degrees * plant.b0(0).value / scale
-    scaled = plant.adrc_b0(at, largest=frame.schedule.high)
+    scaled = plant.adrc_b0(schedule.hover, largest=schedule.high)
     if not isinstance(flown, FlownADRC):
-        frame = frame._replace(schedule=frame.schedule._replace(law=scaled.law))
+        frame = frame._replace(schedule=schedule._replace(law=scaled.law))
     return frame, scaled, scaled.b0.value
 
 
-def _require_gains(plant: GainOverThrottle, grid: np.ndarray, plants: int, seed: int) -> None:
-    """Raise UndeterminedError where the log leaves gains of 0 or below possible."""
-    drawn = [draw_at(plant, float(x), plants, seed)[0] for x in grid]
-    if min(float(gains.min()) for gains in drawn) <= 0:
-        raise UndeterminedError(
-            "the log does not tell the gain from the command to the rate: 0 is within what it "
-            "leaves possible. Fly a chirp of the rate set-point, or stronger and quicker stick"
-        )
+def _third(before: Design, designs: Designs) -> Designs:
+    return before + 1 / 3 * (designs - before)
 
 
-def _flown_design(flown: Flown, axis: str) -> Design | None:
-    """wc, wo and b0 that flew; None of a PID."""
-    if not isinstance(flown, FlownADRC):
-        return None
-    law, k = flown.law, AXES.index(axis)
-    return np.array([float(np.broadcast_to(x, (3,))[k]) for x in (law.wc, law.wo, law.b0)])
+def _stages(
+    loops: Sequence[ADRCLoops], before: Design | None, best: Design, usual: Design
+) -> dict[str, ADRCStage]:
+    """What flew, a third of the way where that has a meaning, the proposal, and the defaults."""
+    flown = together([loop.flown() for loop in loops])
+    rms = lambda ratio: float(np.sqrt(np.mean(ratio**2)))
 
+    def stage(design: Design, x: LoopQualities) -> ADRCStage:
+        return ADRCStage(
+            *map(float, design), float(np.mean(x.stable)), float(np.max(x.peak)),
+            float(np.max(x.resonance)), float(np.median(x.crossover)),
+            rms(x.rejection / flown.rejection), rms(x.noise / flown.noise),
+        )  # fmt: skip
 
-def _bounds(flown: Flown, axis: str, b0: float, change: float) -> tuple[Design, Design]:
-    """Least and most of wc, wo and b0."""
-    rows = rows_of(axis)
-    low = np.array([row.low for row in rows], float)
-    high = np.array([row.high for row in rows], float)
-    before = _flown_design(flown, axis)
+    of = lambda design: stage(design, together([loop.qualities(design[None]) for loop in loops]))
+    stages = {"what flew": stage(np.full(3, np.nan) if before is None else before, flown)}
     if before is not None:
-        return np.clip(before / change, low, high), np.clip(before * change, low, high)
-    low[2], high[2] = np.clip([b0 / _SPREAD, b0 * _SPREAD], low[2], high[2])
-    return low, high
+        stages["a third of the way"] = of(np.rint(_third(before, best)))
+    return stages | {"proposed": of(best), "defaults": of(usual)}
 
 
-def _parameters(axis: str, design: Design, frame: ADRCFrame) -> dict[str, float]:
-    """What the firmware has to hold for the loops that were certified."""
-    values = {row.name: float(x) for row, x in zip(rows_of(axis), design, strict=True)}
-    return values | {
-        "adrc_gyro_lpf_hz": frame.lowpass_hz,
-        "adrc_td_hz": frame.setpoint_hz,
-        "adrc_hover_throttle": 100 * frame.schedule.hover,
-        "adrc_sigma_decay": 10 * frame.forgetting,
-    }
+def _judge(
+    stages: Mapping[str, ADRCStage], beyond: Sequence[str], targets: ADRCTargets, fresh: int,
+    grid: np.ndarray,
+) -> tuple[Kind, str]:  # fmt: skip
+    """The verdict, in words too."""
+    if beyond:
+        return "not to be flown", (
+            f"no parameters are proposed: {'; '.join(beyond)}. Allow more (`sensitivity`, "
+            "`resonance`, `noise`), or fly more excitation"
+        )
+    flown, best = stages["what flew"], stages["proposed"]
+    better = f"{best.rejection:.2f} of the effect of torque with what flew"
+    within = flown.peak <= targets.sensitivity and flown.resonance <= targets.resonance
+    if not np.isnan(flown.wc) and flown.stable == 1 and within and best.rejection > _WORTH:
+        return "kept", (
+            f"what flew is kept: within the limits the best parameters leave {better}. Its worst "
+            f"Ms on {fresh} fresh plants is {flown.peak:.2f}"
+        )
+    where = f"from {grid[0]:.2f} to {grid[-1]:.2f}" if len(grid) > 1 else f"at {grid[0]:.2f}"
+    return "proposed", (
+        f"proposed: stable on all {fresh} fresh plants {where} throttle, worst Ms {best.peak:.2f} "
+        f"of at most {targets.sensitivity:g}, {better}"
+    )
 
 
 def _search(
-    loops: Sequence[ADRCLoop], bounds: tuple[Design, Design], targets: ADRCTargets, edge: float,
+    loops: Sequence[ADRCLoops], bounds: tuple[Design, Design], targets: ADRCTargets, edge: float,
     before: Design | None,
 ) -> Design:  # fmt: skip
     """The whole numbers with the least effect of torque; where none keep the targets: nearest."""
     low, high = bounds
     score = _Score(loops, targets, edge, before)
-    rough = _Score([loop.first() for loop in loops], targets, edge, before)
+    first = [dataclasses.replace(loop, plants=loop.plants[:1]) for loop in loops]
+    rough = _Score(first, targets, edge, before)
     middle, half = np.log(low * high) / 2, np.log(high / low) / 2
     for level in range(_LEVELS):
         axes = [
@@ -312,7 +378,7 @@ class _Score:
     """The effect of torque; designs beyond a target come after all that keep them."""
 
     def __init__(
-        self, loops: Sequence[ADRCLoop], targets: ADRCTargets, edge: float, before: Design | None
+        self, loops: Sequence[ADRCLoops], targets: ADRCTargets, edge: float, before: Design | None
     ):
         self.loops, self.targets, self.edge, self.before = loops, targets, edge, before
         self.flown = [loop.flown() for loop in loops]
@@ -323,29 +389,20 @@ class _Score:
 
     def _of(self, designs: Designs) -> Float[np.ndarray, " designs"]:
         worst, rejected = designs[:, 0] / designs[:, 1], np.zeros(len(designs))  # wc at most wo
-        targets = self.targets
+        targets, limit = self.targets, _RESERVE * self.targets.sensitivity
+        last = lambda x, beyond: np.where(np.all(x.stable, axis=1), beyond, 1e6 * beyond)
         for loop, flown in zip(self.loops, self.flown, strict=True):
-            qualities = loop.qualities(designs)
+            x = loop.qualities(designs)
             beyond = np.stack([
-                np.max(qualities.peak, axis=1) / (_RESERVE * targets.sensitivity),
-                np.max(qualities.resonance, axis=1) / (_RESERVE * targets.resonance),
-                np.mean(qualities.noise / flown.noise, axis=1) / (_RESERVE * targets.noise),
-                np.max(qualities.crossover, axis=1) / self.edge,
-            ]).max(axis=0)  # fmt: skip
-            worst = np.maximum(
-                worst, np.where(np.all(qualities.stable, axis=1), beyond, 1e6 * beyond)
-            )
-            worst = np.maximum(worst, self._on_the_way(loop, flown, designs))
-            rejected += np.mean((qualities.rejection / flown.rejection) ** 2, axis=1)
+                np.max(x.peak, axis=1) / limit,
+                np.max(x.resonance, axis=1) / (_RESERVE * targets.resonance),
+                np.mean(x.noise / flown.noise, axis=1) / (_RESERVE * targets.noise),
+                np.max(x.crossover, axis=1) / self.edge,
+            ])  # fmt: skip
+            worst = np.maximum(worst, last(x, beyond.max(axis=0)))
+            if self.before is not None:  # Ms a third of the way, or that of what flew
+                third = loop.qualities(_third(self.before, designs))
+                allowed = max(limit, float(np.max(flown.peak)))
+                worst = np.maximum(worst, last(third, np.max(third.peak, axis=1) / allowed))
+            rejected += np.mean((x.rejection / flown.rejection) ** 2, axis=1)
         return np.where(worst <= 1, np.sqrt(rejected / len(self.loops)), 1e9 * worst)
-
-    def _on_the_way(
-        self, loop: ADRCLoop, flown: LoopQualities, designs: Designs
-    ) -> Float[np.ndarray, " designs"]:
-        """Ms a third of the way, over the greatest that is allowed there."""
-        if self.before is None:
-            return np.zeros(len(designs))
-        qualities = loop.qualities(a_third(self.before, designs))
-        allowed = max(_RESERVE * self.targets.sensitivity, float(np.max(flown.peak)))
-        beyond = np.max(qualities.peak, axis=1) / allowed
-        return np.where(np.all(qualities.stable, axis=1), beyond, 1e6 * beyond)
