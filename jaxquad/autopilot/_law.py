@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, ArrayLike, Float, PyTree
+from jaxtyping import Array, ArrayLike, Complex, Float, PyTree
 
 from jaxquad._core import (
     as_messages,
@@ -370,3 +370,16 @@ def low_pass_share(cutoff_hz: Array, dt: float, like: Signal) -> Array:
     on = cutoff_hz > 0
     w = 2 * np.pi * dt * jnp.where(on, cutoff_hz, 1.0)
     return broadcast_gain(jnp.where(on, w / (w + 1), 1.0), like)
+
+
+def law_responses(
+    law: RateLoop, axis: int, omega: Float[np.ndarray, " frequencies"]
+) -> Complex[np.ndarray, "2 frequencies"]:
+    """From the set-point and from the rate, both in rad/s, to the command."""
+    linear = law.linear(axis)
+    A, c = np.asarray(linear.A), np.asarray(linear.C)
+    into = np.stack([linear.reference_in, linear.measurement_in], axis=1)
+    through = np.array([linear.reference_through, linear.measurement_through])
+    z = np.exp(1j * omega * linear.dt)[:, None, None]
+    inner = np.linalg.solve(z * np.eye(len(A)) - A, np.broadcast_to(into, (len(z), *into.shape)))
+    return (c @ inner + through).T

@@ -23,9 +23,9 @@ from jaxquad.identify import (
 from jaxquad.records import AXES
 
 from .._filters import FilterChain, PT2
-from .._law import FlownLoop
+from .._law import FlownLoop, law_responses
 from .._parameters import list_parameters
-from .._rate_loops import cells_of, hold_plants, law_responses, LoopQualities, RateLoops
+from .._rate_loops import cells_of, hold_plants, LoopQualities, RateLoops
 from ._betaflight import betaflight_loop, flies_adrc, FlownBetaflight
 from ._betaflight_law import BetaflightADRC
 

@@ -22,9 +22,8 @@ from jaxquad.identify import (
 from jaxquad.records import AXES
 
 from .._parameters import find_parameter, store_parameters
-from .._rate_design import Kind
 from .._rate_loops import LoopQualities, together
-from .._stages import beyond_limits
+from .._stages import beyond_limits, Kind
 from ._betaflight_adrc import (
     adrc_loops,
     ADRCFrame,

@@ -16,12 +16,21 @@ from jaxquad.report import Headline, Provenance, provenance, Table, write_json
 from .._files import change_table, parameter_file, ParameterChange, propose_changes, WordChange
 from .._filters import FilterChain, PT2
 from .._flight_channels import FlightChannels
-from .._identified import DesignSettings
-from .._page import B0Section, Chains, PilotPage, write_pilot_page
+from .._page import (
+    B0Section,
+    Chains,
+    chains_of,
+    change_rows,
+    logged_terms,
+    motor_rows,
+    PilotPage,
+    VERDICTS,
+    write_pilot_page,
+)
 from .._parameters import find_parameter
-from .._pilot_page import chains_of, change_rows, logged_terms, motor_rows, StepGrid, VERDICTS
-from .._rate_design import Kind
+from .._rate_loops import StepGrid
 from .._reproduce_flight import Reproduction
+from .._stages import DesignSettings, Kind
 from ._betaflight_adrc import adrc_loops, adrc_parameters, b0_law, Flown, FlownADRC
 from ._betaflight_adrc_design import ADRCProposal
 
