@@ -8,8 +8,8 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 from jaxtyping import Complex, Float, Int
 
+from ._fourier_sums import coefficients
 from ._leakage import Rest
-from ._windows import leaked_power
 
 
 Grid = Float[np.ndarray, " frequencies"]
@@ -23,6 +23,7 @@ _BANDWIDTH = 0.2  # of the smoothing, in ln(omega)
 _WIDE = 2.0  # that of the correlations between outputs in open loop
 _UNLIKELY = 1e-4  # chance at which a residual counts as a misfit, or a line in the noise
 _FLOOR = 1e-26  # of the output's power: below it lies rounding
+_NEAR = 1e-2  # of a pole: its neighbourhood's rounding is below 1e-13
 _FEW = 256  # frequencies, of which a square takes half a megabyte
 
 
@@ -225,6 +226,21 @@ def covariance_of_windows(
 
 @ft.lru_cache(maxsize=12)
 def _shared_power(shape: str, length: int, angle: tuple[float, ...]) -> Square:
-    """What windows of this length have in common at two frequencies, in rad per sample."""
+    """Squared correlation of white noise behind windows of this length at two frequencies (rad)."""
     places = np.array(angle)
-    return leaked_power(shape, length, places[:, None] - places)
+    level, cosine = coefficients(shape)
+    cycles = (places[:, None] - places) * length / (2 * np.pi)
+    terms = level**2 + cosine**2 / 2, level * cosine, cosine**2 / 4  # of the squared window
+    # sinc(c - k) + sinc(c + k) for k = 0, 1, 2 have one sine in common, but poles at whole cycles.
+    square = cycles**2
+    poles = square * (square - 1) * (square - 4)
+    near = np.abs(poles) < _NEAR
+    poles = np.where(near, 1.0, poles)
+    ratio = terms[0] * (square - 1) * (square - 4)
+    ratio += 2 * square * (terms[2] * (square - 1) - terms[1] * (square - 4))
+    correlation = np.sin(np.pi * cycles) * cycles * ratio / (np.pi * poles)
+    close = cycles[near]
+    correlation[near] = terms[0] * np.sinc(close)
+    for k in (1, 2):
+        correlation[near] += terms[k] * (np.sinc(close - k) + np.sinc(close + k))
+    return (correlation / terms[0]) ** 2

@@ -19,13 +19,19 @@ from ._checks import check_band, check_compatible, check_excitation, in_hertz
 from ._error_covariance import ErrorCovariance, place_windows, window_products
 from ._estimators import Composite, Welch
 from ._feedback import remarks_on_feedback
-from ._fourier_sums import fourier_sums, Taper
+from ._fourier_sums import (
+    coefficients,
+    fourier_sums,
+    lattice_windows,
+    Layout,
+    segment_starts,
+    Taper,
+)
 from ._frequency_response import FrequencyResponse
 from ._leakage import cross_products, shows_leakage, Slopes
 from ._linearity import remarks_on_linearity
 from ._noise import covariance_of_windows, smoothed
 from ._remarks import Remark, Remarks
-from ._windows import coefficients, lattice_windows, Layout, segment_starts
 
 
 _ROUNDING = 1e-14  # of a Fourier sum, relative to the largest value summed
