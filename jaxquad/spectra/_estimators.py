@@ -260,3 +260,6 @@ class JointInputOutput(eqx.Module):
     """
 
     spectra: Welch | Composite | LocalPolynomial | Periodic = LocalPolynomial()
+
+
+Estimator = Welch | Composite | LocalPolynomial | Periodic | JointInputOutput
