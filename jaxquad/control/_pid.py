@@ -403,10 +403,7 @@ class PD(eqx.Module):
         return PDState(zero, zero, jnp.zeros((), like.dtype))
 
     def step(
-        self,
-        state: PDState,
-        reference: Reference,
-        measurement: Float[Array, " axes *ensemble"],
+        self, state: PDState, reference: Reference, measurement: Float[Array, " axes *ensemble"]
     ) -> tuple[PDState, Float[Array, " axes *ensemble"]]:
         """One sample: the command to hold until the next one.
 

@@ -16,7 +16,4 @@ from ._paper import (
     observe_disturbance as observe_disturbance,
     paper_inertia as paper_inertia,
 )
-from ._regression import (
-    RecursiveInertia as RecursiveInertia,
-    WindowedInertia as WindowedInertia,
-)
+from ._regression import RecursiveInertia as RecursiveInertia, WindowedInertia as WindowedInertia

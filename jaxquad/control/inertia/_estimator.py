@@ -197,9 +197,7 @@ class MatchedFilters(eqx.Module):
         return FilterState(past, tuple(stages)), out
 
 
-def has_settled(
-    terms: Float[Array, " signals axes *ensemble"],
-) -> Float[Array, " axes *ensemble"]:
+def has_settled(terms: Float[Array, " signals axes *ensemble"]) -> Float[Array, " axes *ensemble"]:
     """1 once the filter has forgotten its start, 0 before.
 
     The first difference of a counted angle is wrong by up to a count per sample interval, which
