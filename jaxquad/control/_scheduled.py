@@ -23,7 +23,15 @@ from jaxquad._core import (
 
 from ._ladrc import LADRC, LADRCLaw, LADRCState
 from ._pid import PID
-from ._protocols import InertiaEstimator, ProbingEstimator, Reference, Transform, Tunable
+from ._protocols import (
+    Gain,
+    InertiaEstimator,
+    ProbingEstimator,
+    Reference,
+    Signal,
+    Transform,
+    Tunable,
+)
 
 
 InertiaToGain = Callable[[Array], Array]  # kg m^2 to b0 in rad/s^2 per unit of command
@@ -148,9 +156,7 @@ def gain_at(map: InertiaToGain, inertia: Float[ArrayLike, "..."]) -> Array:
 
 
 @ft.partial(Jit, options=hasty_options)  # a tune evaluates it for each ensemble that it draws
-def _evaluate_map(
-    map: InertiaToGain, inertia: Float[Array, "..."], shape: tuple[int, ...]
-) -> Array:
+def _evaluate_map(map: InertiaToGain, inertia: Gain, shape: tuple[int, ...]) -> Array:
     return map(jnp.broadcast_to(inertia, shape))
 
 
@@ -239,7 +245,7 @@ class AdaptiveLADRC(eqx.Module):
         return ensemble_shape(self)
 
     @property
-    def limit(self) -> Float[Array, "..."]:
+    def limit(self) -> Gain:
         """Of the command, either sign: that of the `ladrc`."""
         return self.ladrc.limit
 
@@ -285,21 +291,14 @@ class AdaptiveLADRC(eqx.Module):
             return jnp.zeros(())
         return self.ladrc.observer_barrier(names_within("ladrc", free))
 
-    def init(
-        self,
-        like: Float[Array, " axes *ensemble"],
-        measurement: Float[Array, " axes *ensemble"] | None = None,
-    ) -> AdaptiveLADRCState:
+    def init(self, like: Signal, measurement: Signal | None = None) -> AdaptiveLADRCState:
         """At rest at angle 0, or at `measurement` in rad; shaped as `like` and the ensemble."""
         full = jnp.zeros(signal_shape(like, self.ensemble), like.dtype)
         return AdaptiveLADRCState(self.ladrc.init(full, measurement), self.estimator.init(full))
 
     def step(
-        self,
-        state: AdaptiveLADRCState,
-        reference: Reference,
-        measurement: Float[Array, " axes *ensemble"],
-    ) -> tuple[AdaptiveLADRCState, Float[Array, " axes *ensemble"]]:
+        self, state: AdaptiveLADRCState, reference: Reference, measurement: Signal
+    ) -> tuple[AdaptiveLADRCState, Signal]:
         """One sample: the command to hold until the next one, with the test signal in it."""
         memory = self.estimator.update(state.estimator, state.ladrc.command, measurement)
         b0 = self._adapt(state.ladrc.b0, memory)
@@ -310,17 +309,13 @@ class AdaptiveLADRC(eqx.Module):
             ladrc = self.ladrc.applied(ladrc, command)
         return AdaptiveLADRCState(ladrc, memory), command
 
-    def _adapt(
-        self, b0: Float[Array, " axes *ensemble"], memory: PyTree
-    ) -> Float[Array, " axes *ensemble"]:
+    def _adapt(self, b0: Signal, memory: PyTree) -> Signal:
         estimate = self.estimator.estimate(memory)
         share = estimate.trusted * -math.expm1(-self.dt / self.settling)
         inertia = jnp.where(estimate.trusted > 0, estimate.inertia, jnp.ones_like(estimate.inertia))
         return b0 + share * (self.map(inertia) - b0)
 
-    def applied(
-        self, state: AdaptiveLADRCState, achieved: Float[Array, " axes *ensemble"]
-    ) -> AdaptiveLADRCState:
+    def applied(self, state: AdaptiveLADRCState, achieved: Signal) -> AdaptiveLADRCState:
         """What the drive really gave since the last `step`, for ladrc and estimator."""
         return state._replace(ladrc=self.ladrc.applied(state.ladrc, achieved))
 

@@ -9,14 +9,15 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxquad._core import require_all_positive, signal_shape
 
+from .._protocols import Signal
 from ._estimator import AbstractInertia, empty_past, LastEstimate, motion, Past, ProbeTones
 
 
 class LockInSolution(NamedTuple):
-    inertia: Float[Array, " axes *ensemble"]  # kg m^2
-    variance: Float[Array, " axes *ensemble"]  # (kg m^2)^2
-    stiffness: Float[Array, " axes *ensemble"]  # N m/rad
-    informed: Float[Array, " axes *ensemble"]  # 1 where enough tones stand out
+    inertia: Signal  # kg m^2
+    variance: Signal  # (kg m^2)^2
+    stiffness: Signal  # N m/rad
+    informed: Signal  # 1 where enough tones stand out
 
 
 class _Tones(NamedTuple):
@@ -146,22 +147,19 @@ class LockInWindows(eqx.Module):
         """Of the tones in cycles."""
         return _cycles(self.periods, index, self.samples)
 
-    def square(self, signal: Float[Array, " axes *ensemble"]) -> Float[Array, " tones *ones"]:
+    def square(self, signal: Signal) -> Float[Array, " tones *ones"]:
         """w^2 in (rad/s)^2, as the second difference of a sampled sine shows it."""
         w = 2 / self.dt * np.sin(np.pi * self.periods / self.samples)
         return jnp.asarray(w**2, signal.dtype).reshape((-1,) + (1,) * signal.ndim)
 
-    def init(self, like: Float[Array, " axes *ensemble"]) -> WindowSums:
+    def init(self, like: Signal) -> WindowSums:
         lines = 3 * len(self.frequencies)
         correlations = jnp.zeros((2, 2, lines, 2, *like.shape), like.dtype)
         valid = jnp.zeros((2, *like.shape), like.dtype)
         return WindowSums(correlations, valid, jnp.zeros((), jnp.int32))
 
     def add(
-        self,
-        sums: WindowSums,
-        signals: Float[Array, " signals axes *ensemble"],
-        counts: Float[Array, " axes *ensemble"],
+        self, sums: WindowSums, signals: Float[Array, " signals axes *ensemble"], counts: Signal
     ) -> WindowSums:
         """One more sample, `counts` 0 where its window is not to count."""
         place = self._place(sums.index)
@@ -211,8 +209,8 @@ class LockInState(NamedTuple):
     past: Past
     sums: WindowSums
     last: LastEstimate
-    stiffness: Float[Array, " axes *ensemble"]  # N m/rad
-    exciting: Float[Array, " axes *ensemble"]  # 1 while the tones are on
+    stiffness: Signal  # N m/rad
+    exciting: Signal  # 1 while the tones are on
 
 
 class LockInInertia(AbstractInertia):
@@ -268,18 +266,13 @@ class LockInInertia(AbstractInertia):
     def _windows(self) -> LockInWindows:
         return LockInWindows(self.tones.frequencies, self.window, self.dt)
 
-    def init(self, like: Float[Array, " axes *ensemble"]) -> LockInState:
+    def init(self, like: Signal) -> LockInState:
         """Before the first sample; shaped as the measurement `like` and as the ensemble."""
         like = zero = jnp.zeros(signal_shape(like, self.ensemble), like.dtype)
         sums = self._windows().init(like)
         return LockInState(empty_past(like), sums, self._start(like), zero, zero + 1)
 
-    def update(
-        self,
-        state: LockInState,
-        command: Float[Array, " axes *ensemble"],
-        measurement: Float[Array, " axes *ensemble"],
-    ) -> LockInState:
+    def update(self, state: LockInState, command: Signal, measurement: Signal) -> LockInState:
         """Add the command held during the last sample and the angle at its end."""
         past, now = motion(state.past, self.torque_gain, command, measurement, self.dt)
         windows = self._windows()
@@ -306,11 +299,11 @@ class LockInInertia(AbstractInertia):
         renew = ft.partial(jnp.where, (valid > 0) & (solved.informed > 0))
         return jax.tree.map(renew, (new, solved.stiffness), (last, stiffness))
 
-    def stiffness(self, state: LockInState) -> Float[Array, " axes *ensemble"]:
+    def stiffness(self, state: LockInState) -> Signal:
         """In N m/rad beside the inertia; 0 unless the nuisance is "angle"."""
         return state.stiffness
 
-    def probe(self, state: LockInState) -> Float[Array, " axes *ensemble"]:
+    def probe(self, state: LockInState) -> Signal:
         """The test signal to add to the next command."""
         phase = self._windows().phase(state.sums.index).astype(state.exciting.dtype)
         return self.tones.wave(phase, state.exciting)

@@ -17,7 +17,7 @@ from jaxquad._core import (
     require_positive,
 )
 
-from .._protocols import Transform
+from .._protocols import Gain, Signal, Transform
 
 
 class FuzzyMap(eqx.Module):
@@ -41,8 +41,8 @@ class FuzzyMap(eqx.Module):
     - `ValueError`: the centres do not rise, or an increment leaves no b0 above 0.
     """
 
-    nominal: Float[Array, "..."] = per_member(rank=1, converter=as_float)  # kg m^2
-    b0: Float[Array, "..."] = per_member(rank=1, converter=as_float)  # rad/s^2 per unit of command
+    nominal: Gain = per_member(rank=1, converter=as_float)  # kg m^2
+    b0: Gain = per_member(rank=1, converter=as_float)  # rad/s^2 per unit of command
     centres: Float[Array, " sets"] = eqx.field(converter=as_float)  # of delta
     increments: Float[Array, " sets"] = eqx.field(converter=as_float)  # of b0
 
@@ -67,9 +67,7 @@ class FuzzyMap(eqx.Module):
         """The trailing shape of the map, () for one controller."""
         return ensemble_shape({"nominal": self.nominal, "b0": self.b0}, rank=1)
 
-    def memberships(
-        self, delta: Float[Array, " axes *ensemble"]
-    ) -> Float[Array, " sets axes *ensemble"]:
+    def memberships(self, delta: Signal) -> Float[Array, " sets axes *ensemble"]:
         """Of each set, from 0 to 1."""
         centres = self.centres.astype(delta.dtype)
         inside = jnp.clip(delta, centres[0], centres[-1])
@@ -81,7 +79,7 @@ class FuzzyMap(eqx.Module):
             [jnp.clip(jnp.minimum(a, b), 0, 1) for a, b in zip(rise, fall, strict=True)]
         )
 
-    def __call__(self, inertia: Float[Array, " axes *ensemble"]) -> Float[Array, " axes *ensemble"]:
+    def __call__(self, inertia: Signal) -> Signal:
         """b0 in rad/s^2 per unit of command at an `inertia` in kg m^2."""
         require_common_shape({"inertia": inertia, "nominal": self.nominal, "b0": self.b0})
         delta = inertia / broadcast_gain(self.nominal, inertia)
@@ -95,7 +93,7 @@ class FuzzyMap(eqx.Module):
         return {"b0": None}
 
 
-def printed_map(nominal: Float[Array, "..."] | float, *, b0: float = 3.0) -> FuzzyMap:
+def printed_map(nominal: Gain | float, *, b0: float = 3.0) -> FuzzyMap:
     """The map with the ranges that the paper prints, to show what they do; not for use.
 
     Eight sets over 1 < delta < 22 and 0 <= db0 <= 24 can only raise b0, while the paper's own b0
@@ -145,7 +143,7 @@ class InertiaMap(eqx.Module):
     - `ValueError`: the knots do not rise, or the shapes do not fit.
     """
 
-    nominal: Float[Array, "..."] = per_member(rank=1, converter=as_float)  # kg m^2; axes *ensemble
+    nominal: Gain = per_member(rank=1, converter=as_float)  # kg m^2; axes *ensemble
     knots: Float[Array, " knots"] = eqx.field(converter=as_float)  # ln(J / nominal)
     values: Float[Array, " knots ..."] = per_member(
         rank=2, converter=as_float
@@ -169,7 +167,7 @@ class InertiaMap(eqx.Module):
         """The trailing shape of the map, () for one controller."""
         return ensemble_shape({"nominal": self.nominal, "values": self.values[0]}, rank=1)
 
-    def __call__(self, inertia: Float[Array, " axes *ensemble"]) -> Float[Array, " axes *ensemble"]:
+    def __call__(self, inertia: Signal) -> Signal:
         """b0 in rad/s^2 per unit of command at an `inertia` in kg m^2."""
         require_common_shape(
             {"inertia": inertia, "nominal": self.nominal, "values": self.values[0]}
@@ -189,10 +187,8 @@ class InertiaMap(eqx.Module):
 
 
 def interpolate(
-    x: Float[Array, " axes *ensemble"],
-    knots: Float[Array, " knots"],
-    values: Float[Array, " knots ..."],
-) -> Float[Array, " axes *ensemble"]:
+    x: Signal, knots: Float[Array, " knots"], values: Float[Array, " knots ..."]
+) -> Signal:
     """Straight between the knots and constant beyond, without a search: a sum of clipped ramps."""
     knots = knots.astype(x.dtype)
     rows = [broadcast_gain(row, x) for row in values]
@@ -244,8 +240,6 @@ def certainty_equivalence(
 
 
 @eqx.filter_jit  # as one program
-def _log_gain(
-    torque_gain: Float[Array, "..."], nominal: Float[Array, "..."], factor: Float[Array, ""]
-) -> Float[Array, "..."]:
+def _log_gain(torque_gain: Gain, nominal: Gain, factor: Float[Array, ""]) -> Gain:
     """ln b0 at the nominal inertia."""
     return jnp.log(factor * multiply_gains(torque_gain, 1 / nominal))

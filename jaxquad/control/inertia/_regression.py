@@ -11,6 +11,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxquad._core import as_float, require_all_positive, signal_shape
 
+from .._protocols import Signal
 from ._estimator import (
     AbstractInertia,
     FilterState,
@@ -30,20 +31,20 @@ class Sums(NamedTuple):
     """Weighted sums over the samples: products of the terms, and the scatter of the score."""
 
     products: Float[Array, " signals signals axes *ensemble"]
-    recent: Float[Array, " axes *ensemble"]  # scores of the last moment
-    scatter: Float[Array, " axes *ensemble"]  # long-run variance of the sum of scores
+    recent: Signal  # scores of the last moment
+    scatter: Signal  # long-run variance of the sum of scores
 
 
 class Solution(NamedTuple):
     """A regression solved for the inertia alone."""
 
-    inertia: Float[Array, " axes *ensemble"]  # kg m^2
-    variance: Float[Array, " axes *ensemble"]  # (kg m^2)^2
-    weight: Float[Array, " axes *ensemble"]  # samples that count
-    informed: Float[Array, " axes *ensemble"]  # 1 where the acceleration stands out
+    inertia: Signal  # kg m^2
+    variance: Signal  # (kg m^2)^2
+    weight: Signal  # samples that count
+    informed: Signal  # 1 where the acceleration stands out
 
 
-def empty_sums(signals: int, like: Float[Array, " axes *ensemble"]) -> Sums:
+def empty_sums(signals: int, like: Signal) -> Sums:
     zero = jnp.zeros_like(like)
     return Sums(jnp.zeros((signals, signals, *like.shape), like.dtype), zero, zero)
 
@@ -51,12 +52,12 @@ def empty_sums(signals: int, like: Float[Array, " axes *ensemble"]) -> Sums:
 def add_sample(
     sums: Sums,
     terms: Float[Array, " signals axes *ensemble"],
-    keep: Float[Array, " axes *ensemble"],
+    keep: Signal,
     *,
     nuisance: tuple[str, ...],
     excitation: float,
     forget: float,
-    previous: Float[Array, " axes *ensemble"],
+    previous: Signal,
 ) -> tuple[Sums, Solution]:
     """The sums after one more sample, old ones weighted by `keep`, and what they say.
 
@@ -147,7 +148,7 @@ class AbstractRegression(AbstractInertia):
         self,
         sums: Sums,
         terms: Float[Array, " signals axes *ensemble"],
-        keep: Float[Array, " axes *ensemble"],
+        keep: Signal,
         last: LastEstimate,
     ) -> tuple[Sums, Solution]:
         return add_sample(
@@ -155,7 +156,7 @@ class AbstractRegression(AbstractInertia):
             forget=min(1.0, self.dt / self.correlation), previous=last.inertia,
         )  # fmt: skip
 
-    def probe(self, state: "WindowedState | RecursiveState") -> Float[Array, " axes *ensemble"]:
+    def probe(self, state: "WindowedState | RecursiveState") -> Signal:
         """The test signal to add to the next command."""
         return self.tones.signal(state.probe, self.dt)
 
@@ -217,7 +218,7 @@ class WindowedInertia(AbstractRegression):
     def samples(self) -> int:
         return round(self.window / self.dt)
 
-    def init(self, like: Float[Array, " axes *ensemble"]) -> WindowedState:
+    def init(self, like: Signal) -> WindowedState:
         """Before the first sample; shaped as the measurement `like` and as the ensemble."""
         like = jnp.zeros(signal_shape(like, self.ensemble), like.dtype)
         filters = self._filters()
@@ -226,12 +227,7 @@ class WindowedInertia(AbstractRegression):
             self.tones.init(like), jnp.zeros((), jnp.int32),
         )  # fmt: skip
 
-    def update(
-        self,
-        state: WindowedState,
-        command: Float[Array, " axes *ensemble"],
-        measurement: Float[Array, " axes *ensemble"],
-    ) -> WindowedState:
+    def update(self, state: WindowedState, command: Signal, measurement: Signal) -> WindowedState:
         """Add the command held during the last sample and the angle at its end."""
         filters, terms = self._filters()(state.filters, command, measurement)
         sums = jax.tree.map(lambda x: jnp.where(state.index == 0, 0, x), state.sums)
@@ -249,7 +245,7 @@ class WindowedInertia(AbstractRegression):
 
 class RecursiveState(NamedTuple):
     filters: FilterState
-    power: Float[Array, " axes *ensemble"]  # of the filtered acceleration, (rad/s^2)^2
+    power: Signal  # of the filtered acceleration, (rad/s^2)^2
     sums: Sums
     last: LastEstimate
     probe: ProbeState
@@ -290,7 +286,7 @@ class RecursiveInertia(AbstractRegression):
                 f"{100 * self.dt:g} s or more."
             )
 
-    def init(self, like: Float[Array, " axes *ensemble"]) -> RecursiveState:
+    def init(self, like: Signal) -> RecursiveState:
         """Before the first sample; shaped as the measurement `like` and as the ensemble."""
         like = jnp.zeros(signal_shape(like, self.ensemble), like.dtype)
         filters = self._filters()
@@ -299,12 +295,7 @@ class RecursiveInertia(AbstractRegression):
             self._start(like), self.tones.init(like),
         )  # fmt: skip
 
-    def update(
-        self,
-        state: RecursiveState,
-        command: Float[Array, " axes *ensemble"],
-        measurement: Float[Array, " axes *ensemble"],
-    ) -> RecursiveState:
+    def update(self, state: RecursiveState, command: Signal, measurement: Signal) -> RecursiveState:
         """Add the command held during the last sample and the angle at its end."""
         filters, terms = self._filters()(state.filters, command, measurement)
         power = state.power + self.dt / 0.5 * (terms[-2] ** 2 - state.power)
