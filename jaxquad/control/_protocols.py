@@ -14,18 +14,11 @@ Gain = Float[Array, "..."]  # one number, one for each axis, or `[axes, *ensembl
 
 
 class Setpoint(NamedTuple):
-    """A reference with its derivatives, for feed-forward.
+    """A reference with its derivatives, for feed-forward."""
 
-    **Arguments:**
-
-    - `angle`: rad.
-    - `rate`: rad/s.
-    - `acceleration`: rad/s^2.
-    """
-
-    angle: Signal
-    rate: Signal
-    acceleration: Signal
+    angle: Signal  # rad
+    rate: Signal  # rad/s
+    acceleration: Signal  # rad/s^2
 
 
 Reference = Setpoint | Signal  # angles in rad have no feed-forward
@@ -189,18 +182,11 @@ class AntiWindup(Protocol):
 
 
 class InertiaEstimate(NamedTuple):
-    """An estimate of the inertia with its uncertainty.
+    """An estimate of the inertia with its uncertainty."""
 
-    **Arguments:**
-
-    - `inertia`: kg m^2; the nominal one before any excitation.
-    - `deviation`: kg m^2, one standard deviation.
-    - `trusted`: 1 where excited and precise enough, else 0.
-    """
-
-    inertia: Signal
-    deviation: Signal
-    trusted: Signal
+    inertia: Signal  # kg m^2; the nominal one before any excitation
+    deviation: Signal  # kg m^2, one standard deviation
+    trusted: Signal  # 1 where excited and precise enough, else 0
 
 
 @runtime_checkable

@@ -18,7 +18,7 @@ from jaxquad._core import (
     require_positive,
 )
 
-from .._protocols import Gain, InertiaEstimate, Signal
+from ._protocols import Gain, InertiaEstimate, Signal
 
 
 PLAUSIBLE = 10.0  # times the nominal inertia, or a share of it

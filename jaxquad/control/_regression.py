@@ -11,7 +11,6 @@ from jaxtyping import Array, Float, Int
 
 from jaxquad._core import as_float, require_all_positive, signal_shape
 
-from .._protocols import Signal
 from ._estimator import (
     AbstractInertia,
     FilterState,
@@ -22,8 +21,10 @@ from ._estimator import (
     ProbeState,
     ProbeTones,
 )
+from ._protocols import Signal
 
 
+Terms = Float[Array, " signals axes *ensemble"]
 NUISANCES = ("offset", "rate", "angle")
 
 
@@ -49,51 +50,12 @@ def empty_sums(signals: int, like: Signal) -> Sums:
     return Sums(jnp.zeros((signals, signals, *like.shape), like.dtype), zero, zero)
 
 
-def add_sample(
-    sums: Sums,
-    terms: Float[Array, " signals axes *ensemble"],
-    keep: Signal,
-    *,
-    nuisance: tuple[str, ...],
-    excitation: float,
-    forget: float,
-    previous: Signal,
-) -> tuple[Sums, Solution]:
-    """The sums after one more sample, old ones weighted by `keep`, and what they say.
-
-    The inertia is the regression of torque on acceleration beside the `nuisance` terms. Where the
-    acceleration that they leave is below `excitation` in rad/s^2 rms the `previous` inertia stays.
-    The scores x e of neighbouring samples are correlated, since both are filtered: the variance of
-    their sum weighs pairs of samples by (1 - `forget`)^|k - l|.
-    """
-    products = keep[None, None] * sums.products + terms[:, None] * terms[None]
-    rest = _eliminate(products, terms, nuisance)
-    weight = products[0, 0]
-    floor = 64 * jnp.finfo(terms.dtype).eps * products[-2, -2]
-    informed = rest.square > jnp.maximum(weight * excitation**2, floor)
-    inverse = _inverse(rest.square, informed)
-    inertia = jnp.where(informed, rest.product * inverse, previous)
-    score = rest.acceleration * (rest.torque - inertia * rest.acceleration)
-    recent = (1 - forget) * keep * sums.recent
-    scatter = keep**2 * sums.scatter + score * (score + 2 * recent)
-    variance = jnp.maximum(scatter, 0) * inverse**2
-    solved = Solution(inertia, variance, weight, informed.astype(terms.dtype))
-    return Sums(products, recent + score, scatter), solved
-
-
-class _Residual(NamedTuple):
-    """What no nuisance term explains."""
-
-    square: Array  # of the acceleration, summed
-    product: Array  # with the torque, summed
-    acceleration: Array  # at this sample
-    torque: Array
-
-
 def _eliminate(products, terms, nuisance):
-    """Gauss' elimination of the nuisance terms, without pivoting: the matrix is definite.
+    """What no nuisance term explains: of the acceleration the sum of squares and of products with
+    the torque, and at this sample acceleration and torque.
 
-    Entry by entry, which compiles to one pass over the ensemble.
+    Gauss' elimination without pivoting, as the matrix is definite; entry by entry, which compiles
+    to one pass over the ensemble.
     """
     a, u = len(terms) - 2, len(terms) - 1
     left = {(i, j): products[i, j] for i in range(len(terms)) for j in range(i, len(terms))}
@@ -109,7 +71,7 @@ def _eliminate(products, terms, nuisance):
         for i, j in left:
             if i in row and j in row:
                 left[i, j] = left[i, j] - ratio[i] * row[j]
-    return _Residual(left[a, a], left[a, u], now[a], now[u])
+    return left[a, a], left[a, u], now[a], now[u]
 
 
 def _inverse(x, safe):
@@ -145,16 +107,27 @@ class AbstractRegression(AbstractInertia):
         return MatchedFilters(self.torque_gain, self.bandwidth, self.order, self.dt, angle)
 
     def _add(
-        self,
-        sums: Sums,
-        terms: Float[Array, " signals axes *ensemble"],
-        keep: Signal,
-        last: LastEstimate,
+        self, sums: Sums, terms: Terms, keep: Signal, last: LastEstimate
     ) -> tuple[Sums, Solution]:
-        return add_sample(
-            sums, terms, keep, nuisance=self.nuisance, excitation=self.excitation,
-            forget=min(1.0, self.dt / self.correlation), previous=last.inertia,
-        )  # fmt: skip
+        """The sums after one more sample, old ones weighted by `keep`, and what they say.
+
+        Where the acceleration that the nuisance terms leave is below `excitation` the last inertia
+        stays. The scores x e of neighbouring samples are correlated, since both are filtered: the
+        variance of their sum weighs pairs of samples by (1 - dt / correlation)^|k - l|.
+        """
+        products = keep[None, None] * sums.products + terms[:, None] * terms[None]
+        square, product, acceleration, torque = _eliminate(products, terms, self.nuisance)
+        weight = products[0, 0]
+        floor = 64 * jnp.finfo(terms.dtype).eps * products[-2, -2]
+        informed = square > jnp.maximum(weight * self.excitation**2, floor)
+        inverse = _inverse(square, informed)
+        inertia = jnp.where(informed, product * inverse, last.inertia)
+        score = acceleration * (torque - inertia * acceleration)
+        recent = (1 - min(1.0, self.dt / self.correlation)) * keep * sums.recent
+        scatter = keep**2 * sums.scatter + score * (score + 2 * recent)
+        variance = jnp.maximum(scatter, 0) * inverse**2
+        solved = Solution(inertia, variance, weight, informed.astype(terms.dtype))
+        return Sums(products, recent + score, scatter), solved
 
     def probe(self, state: "WindowedState | RecursiveState") -> Signal:
         """The test signal to add to the next command."""
@@ -309,3 +282,33 @@ class RecursiveInertia(AbstractRegression):
         last = LastEstimate(solved.inertia, solved.variance, age, informed)
         probe = self.tones.step(state.probe, self._assess(last))
         return RecursiveState(filters, power, sums, last, probe)
+
+
+def paper_inertia(
+    q0: Float[Array, " samples"],
+    q1: Float[Array, " samples"],
+    *,
+    J_n: float | Float[Array, ""],
+    dt: float,
+) -> Float[Array, ""]:
+    """Eq. (22)-(24): the inertia in kg m^2 over one window of samples.
+
+    J_n cancels: what is left is the regression of q1 on q0'. It is the inertia itself where the
+    integrals of q0 q0' and of q0' vanish, over whole periods of a steady motion.
+
+    **Arguments:**
+
+    - `q0`, `q1`: Eq. (19) at the same samples: `q0` of the mean rate over the sample interval, in
+        rad/s, `q1` of the mean torque over it and the one before, in N m. For torques that are held
+        over each interval the estimate is then exact.
+    - `J_n`: the nominal inertia in kg m^2.
+    - `dt`: the sample interval in s.
+
+    **Returns:**
+
+    The estimate of J_x.
+    """
+    q0_dot = jnp.diff(q0) / dt
+    M_c = J_n * q0_dot - q1[1:]  # (18)
+    dJ = -jnp.sum(M_c * q0_dot) / jnp.sum(q0_dot**2)  # (22) summed, (23)
+    return J_n + dJ  # (24)
