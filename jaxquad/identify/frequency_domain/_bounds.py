@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from ._cost import mix
 from ._problem import Problem
-from ._solve import Solution, solution_at, solve, weighted_residuals
+from ._solve import Solution, solution_at, solve
 
 
 _NEAR = 1e-2  # of the change that shows: a parameter below it is at zero
@@ -51,7 +51,7 @@ def linearise(problem: Problem, solution: Solution) -> Linearised:
             scaled = weights[..., None] * np.asarray(slopes)[..., :count]
             jacobian.append(mix(mixing, scaled)[weights > 0])
     jacobian = np.concatenate([*jacobian, np.asarray(parts.prior_slopes)[:, :count]])
-    return Linearised(weighted_residuals(problem, parts), jacobian)
+    return Linearised(parts.weighted(problem), jacobian)
 
 
 def solve_within_bounds(

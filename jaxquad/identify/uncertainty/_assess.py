@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float, PyTree
 
-from jaxquad._core import as_messages
+from jaxquad._core import as_messages, Message
 from jaxquad.models import LaggedIntegrator, StateSpace, TransferFunction
 from jaxquad.spectra import FrequencyResponse
 
@@ -17,8 +17,7 @@ from ..frequency_domain._problem import on_device, Problem
 from ..frequency_domain._refits import Origin
 from ..frequency_domain._result import Fit
 from ..frequency_domain._sampled import remarks_on_hold
-from ..frequency_domain._solve import is_saddle, same_responses, Solution
-from ..frequency_domain._starts import Minimum, remarks_on_minima
+from ..frequency_domain._solve import is_saddle, Minimum, same_responses, Solution
 from ..output_error._noise import NoiseModel
 from ..output_error._simulated import HasStateSpace, HasTransferFunction, linear_model
 from ._accuracy import (
@@ -70,6 +69,7 @@ from ._zero_bounds import bounds_among, near_zeros, one_sided_covariance, pulled
 _NO_MINIMUM = 1e-2  # Newton decrement over cost, above which no number counts as determined
 
 Vector = Float[np.ndarray, " parameters"]
+_NEAR = 1.5  # ratio of costs within which another minimum is a rival
 
 
 def assess(
@@ -183,6 +183,30 @@ def assess(
         discrepancy=budget.discrepancy,
         origin=origin,
     )
+
+
+def remarks_on_minima(
+    problem: Problem, is_saddle: bool, minima: tuple[Minimum, ...]
+) -> list[Message]:
+    """Remarks on a saddle instead of a minimum, and on other minima of nearly the best cost."""
+    remarks = []
+    if is_saddle:
+        text = (
+            "stationary, but no minimum: the cost falls to one side; «start from other values»"
+            "«, or give starts=20»"
+        )
+        remarks.append(Message(text, "saddle"))
+    true = [point for point in minima if point.is_minimum]
+    rivals = [point for point in true[1:] if point.cost <= _NEAR * true[0].cost]
+    if rivals:
+        values = ", ".join(f"{x:.4g}" for x in rivals[0].values)
+        text = (
+            f"{len(rivals)} other minima cost less than {_NEAR:g} times the best; the next costs "
+            f"{rivals[0].cost:.4g} at {', '.join(problem.parameters.names)} = {values}: record "
+            "more, or over a wider band, to know which is right"
+        )
+        remarks.append(Message(text, "other minima"))
+    return remarks
 
 
 def newton_step(
