@@ -62,8 +62,8 @@ from .frequency_domain._refits import (
 )
 from .frequency_domain._result import Fit as Fit
 from .frequency_domain._sampled import as_sampled as as_sampled
-from .frequency_domain._solve import (
-    least_squares as least_squares,
+from .frequency_domain._solve import least_squares as least_squares
+from .frequency_domain._starts import (
     Minimum as Minimum,
     solve_from_many as solve_from_many,
     spread_starts as spread_starts,

@@ -44,7 +44,8 @@ from ._problem import (
 )
 from ._refits import Options, Origin
 from ._result import Fit
-from ._solve import Minimum, Solution, solve_from_many, spread_starts
+from ._solve import Solution
+from ._starts import Minimum, solve_from_many, spread_starts
 
 
 _SMALL = 256  # frequencies, up to which a second thread of BLAS waits longer than it works

@@ -35,7 +35,7 @@ from ..uncertainty._verdict import (
 from ._fit_content import fit_content, fit_table
 from ._parameters import Parameters
 from ._refits import Bands, explain_misfit, Explanation, fit_bands, Origin
-from ._solve import Minimum
+from ._starts import Minimum
 
 
 @pytree_node

@@ -1,4 +1,4 @@
-"""Descents of fits from one start or many, and the derivatives where they stop."""
+"""Descents of fits, the derivatives where they stop, and the test for saddles."""
 
 import functools as ft
 from collections.abc import Callable, Sequence
@@ -12,24 +12,26 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from jaxquad._compile import evaluate_once, FEW, hasty_options, KeptPrograms
 from jaxquad._core import (
-    CONVERGED,
-    decrement,
-    minimise,
+    advance,
+    begin,
     Normal,
     normal_equations,
     RUNNING,
+    settle,
+    solve_definite,
     STALLED,
     TOLERANCE,
 )
 
 from ._cost import mix
-from ._parameters import Numbers, Parameters
-from ._problem import misfits, Problem, problem_normal, residuals
+from ._parameters import namespace_of, Numbers
+from ._problem import misfits, Problem, problem_normal, residuals, weigh_parts
 
 
 _FEW = 2000  # points times parameters, whose slopes take a tenth of a ms
 _SHORT = 3e4  # residuals times parameters squared: a few ms for a whole descent
 _LONGEST = 0.05  # relative step to either side of a stop
+_RIDGE = 1e-12  # of a matrix with ones on its diagonal, so that it has an inverse
 
 Vector = Float[np.ndarray, " parameters"]
 Evaluate = Callable[[Float[Array, " parameters"], PyTree], Normal]
@@ -66,6 +68,7 @@ class Solution(NamedTuple):
     sensitivity: Sensitivity
     at_zero: tuple[int, ...] = ()  # parameters at their bound, where z stands for next to nothing
     units_at_zero: tuple[float, ...] = ()  # changes of them that show
+    aside: Float[np.ndarray, " sides"] | None = None  # costs to either side, if it has them
 
     @property
     def converged(self) -> bool:
@@ -221,16 +224,13 @@ def least_squares(
 
     `z` where the solver stopped, whether it converged, the reason and the number of steps.
     """
-    if solver is None:
-        at = lambda z: normal_equations(residual, z, args) if normal is None else normal(z, args)
-        end = minimise(at, jnp.asarray(z0), max_steps - 1, tolerance)
-        return Stop(end.z, end.status == CONVERGED, end.status, end.steps + 1)
     # Imported late: optimistix doubles the time of `import jaxquad`.
     import optimistix as optx
 
-    if not isinstance(solver, optx.AbstractLeastSquaresSolver | optx.AbstractMinimiser):
+    chosen = _gauss_newton()(tolerance, normal) if solver is None else solver
+    if not isinstance(chosen, optx.AbstractLeastSquaresSolver | optx.AbstractMinimiser):
         raise ValueError(
-            f"solver is a {type(solver).__name__}: give an optimistix least-squares solver, for "
+            f"solver is a {type(chosen).__name__}: give an optimistix least-squares solver, for "
             "instance optx.LevenbergMarquardt(rtol=1e-8, atol=1e-8)"
         )
 
@@ -239,9 +239,53 @@ def least_squares(
         r = residual(z, args)
         return jnp.where(jnp.isfinite(r), r, 1e6)
 
-    end = optx.least_squares(finite, solver, z0, args=args, max_steps=max_steps, throw=False)
-    converged = end.result == optx.RESULTS.successful
-    return Stop(end.value, converged, end.result, end.stats["num_steps"])
+    function = residual if solver is None else finite
+    end = optx.least_squares(function, chosen, z0, args=args, max_steps=max_steps, throw=False)
+    reason = end.state.status if solver is None else end.result
+    return Stop(end.value, end.result == optx.RESULTS.successful, reason, end.stats["num_steps"])
+
+
+@ft.cache
+def _gauss_newton() -> Callable[..., PyTree]:
+    import optimistix as optx
+
+    class DampedGaussNewton(optx.AbstractLeastSquaresSolver):
+        """Gauss-Newton on the normal equations, damped as far as its steps fail.
+
+        A step that meets NaN is shortened like any that fails. `result` is `nonlinear_divergence`
+        where no shorter step helps either; the last point is then the best. Without LAPACK, so
+        `vmap` over solves is safe on few cores.
+        Source: Nielsen (1999), Damping parameter in Marquardt's method, IMM-REP-1999-05.
+        """
+
+        rtol: float
+        atol: float
+        norm: Callable[[PyTree], Float[Array, ""]]
+        normal: Evaluate | None  # a faster way to the normal equations than to differentiate
+
+        def __init__(self, tolerance: float, normal: Evaluate | None):
+            self.rtol = self.atol = tolerance
+            self.norm, self.normal = optx.max_norm, normal
+
+        def init(self, fn, y, args, options, f_struct, aux_struct, tags):
+            return begin(y)
+
+        def step(self, fn, y, args, options, state, tags):
+            by_slopes = lambda z: normal_equations(lambda z, args: fn(z, args)[0], z, args)
+            normal = by_slopes if self.normal is None else lambda z: self.normal(z, args)
+            state = advance(normal, state, jnp.iinfo(jnp.int32).max, self.rtol)
+            state = jax.lax.cond(state.status == STALLED, settle, lambda same: same, state)
+            return state.z, state, None  # to ask `fn` for it would trace the residuals once more
+
+        def terminate(self, fn, y, args, options, state, tags):
+            failed, good = optx.RESULTS.nonlinear_divergence, optx.RESULTS.successful
+            result = optx.RESULTS.where(state.status == STALLED, failed, good)
+            return state.status != RUNNING, result
+
+        def postprocess(self, fn, y, aux, args, options, state, tags, result):
+            return y, aux, {}
+
+    return DampedGaussNewton
 
 
 def solve(problem: Problem, z0: Vector, solver: eqx.Module | None, max_steps: int) -> Solution:
@@ -261,9 +305,9 @@ def solve(problem: Problem, z0: Vector, solver: eqx.Module | None, max_steps: in
             stop, leaves, *rest = stop
             model = take_apart(problem.model)[0].filled(leaves)  # while the program runs
             message, steps = stop.message, int(np.asarray(stop.steps))
-            z, values, slopes, *parts = map(np.asarray, (stop.z, *rest))
-            derivatives = _by_record(problem, *parts)
-            return Solution(z, model, values, slopes, message, steps, derivatives)
+            z, values, slopes, *parts, aside = map(np.asarray, (stop.z, *rest))
+            parts = message, steps, _by_record(problem, *parts)
+            return Solution(z, model, values, slopes, *parts, aside=aside)
     return solution_at(problem, np.asarray(stop.z), stop.message, int(np.asarray(stop.steps)))
 
 
@@ -295,8 +339,16 @@ def _solve_by_default(z0: Float[Array, " parameters"], problem: Problem, max_ste
     stop, parameters = _descend(z0, problem, max_steps), problem.parameters
     z = jnp.concatenate([stop.z, parameters.start[z0.size :]])
     values = parameters.values(z)
-    arrays = take_apart(parameters.replace(problem.model, values[: z0.size]))[1]
-    return stop, arrays, values, parameters.slopes(z), *misfits_and_slopes(z, problem)
+    model = parameters.replace(problem.model, values[: z0.size])
+    lined_up, slopes = misfits_and_slopes(z, problem)
+    # The costs to either side, from misfits and slopes.
+    both = jnp.concatenate([lined_up[None], slopes[: z0.size]])
+    parts = both.reshape(len(both), 2, *jnp.moveaxis(problem.measured[0], 0, -1).shape)
+    weighed = jax.vmap(ft.partial(weigh_parts, problem, 0))(parts[:, 0], parts[:, 1])
+    rows = jnp.concatenate([part.reshape(len(both), -1) for part in weighed], axis=1)
+    sides = _sides(stop.z, rows[1:] @ rows[1:].T, rows[0] @ rows[0])
+    costs = jax.vmap(lambda z: jnp.sum(residuals(z, problem) ** 2))(sides)
+    return stop, take_apart(model)[1], values, parameters.slopes(z), lined_up, slopes, costs
 
 
 _KEPT = {
@@ -317,16 +369,42 @@ def _program(frame: Frame, kind: str, *options: int) -> Callable[[list[Numbers]]
 def is_saddle(problem: Problem, solution: Solution, here: float, bread: np.ndarray) -> bool:
     """Whether the cost is lower than `here`, at the solution, a small step to either side of it.
 
-    The step is along the weakest direction of `bread`, J'J of its weighted residuals.
+    `bread` is J'J of its weighted residuals.
     """
-    size = np.sqrt(np.maximum(np.diagonal(bread), 1e-300))
-    curvature, directions = np.linalg.eigh(bread / (size[:, None] * size[None]))
-    weakest = directions[:, 0] / size
-    step = np.sqrt(1e-2 * max(here, 1e-12) / max(curvature[0], 1e-12))
-    step = min(step, _LONGEST / max(float(np.max(np.abs(weakest))), 1e-300))
-    sides = evaluate(problem, solution.z + step * weakest, solution.z - step * weakest)
-    rows = [side.weighted(problem) for side in sides]
-    return bool(min(row @ row for row in rows) < here * (1 - 1e-6) - 1e-12)
+    costs = solution.aside
+    if costs is None:
+        sides = evaluate(problem, *_sides(solution.z, bread, np.asarray(here)))
+        costs = np.array([row @ row for row in (side.weighted(problem) for side in sides)])
+    return bool(np.min(costs) < here * (1 - 1e-6) - 1e-12)
+
+
+def _sides(
+    z: Float[Numbers, " parameters"],
+    bread: Float[Numbers, "parameters parameters"],
+    here: Float[Numbers, ""],
+) -> Float[Numbers, "sides parameters"]:
+    """A small step from `z` to either side along the weakest direction of `bread`."""
+    xp = namespace_of(z)
+    size = xp.sqrt(xp.maximum(xp.diagonal(bread), 1e-300))
+    unit = bread / (size[:, None] * size[None])
+    if xp is np:
+        curvatures, vectors = np.linalg.eigh(unit)
+        weakest, curvature = vectors[:, 0] / size, curvatures[0]
+    else:
+        # A kept program that calls LAPACK crashes in a process that has not traced it. So: the 32nd
+        # power of the inverse, in whose columns nothing is left but the weakest direction.
+        identity = jnp.eye(z.size, dtype=z.dtype)
+        ridged = jnp.broadcast_to((unit + _RIDGE * identity)[..., None], (z.size,) * 3)
+        inverse = solve_definite(ridged, identity)[0]
+        power = inverse / jnp.trace(inverse)
+        for _ in range(5):
+            power = power @ power
+        column = power[:, jnp.argmax(jnp.diagonal(power))]
+        vector = column / jnp.sqrt(column @ column)
+        weakest, curvature = vector / size, vector @ unit @ vector
+    step = xp.sqrt(1e-2 * xp.maximum(here, 1e-12) / xp.maximum(curvature, 1e-12))
+    step = xp.minimum(step, _LONGEST / xp.maximum(xp.max(xp.abs(weakest)), 1e-300))
+    return xp.stack([z + step * weakest, z - step * weakest])
 
 
 def same_responses(problem: Problem, solution: Solution, values: np.ndarray) -> bool:
@@ -340,166 +418,3 @@ def same_responses(problem: Problem, solution: Solution, values: np.ndarray) -> 
     moved = solution_at(problem, z).sensitivity.misfits
     pairs = zip(moved, solution.sensitivity.misfits, strict=True)
     return all(np.allclose(*pair, atol=1e-6, rtol=0, equal_nan=True) for pair in pairs)
-
-
-MINIMUM = "minimum"
-FLAT = "flat: some change of parameters does not change the cost"
-SADDLE = "stationary, but no minimum: the cost falls to one side"
-WALL = "no minimum: no shorter step lowers the cost, yet its slope is not zero"
-UNFINISHED = "the maximum number of steps was reached"
-NOT_FINITE = "the model is not finite at the start"
-
-
-class Minimum(NamedTuple):
-    """A point at which the fits from some of the starts ended."""
-
-    cost: float  # sum of squares
-    z: Float[np.ndarray, " parameters"]
-    values: Float[np.ndarray, " parameters"]  # physical
-    starts: tuple[int, ...]  # which of them led here
-    decrement: float  # Newton decrement: half of what one more step would save of the cost
-    curvature: float  # smallest eigenvalue of the cost's Hessian, scaled to unit diagonal
-    kind: str  # "minimum", or what it is instead
-
-    @property
-    def is_minimum(self) -> bool:
-        """Whether slope and curvature are those of a minimum, isolated or flat."""
-        return self.kind in (MINIMUM, FLAT)
-
-
-def spread_starts(
-    parameters: Parameters, count: int, *, fastest: float, factor: float = 5.0, seed: int = 0
-) -> Float[np.ndarray, "starts parameters"]:
-    """Starting vectors `z`: the given start, then a Latin hypercube around it.
-
-    Parameters that keep their sign spread evenly in the logarithm, those that may cross zero over
-    twice their scale. A parameter whose name ends in `delay` stays below half a turn at the fastest
-    frequency, beyond which minima repeat with each turn.
-
-    **Arguments:**
-
-    - `parameters`: of `jq.identify.select_parameters`.
-    - `count`: how many starts.
-    - `fastest`: the highest frequency in rad/s.
-    - `factor`: how far to spread to both sides, above 1.
-    - `seed`: of the random numbers.
-
-    **Raises:**
-
-    - `ValueError`: no starts, or a factor that spreads nothing.
-    """
-    if count < 1:
-        raise ValueError(f"starts is {count}: give 1 for the given start alone, or more")
-    if not (1 < factor < np.inf and 0 < fastest < np.inf):
-        raise ValueError(
-            f"factor {factor} and fastest frequency {fastest} rad/s: give a finite factor above 1, "
-            "for instance 5, and a positive frequency"
-        )
-    n, rng = parameters.count, np.random.default_rng(seed)
-    start, scale = (np.asarray(x)[:n] for x in (parameters.start, parameters.scale))
-    cells = np.stack([rng.permutation(count - 1) for _ in range(n)], axis=1).reshape(count - 1, n)
-    unit = (cells + rng.uniform(size=cells.shape)) / max(count - 1, 1)
-    logarithmic = np.array(parameters.logarithmic[:n])
-    reach = np.where(logarithmic, np.log(factor), 2.0)
-    low, high = start - reach, start + reach
-    for k, name in enumerate(parameters.names):
-        if name.split(".")[-1].split("[")[0].endswith("delay") and logarithmic[k]:
-            most = max(np.log(np.pi / fastest / abs(scale[k])), start[k])
-            high[k] = min(high[k], most)
-    return np.concatenate([start[None], low + (high - low) * unit])
-
-
-def solve_from_many(
-    problem: Problem,
-    starts: Float[np.ndarray, "starts parameters"],
-    solver: eqx.Module | None,
-    max_steps: int,
-) -> tuple[Solution, tuple[Minimum, ...]]:
-    """Solve from every start in one call.
-
-    Starts of the default solver run side by side, those of an optimistix solver one by one, since
-    its LAPACK calls can hang under `vmap`.
-
-    **Arguments:**
-
-    - `problem`: of `jq.identify.make_problem`.
-    - `starts`: vectors `z`, of `spread_starts`.
-    - `solver`: `None` for the default, or an optimistix least-squares solver.
-    - `max_steps`: of the solver.
-
-    **Returns:**
-
-    The best solution, a minimum before a lower point that is none; and all distinct points, sorted
-    by cost.
-
-    **Raises:**
-
-    - `ValueError`: no start has a finite response.
-    """
-    stops = jax.tree.map(np.asarray, _solve_all(problem, np.asarray(starts), solver, max_steps))
-    z, status, steps, normal, left, bent = stops
-    costs, groups = normal.cost, list[list[int]]()
-
-    def same(one: int, other: int) -> bool:
-        """Those within a millionth of the cost are one."""
-        floor, difference = 1e-6 * (costs[one] + 1e-6), np.asarray(z[one] - z[other])
-        if abs(costs[other] - costs[one]) > floor:
-            return False
-        near = bool(np.max(np.abs(difference)) <= 1e-4)
-        return near or bool(0.5 * difference @ normal.hessian[one] @ difference <= floor)
-
-    for k in (int(k) for k in np.argsort(costs) if np.isfinite(costs[k])):
-        group = next((group for group in groups if same(group[0], k)), None)
-        groups.append([k]) if group is None else group.append(k)
-    if not groups:
-        raise ValueError(
-            f"the model's response is not finite at any of {len(starts)} starts: check the model "
-            "at its starting values with model.frequency_response(omega)"
-        )
-    minima = []
-    for k, *others in groups:
-        curvature, cost = -np.inf, float(costs[k])
-        if np.all(np.isfinite(bent[k])):
-            size = np.sqrt(np.maximum(np.abs(np.diagonal(bent[k])), 1e-300))
-            curvature = float(np.linalg.eigvalsh(bent[k] / np.outer(size, size))[0])
-        # Noise-free data leave a cost of rounding errors, of which no share means anything.
-        if left[k] > 1e-6 * cost + 1e-12:
-            kind = UNFINISHED if status[k] == RUNNING else WALL
-        elif curvature < -1e-6:
-            kind = SADDLE
-        else:
-            kind = MINIMUM if curvature > 1e-9 else FLAT
-        values, led = np.asarray(problem.parameters.values(z[k])), tuple(sorted([k, *others]))
-        minima.append(Minimum(2 * cost, z[k], values, led, float(left[k]), curvature, kind))
-    best = min(minima, key=lambda point: (not point.is_minimum, point.cost))
-    if lost := tuple(k for k in range(len(z)) if not np.isfinite(costs[k])):
-        values = np.asarray(problem.parameters.values(z[lost[0]]))
-        minima.append(Minimum(np.inf, z[lost[0]], values, lost, np.inf, -np.inf, NOT_FINITE))
-    reason, count = (int(part[best.starts[0]]) for part in (status, steps))
-    message = "" if best.is_minimum else best.kind
-    if message and reason in (RUNNING, STALLED):
-        message = stopped_early(reason, count)
-    return solution_at(problem, best.z, message, count), tuple(minima)
-
-
-@eqx.filter_jit
-def _solve_all(problem, starts, solver, max_steps) -> tuple:
-    """Of every start: `z`, status and steps of its stop; there the normal equations, the Newton
-    decrement, and second derivatives of half the cost."""
-
-    def normal_at(z):
-        return problem_normal(z, problem)
-
-    if solver is None:
-        side_by_side = jax.vmap(normal_at, in_axes=-1, out_axes=-1)
-        state = minimise(side_by_side, starts.T, max_steps, TOLERANCE)
-        z, status, steps = state.z.T, state.status, state.steps
-    else:
-        solve = lambda z0: least_squares(residuals, z0, problem, solver=solver, max_steps=max_steps)
-        stop = jax.lax.map(solve, starts)
-        z, steps = stop.z, stop.steps
-        status = jnp.where(stop.converged, CONVERGED, RUNNING)
-    normal = jax.vmap(normal_at)(z)
-    # Forward over forward: a model need not support reverse differentiation.
-    bent = jax.vmap(jax.jacfwd(lambda z: normal_at(z).gradient))(z)
-    return z, status, steps, normal, jax.vmap(decrement)(normal), bent
