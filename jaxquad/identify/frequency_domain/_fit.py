@@ -259,11 +259,7 @@ def _solve_reweighted(
 
 
 def _solve_with_floor(
-    problem: Problem,
-    points: Sequence[Points],
-    solution: Solution,
-    options: Options,
-    rounds: int,
+    problem: Problem, points: Sequence[Points], solution: Solution, options: Options, rounds: int
 ) -> tuple[Problem, Solution, Weighting]:
     """Solve again with what the model leaves unexplained as a floor on the random error.
 

@@ -130,11 +130,7 @@ class Fit:
         return self.names.index(name)
 
     def __call__(
-        self,
-        record: Record,
-        *,
-        band: tuple[float, float] | None = None,
-        hold: str | None = None,
+        self, record: Record, *, band: tuple[float, float] | None = None, hold: str | None = None
     ) -> Verification:
         """Simulate the model on a record and compare: `jq.verify(fit, record)`.
 
