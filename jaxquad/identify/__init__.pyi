@@ -50,7 +50,6 @@ from .frequency_domain._parameters import (
     with_values as with_values,
 )
 from .frequency_domain._problem import (
-    as_sampled as as_sampled,
     make_problem as make_problem,
     Prior as Prior,
     Problem as Problem,
@@ -62,6 +61,7 @@ from .frequency_domain._refits import (
     Explanation as Explanation,
 )
 from .frequency_domain._result import Fit as Fit
+from .frequency_domain._sampled import as_sampled as as_sampled
 from .frequency_domain._solve import least_squares as least_squares
 from .frequency_domain._starts import (
     Minimum as Minimum,
