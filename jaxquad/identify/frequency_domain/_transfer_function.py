@@ -230,7 +230,7 @@ class _Orders(NamedTuple):
         orders = {"zeros": zeros, "poles": poles, "integrators": integrators}
         for name, value in orders.items():
             if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 0:
-                raise ValueError(f"{name}={value!r}: give a whole number, 0 or more")
+                raise ValueError(f"{name}={value!r}: give a measured number, 0 or more")
         if not max(zeros, integrators) <= poles:
             raise ValueError(
                 f"zeros={zeros}, poles={poles}, integrators={integrators}: a proper transfer "
@@ -334,8 +334,11 @@ def _usable_pair(
             f"{len(frfs)} responses: a transfer function is fitted to one; combine the records in "
             "jq.frequency_response([record, ...]), or start jq.fit(model, responses) from a guess"
         )
-    [whole], places = frfs, []
-    sides = (("output", channels[0], whole.output_names), ("input", channels[1], whole.input_names))
+    [measured], places = frfs, []
+    sides = (
+        ("output", channels[0], measured.output_names),
+        ("input", channels[1], measured.input_names),
+    )
     for role, wanted, names in sides:
         if isinstance(wanted, str) and wanted in names:
             places.append(names.index(wanted))
@@ -348,16 +351,16 @@ def _usable_pair(
     o, i = places
     pick = lambda values: None if values is None else values[:, o : o + 1, i : i + 1]
     pair = dataclasses.replace(
-        whole,
-        response=pick(whole.response),
-        coherence=pick(whole.coherence),
-        random_error=pick(whole.random_error),
-        errors=whole.errors.pair(o, i),
-        divided=pick(whole.divided),
-        direct_coherence=pick(whole.direct_coherence),
-        multiple_coherence=whole.multiple_coherence[:, o : o + 1],
-        input_names=whole.input_names[i : i + 1],
-        output_names=whole.output_names[o : o + 1],
+        measured,
+        response=pick(measured.response),
+        coherence=pick(measured.coherence),
+        random_error=pick(measured.random_error),
+        errors=measured.errors.pair(o, i),
+        divided=pick(measured.divided),
+        direct_coherence=pick(measured.direct_coherence),
+        multiple_coherence=measured.multiple_coherence[:, o : o + 1],
+        input_names=measured.input_names[i : i + 1],
+        output_names=measured.output_names[o : o + 1],
     )
     least = least_coherence(min_coherence, cost, pair)
     used = usable(pair, band, least) & (np.abs(np.asarray(pair.response)) > 0)
