@@ -230,7 +230,7 @@ class _Orders(NamedTuple):
         orders = {"zeros": zeros, "poles": poles, "integrators": integrators}
         for name, value in orders.items():
             if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 0:
-                raise ValueError(f"{name}={value!r}: give a measured number, 0 or more")
+                raise ValueError(f"{name}={value!r}: give a whole number, 0 or more")
         if not max(zeros, integrators) <= poles:
             raise ValueError(
                 f"zeros={zeros}, poles={poles}, integrators={integrators}: a proper transfer "
