@@ -6,6 +6,13 @@ from ._errors import (
     RecordError as RecordError,
     RecordWarning as RecordWarning,
 )
+from ._proposal import (
+    AXES as AXES,
+    Flight as Flight,
+    flights as flights,
+    Proposal as Proposal,
+    propose as propose,
+)
 from ._read import (
     channels as channels,
     ChannelSummary as ChannelSummary,
@@ -22,10 +29,3 @@ from ._segments import (
     Segment as Segment,
 )
 from .formats import require_file as require_file
-from .proposals import (
-    AXES as AXES,
-    Flight as Flight,
-    flights as flights,
-    Proposal as Proposal,
-    propose as propose,
-)
