@@ -1,6 +1,11 @@
-from ._channel import Channel as Channel, resample as resample
-from ._clock import clock_start as clock_start, show_times as show_times
-from ._edit import detrend as detrend, mix as mix, select as select, trim as trim
+from ._channel import Channel as Channel, clock_start as clock_start, show_times as show_times
+from ._edit import (
+    detrend as detrend,
+    mix as mix,
+    resample as resample,
+    select as select,
+    trim as trim,
+)
 from ._errors import (
     ReadError as ReadError,
     RecordError as RecordError,

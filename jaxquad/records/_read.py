@@ -9,14 +9,19 @@ import numpy as np
 from ._channel import (
     Channel,
     check_ranges,
+    clock_start,
+    JITTER,
+    nonuniformity,
+    Number,
     repair_values,
-    resample,
+    show_times,
+    TimeUnit,
     Valid,
+    window,
     within,
     without_turns,
 )
-from ._clock import clock_start, JITTER, nonuniformity, Number, show_times, TimeUnit, window
-from ._edit import combine
+from ._edit import combine, resample
 from ._errors import located, ReadError, RecordError, RecordWarning, unknown_name
 from ._firmwares import firmware_log
 from ._log import known_unit

@@ -9,8 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ._channel import Valid
-from ._clock import clock_start, Number, show_times, TimeUnit
+from ._channel import clock_start, Number, show_times, TimeUnit, Valid
 from ._errors import GapError, RecordError, RecordWarning
 from ._read import read
 from ._record import assemble, Hold, Record

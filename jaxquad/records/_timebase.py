@@ -6,15 +6,15 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool
 
-from ._channel import Channel
-from ._clock import (
+from ._channel import (
+    Channel,
     check_unit,
     doubt_of_seconds,
+    FEWEST,
     Number,
     PER_SECOND,
-    repair,
+    repair_time,
     RepairedTime,
-    steady,
     TimeUnit,
     unwrap,
 )
@@ -168,7 +168,7 @@ class Timebases:
                 f"in {blank} of the {seconds.size} rows in which channel {name!r} has a value, its "
                 f"time base {base!r} is blank. Name the channel's own time base («time=»)."
             )
-        repaired = self._repaired[key] = repair(seconds)
+        repaired = self._repaired[key] = repair_time(seconds)
         times = "once" if stamps.wraps == 1 else f"{stamps.wraps} times"
         overflow = f"the counter overflowed {times}; this was undone" if stamps.wraps else ""
         for text in filter(None, (overflow, repaired.remark)):
@@ -336,7 +336,12 @@ def _prefixes(name: str, separator: str) -> Iterator[str]:
 def _begins_with_clock(signal: Signal) -> bool:
     """Whether the first column of a matrix is a clock, as Simulink's `To File` writes it."""
     matrix = signal.values
-    return matrix.ndim == 2 and matrix.shape[1] > 1 and steady(matrix[:, 0])
+    if matrix.ndim != 2 or matrix.shape[1] < 2 or len(matrix) < FEWEST:
+        return False
+    steps = np.diff(matrix[:, 0].astype(np.float64))
+    if not np.isfinite(steps).all() or not (steps > 0).all():
+        return False
+    return bool(np.mean(np.abs(steps / np.median(steps) - 1) < 0.5) > 0.9)
 
 
 def _in_rows(values: np.ndarray, rows: Bool[np.ndarray, " rows"] | None) -> np.ndarray:

@@ -9,7 +9,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from ._clock import FEWEST as FEWEST, native_rate
+from ._channel import FEWEST as FEWEST, native_rate
 from ._errors import RecordError
 from ._firmwares import (
     axis_of_rate as axis_of_rate,
