@@ -19,18 +19,14 @@ from ._proposal import (
     propose as propose,
 )
 from ._read import (
-    channels as channels,
-    ChannelSummary as ChannelSummary,
-    read as read,
-    read_settings as read_settings,
-    Settings as Settings,
-)
-from ._record import Record as Record
-from ._segments import (
     Mix as Mix,
     MixError as MixError,
     parse_mix as parse_mix,
+    read as read,
     read_segments as read_segments,
     Segment as Segment,
 )
+from ._record import Record as Record
+from ._timebase import channels as channels, ChannelSummary as ChannelSummary
+from .firmware import read_settings as read_settings, Settings as Settings
 from .formats import require_file as require_file

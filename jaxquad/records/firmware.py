@@ -4,13 +4,15 @@ The file of a firmware takes from here what its `FirmwareLog` needs.
 """
 
 import dataclasses
+import re
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import Literal, NamedTuple
 
 import numpy as np
 
-from ._channel import FEWEST as FEWEST, native_rate
-from ._errors import RecordError
+from ._channel import FEWEST as FEWEST, native_rate, Number
+from ._errors import ReadError, RecordError
 from ._firmwares import (
     axis_of_rate as axis_of_rate,
     firmware_log as firmware_log,
@@ -18,7 +20,7 @@ from ._firmwares import (
     register_log as register_log,
 )
 from ._log import flattened as flattened, Log as Log, Signal, Signals as Signals, Table as Table
-from .formats import Reader as Reader
+from .formats import load_log, Reader as Reader
 
 
 AXES: tuple[str, ...] = ("roll", "pitch", "yaw")
@@ -344,3 +346,59 @@ def throttle_of(firmware: FirmwareLog, signals: Signals, *, wanted: bool = False
         if first_logged(signals, [full]):
             return {full: factor}
     return {}
+
+
+class Settings(NamedTuple):
+    """Firmware and parameters of a log, as text.
+
+    **Arguments:**
+
+    - `vehicle`: ardupilot, px4 or betaflight.
+    - `version`: of the firmware, (4, 2, 0); empty where the log does not say.
+    - `values`: by name: a Betaflight header's lines, ArduPilot's PARM, PX4's parameters.
+    """
+
+    vehicle: str
+    version: tuple[int, ...]
+    values: Mapping[str, str]
+
+
+def read_settings(path: str | Path, *, log: str = "", at: Number | None = None) -> Settings:
+    """Read the parameters that a log begins with.
+
+    A parameter that was changed in flight has its value of the time `at`; by default its last one
+    in ArduPilot's and PX4's logs, and its first one in Betaflight's, which say no more.
+
+    **Arguments:**
+
+    - `path`: a log of Betaflight, ArduPilot or PX4.
+    - `log`: of a Betaflight file with several logs, which one: "log2".
+    - `at`: in s of the log's own time, for logs of ArduPilot and PX4.
+
+    **Returns:** the `Settings`.
+
+    **Raises:**
+
+    - `ReadError`: the file cannot be read, is of no autopilot, or holds no parameters.
+    """
+    content = load_log(path)
+    later = [change for change in content.changes if at is not None and change.time > at]
+    values = {**content.settings, **{change.name: change.before for change in reversed(later)}}
+    if log:
+        values = {
+            k.removeprefix(f"{log} "): x for k, x in values.items() if k.startswith(f"{log} ")
+        }
+    firmware = firmware_log(content.vehicle)
+    if firmware is None or not firmware.settings or not values:
+        raise ReadError(
+            f"{path}: the file holds no parameters of ArduPilot, PX4 or Betaflight"
+            + (f" under {log!r}" if log else "")
+            + ": give the log that the autopilot wrote, with its parameters logged."
+        )
+    text = values.get(firmware.release, content.firmware)
+    match = re.search(r"(\d+)\.(\d+)(?:\.(\d+))?", text)
+    if text.isdecimal():  # one byte each, as PX4 has them
+        version = tuple(int(text) >> shift & 0xFF for shift in (24, 16, 8))
+    else:
+        version = tuple(int(part or 0) for part in match.groups()) if match else ()
+    return Settings(content.vehicle, version, values)
