@@ -16,7 +16,6 @@ from jaxquad._xla import (
     _loop,
     _nvrtc,
     _switch,
-    _trial,
     scan_on_device,
 )
 from jaxquad.models import sincos
@@ -373,17 +372,17 @@ def test_without_a_gpu_no_loop_is_given_to_one():
 
 def trial():
     with _switch.device_kernels("forced"):
-        return _trial.why_no_trust_in_gpu.__wrapped__()
+        return _switch.why_no_trust_in_gpu.__wrapped__()
 
 
 def test_kernels_are_compared_with_a_plain_loop_before_they_are_trusted(monkeypatch):
     said = []
     jax.jit(lambda x: said.append(trial()))(1.0)  # while another program is traced
     assert said == [None]
-    monkeypatch.setattr(_trial, "_by_kernel", lambda *args: plain(args[0], *args[1:]))
+    monkeypatch.setattr(_switch, "_by_kernel", lambda *args: plain(args[0], *args[1:]))
     assert trial() is None
     wrong = lambda step, carry, signals: plain(step, carry, signals[::-1])
-    monkeypatch.setattr(_trial, "_by_kernel", wrong)
+    monkeypatch.setattr(_switch, "_by_kernel", wrong)
     assert "differs from a plain loop" in str(trial())
 
 
@@ -391,5 +390,5 @@ def test_a_trial_that_fails_tells_why(monkeypatch):
     def fails(*_):
         raise RuntimeError("no such instruction")
 
-    monkeypatch.setattr(_trial, "_by_kernel", fails)
+    monkeypatch.setattr(_switch, "_by_kernel", fails)
     assert "no such instruction" in str(trial())

@@ -27,9 +27,7 @@ from synthetic import response_of
 import jaxquad as jq
 from jaxquad.identify import UndeterminedError
 from jaxquad.report import (
-    _measured,
     _report,
-    _tuned,
     provenance,
     reason_of,
     write_report,
@@ -97,7 +95,7 @@ def test_the_page_is_well_formed_and_holds_every_section(whole):
 
 SECTIONS = {
     "answers": (_report, "answer_section"), "step": (_report, "step_section"),
-    "loop": (_report, "loop_section"), "tuned": (_tuned, "tuned_section"),
+    "loop": (_report, "loop_section"), "tuned": (_report, "tuned_section"),
     "response": (_report, "response_section"), "parameters": (_report, "parameter_section"),
     "identifiability": (_report, "identifiability_section"),
     "verification": (_report, "check_section"), "spectrum": (_report, "spectrum_section"),
@@ -131,7 +129,7 @@ def test_errors_of_the_package_speak_for_themselves():
 
 
 def test_a_figure_that_cannot_be_drawn_leaves_its_section(tmp_path, frf, fit, record, monkeypatch):
-    monkeypatch.setattr(_measured, "record_figure", lambda *_: 1 / 0)
+    monkeypatch.setattr(jq.plot, "record_figure", lambda *_: 1 / 0)
     page = read_page(write_report(tmp_path / "report.html", fit=fit, frf=frf, record=record))
     assert page.errors == [] and len(page.of("img")) == 2  # of the response
     assert "figure could not be drawn: ZeroDivisionError" in page.text("section")
