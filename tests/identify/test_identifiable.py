@@ -10,8 +10,7 @@ import pytest
 from synthetic import response_of
 
 import jaxquad as jq
-from jaxquad.identify.frequency_domain._bounds import polish
-from jaxquad.identify.uncertainty._zero_bounds import one_sided, one_sided_limits
+from jaxquad.identify.uncertainty._zero_bounds import one_sided, one_sided_limits, polish
 
 
 ML = jq.identify.MaximumLikelihood()
