@@ -57,11 +57,9 @@ _EXCITE = "excite the axis more, over a wider band (jaxquad design sweep), or re
 
 
 def identify(
-    path: str | Path | Sequence[str | Path],
-    settings: IdentifySettings | None = None,
-    *,
+    path: str | Path | Sequence[str | Path], settings: IdentifySettings | None = None, *,
     proposal: Proposal | None = None,
-) -> Identification:
+) -> Identification:  # fmt: skip
     """Identify one log, or several together, as `jaxquad identify` does.
 
     The frequency response is estimated with the delay taken out that a fit to a quick one has

@@ -112,12 +112,9 @@ class Tuning:
 
 
 def tune(
-    result: str | Path | StoredResult | Identification,
-    settings: TuneSettings,
-    *,
-    log: str | Path | None = None,
-    progress: bool | None = None,
-) -> Tuning:
+    result: str | Path | StoredResult | Identification, settings: TuneSettings, *,
+    log: str | Path | None = None, progress: bool | None = None,
+) -> Tuning:  # fmt: skip
     """Tune and certify a controller for the angle of an identified axis, as `jaxquad tune` does.
 
     A scheduled LADRC is tuned on plants that are drawn from everything the record leaves

@@ -7,14 +7,15 @@ import pytest
 from scipy.linalg import expm
 
 from jaxquad.autopilot import ArduPilotRate, FilterChain, firmware_named
+from jaxquad.autopilot._parameters import gains_of
 from jaxquad.autopilot._rate_loops import (
     cells_of,
     delay_margin,
-    gains_of,
     hold_plants,
     law_paths,
     RateLoops,
 )
+from jaxquad.autopilot._stages import certify_angle
 
 
 DT, GAIN, LAG = 1 / 400, 80.0, 0.03
@@ -86,7 +87,7 @@ def test_the_angle_loop_is_stable_up_to_the_gain_at_which_a_simulated_one_is():
     ones = np.ones(OMEGA.size, complex)
     loops = RateLoops(OMEGA, back, ahead, plants, cells_of(OMEGA), ones, angle=angle.path(OMEGA))
     assert gains_of(law, 0).tolist() == GAINS.tolist()
-    stable = lambda value: bool(loops.outer_qualities(GAINS, value).stable[0])
+    stable = lambda value: certify_angle(loops, GAINS, angle, value).stable == 1
     low, high = 1.0, 200.0
     assert stable(low) and not stable(high)
     for _ in range(12):

@@ -16,19 +16,27 @@ from jaxquad.report import Headline, Provenance, provenance, Table, write_json
 from .._files import change_table, parameter_file, ParameterChange, propose_changes, WordChange
 from .._filters import FilterChain, PT2
 from .._flight_channels import FlightChannels
-from .._identified import DesignSettings
-from .._page import B0Section, Chains, PilotPage, write_pilot_page
+from .._page import (
+    B0Section,
+    Chains,
+    chains_of,
+    change_rows,
+    logged_terms,
+    motor_rows,
+    PilotPage,
+    VERDICTS,
+    write_pilot_page,
+)
 from .._parameters import find_parameter
-from .._pilot_page import chains_of, change_rows, logged_terms, motor_rows, StepGrid, VERDICTS
-from .._rate_design import Kind
+from .._rate_loops import StepGrid
 from .._reproduce_flight import Reproduction
-from ._betaflight_adrc import adrc_parameters, b0_law, FlownADRC
-from ._betaflight_adrc_design import ADRCFrame, ADRCProposal, Flown, make_adrc_loop
+from .._stages import DesignSettings, Kind
+from ._betaflight_adrc import adrc_loops, adrc_parameters, b0_law, Flown, FlownADRC
+from ._betaflight_adrc_design import ADRCProposal
 
 
 _BUILD = (2026, 6)  # whose names a file of the ADRC has
 _STEM = "proposal"
-_PID = ("p", "i", "d")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -65,27 +73,37 @@ class ADRCAutopilot:
         return isinstance(self.flown, FlownADRC)
 
     @property
-    def old(self) -> dict[str, float]:
-        """What the firmware held of the parameters that are proposed; its defaults where the log
-        does not say."""
-        flown = adrc_parameters(self.values)
-        default = lambda name: float(find_parameter("betaflight", name).default)
-        return {name: flown.get(name, default(name)) for name in self.new}
-
-    @property
     def new(self) -> dict[str, float]:
         """The parameters that are proposed; empty where nothing is."""
         return {} if self.proposal is None else dict(self.proposal.parameters)
 
     @property
+    def old(self) -> dict[str, float]:
+        """What the firmware held of these; its defaults where the log does not say it."""
+        flown = adrc_parameters(self.values)
+        default = lambda name: float(find_parameter("betaflight", name).default)
+        return {name: flown.get(name, default(name)) for name in self.new}
+
+    @property
     def changes(self) -> tuple[ParameterChange, ...]:
         """From what the firmware held to the proposal; where the PID flew all, changed or not."""
+        return self._changes(1.0)
+
+    def _changes(self, share: float) -> tuple[ParameterChange, ...]:
+        old, new, reasons = self.old, self.new, {}
+        if self.proposal is not None:
+            after, before = self.proposal.stage, self.proposal.stages["what flew"]
+            tuned = (
+                f"effect of torque {after.rejection:.2f} and command noise {after.noise:.2f} of "
+                f"what flew; Ms {before.peak:.2f} -> {after.peak:.2f}"
+            )
+            kept = "the certificate is of this value"
+            reasons = {name: tuned if name.endswith(self.axis) else kept for name in new}
         if self.flew_adrc:
-            return propose_changes("betaflight", self.old, self.new, reasons=self._reasons)
-        old, reasons = self.old, self._reasons
+            return propose_changes("betaflight", old, new, share=share, reasons=reasons)
         return tuple(
             ParameterChange(find_parameter("betaflight", name), old[name], value, reasons[name])
-            for name, value in self.new.items()
+            for name, value in new.items()
         )
 
     @property
@@ -103,18 +121,6 @@ class ADRCAutopilot:
             WordChange("adrc_b0_law", b0_law(self.values) or "SQRT", law, why),
             WordChange("pid_type", "CLASSIC", "ADRC", "the ADRC of pull request 15400 flies"),
         )
-
-    @property
-    def _reasons(self) -> dict[str, str]:
-        if self.proposal is None:
-            return {}
-        after, before = self.proposal.stage, self.proposal.stages["what flew"]
-        tuned = (
-            f"effect of torque {after.rejection:.2f} and command noise {after.noise:.2f} of what "
-            f"flew; Ms {before.peak:.2f} -> {after.peak:.2f}"
-        )
-        kept = "the certificate is of this value"
-        return {name: tuned if name.endswith(self.axis) else kept for name in self.new}
 
     def content(self) -> dict[str, object]:
         """All of it, for JSON."""
@@ -159,15 +165,13 @@ class ADRCAutopilot:
             )
         if self.words:
             others = " and ".join(axis for axis in AXES if axis != self.axis)
-            remarks.append(
+            remarks += [
                 "pid_type, adrc_hover_throttle and adrc_b0_law are those of all three axes: before "
                 f"a flight tune {others}, too, from logs of their own with the same hover throttle "
-                f"({self.new['adrc_hover_throttle']:.0f} %), and load all three files"
-            )
-            remarks.append(
+                f"({self.new['adrc_hover_throttle']:.0f} %), and load all three files",
                 "there is no file for a third of the way, because between PID and ADRC there is "
-                "none; the file that reverts it switches back to the PID"
-            )
+                "none; the file that reverts it switches back to the PID",
+            ]
         if self.words and not adrc_parameters(self.values):
             remarks.append("the log does not hold the old values: they are the firmware's defaults")
         if (linear := float(self.values.get("thrust_linear", 0.0))) > 0:
@@ -196,40 +200,30 @@ class ADRCAutopilot:
         return [page, stored, *(write_file(folder / k, text) for k, text in self._texts().items())]
 
     def _texts(self) -> dict[str, str]:
-        """The parameter files, and the table of what changes."""
+        """The parameter files, and the table of what changes; without a proposal what flew."""
         if not self.new:
-            return {f"{_STEM}_revert.txt": self._what_flew()}
+            start = ("adrc_wc", "adrc_wo", "adrc_b0") if self.flew_adrc else ("p", "i", "d")
+            flown, version = self.flown.parameters(), self.version or (2025, 12)
+            names = [f"{name}_{self.axis}" for name in start]
+            rows = [(find_parameter("betaflight", name), flown[name]) for name in names]
+            text = parameter_file(
+                "betaflight", [ParameterChange(row, x, x) for row, x in rows], revert=True,
+                version=version, profile=None, title="what flew",
+                raised=[axis for axis in AXES if f"d_max_{axis}" in flown],
+            )  # fmt: skip
+            return {f"{_STEM}_revert.txt": text}
+        texts, table = {}, []
         file = lambda changes, title, revert=False: parameter_file(
             "betaflight", changes, revert=revert, version=_BUILD, profile=None, words=self.words,
             title="\n".join([title, *self.remarks]),
         )  # fmt: skip
-        stages, table = {}, []
         for percent in (33, 100) if self.flew_adrc else (100,):
-            share = 1.0 if percent == 100 else 1 / 3
-            changes = (
-                propose_changes(
-                    "betaflight", self.old, self.new, share=share, reasons=self._reasons
-                )
-                if self.flew_adrc else self.changes
-            )  # fmt: skip
+            changes = self._changes(1.0 if percent == 100 else 1 / 3)
             title = f"{percent} % of the way from what flew to the proposal"
-            stages[f"{_STEM}_{percent:03d}.txt"] = file(changes, title)
+            texts[f"{_STEM}_{percent:03d}.txt"] = file(changes, title)
             table.append(f"## {title}\n\n{change_table(changes, self.words)}")
-        back = {f"{_STEM}_revert.txt": file(self.changes, "what flew", True)}
-        return stages | back | {f"{_STEM}.md": "\n".join(table)}
-
-    def _what_flew(self) -> str:
-        """The parameters of the axis that flew, as a file."""
-        start = ("adrc_wc", "adrc_wo", "adrc_b0") if self.flew_adrc else _PID
-        flown, version = self.flown.parameters(), self.version or (2025, 12)
-        same = [
-            ParameterChange(find_parameter("betaflight", name), flown[name], flown[name])
-            for name in (f"{name_start}_{self.axis}" for name_start in start)
-        ]
-        return parameter_file(
-            "betaflight", same, revert=True, version=version, profile=None, title="what flew",
-            raised=[axis for axis in AXES if f"d_max_{axis}" in flown],
-        )  # fmt: skip
+        texts[f"{_STEM}_revert.txt"] = file(self.changes, "what flew", True)
+        return texts | {f"{_STEM}.md": "\n".join(table)}
 
     @property
     def shown_again(self) -> Mapping[float, Reproduction]:
@@ -322,7 +316,7 @@ def adrc_page(result: ADRCAutopilot, origin: Provenance) -> PilotPage:
 
     filters: dict[str, Chains] = {"flown": chains}
     if isinstance(flown, FlownADRC):
-        filters = {"flown": with_observer(flown.lowpass_hz)}
+        filters = {"flown": with_observer(flown.frame.lowpass_hz)}
     elif result.new:
         filters["proposed"] = with_observer(result.new["adrc_gyro_lpf_hz"])
     steps, b0, stages = {}, None, None
@@ -353,16 +347,9 @@ def _steps_and_b0(
     """Steps at the middle one of the throttles that were certified, and b0 over all of them."""
     flown, schedule = result.flown, proposal.schedule
     middle = proposal.throttle[len(proposal.throttle) // 2]
-    values = result.new or flown.parameters()
-    frame = ADRCFrame(
-        schedule, values.get("adrc_gyro_lpf_hz", 150.0), values.get("adrc_td_hz", 0.0),
-        values.get("adrc_sigma_decay", 3.0) / 10,
-    )  # fmt: skip
-    grid = StepGrid.of(flown.law.dt)
-    loop = make_adrc_loop(
-        plant, flown, AXES.index(result.axis), middle, frame, _PLANTS,
-        result.settings.seed + _SEED, grid.omega,
-    )  # fmt: skip
+    grid, place = StepGrid.of(flown.law.dt), AXES.index(result.axis)
+    seed = result.settings.seed + _SEED
+    loop = adrc_loops(plant, flown, place, middle, proposal.frame, _PLANTS, seed, grid.omega)
     at = f", {middle:.2f} throttle"
     steps = {f"{'ADRC' if result.flew_adrc else 'PID'} flown{at}": grid.band(loop.closed(None))}
     levels = [plant.b0(k) for k in range(plant.throttle.size)]

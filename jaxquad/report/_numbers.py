@@ -1,16 +1,21 @@
-"""The parameters of a fit, their correlation, what the record determines; fits side by side."""
+"""Numbers in tables: parameters of a fit and what the record determines; gains, certificates."""
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import Any, TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Array, Float
 
+import jaxquad.plot as plot
 from jaxquad.identify import Combination, factors, Fit, UndeterminedError
 from jaxquad.models import TransferFunction
 
-from ._page import Cell, Table
+from ._page import Cell, embed_figure, Headline, Table
 
+
+if TYPE_CHECKING:
+    from jaxquad.simulation import Simulation
+    from jaxquad.tuning import Certificate, Tuned
 
 _BOUNDS = (20.0, 10.0)  # %, of Cramer-Rao bound and insensitivity (Tischler & Remple, sec. 11.1)
 _CORRELATED = 0.9
@@ -118,9 +123,8 @@ def _correlation(fit: Fit) -> Table | None:
 
 def identifiability_section(fit: Fit) -> dict[str, object]:
     """What the record determines, and what to do about the rest."""
-    none: dict[str, object] = {
-        "lost": [], "texts": [], "combinations": None, "directions": None, "remedies": []
-    }  # fmt: skip
+    none: dict[str, object] = dict.fromkeys(("lost", "texts", "remedies"), ())
+    none |= {"combinations": None, "directions": None}
     verdict = fit.verdict
     bounds = [f"{bound}." for bound in verdict.bounds]
     if fit.identifiable:
@@ -218,3 +222,108 @@ def _plus_minus(value: float, error: float) -> str:
         digits = 1 + int(np.floor(np.log10(abs(value)))) if value else 1  # before the point
         return f"{value:.{max(digits + last, 1)}g} +- {error:.2g}"
     return f"{value:.{last}f} +- {error:.{last}f}"
+
+
+_DRAWN = 7  # designs that can be distinguished in a figure
+
+
+def verdict_headlines(tuned: "Tuned | Certificate") -> list[Headline]:
+    """The three verdicts of a design; of gains that were given, those that were asked for."""
+    headlines = []
+    for verdict in tuned.verdicts:
+        if verdict.holds is not None:
+            level, fails = ("good", "") if verdict.holds else ("bad", " FAILS")
+            text = ". ".join(filter(None, (verdict.text, verdict.remedy)))
+            headlines.append(Headline(level, f"{verdict.name}{fails}", text))
+    if getattr(tuned, "certificate", tuned) is None:
+        text = "no fresh members were drawn to certify on"
+        headlines.insert(0, Headline("warn", "NOT CERTIFIED", text))
+    return headlines
+
+
+def tuned_section(
+    tuned: "Tuned | Certificate", flights: "Mapping[str, Simulation]"
+) -> dict[str, object]:
+    """The verdicts, the gains, how the tune went, how they fly, and the certificate."""
+    from jaxquad.tuning import Tuned  # here: the room of tuning takes 0.2 s
+
+    image = gains = None
+    if flights:
+        image = embed_figure(
+            lambda: plot.flight(flights),
+            alt="Angle with its set-point, command and disturbing torque over time: "
+            f"{', '.join(flights)}.",
+            caption="The tuned gains in flight, with the members of the certificate that do worst.",
+        )
+    certificate = tuned.certificate if isinstance(tuned, Tuned) else tuned
+    if isinstance(tuned, Tuned):
+        end, curve = "converged" if tuned.converged else "did NOT converge", None
+        facts = {
+            "controller": type(tuned.controller).__name__,
+            "optimisation": f"cost {tuned.cost:.5g}; {end} after {tuned.evaluations} gradient "
+            f"evaluations in {tuned.seconds:.1f} s",
+        }
+        if tuned.minima:
+            facts["starts"] = count_starts([len(point.starts) for point in tuned.minima])
+        if tuned.history:
+            curve = embed_figure(
+                lambda: plot.convergence_figure(tuned.history),
+                alt="Cost above the best found and share of stable members, by gradient "
+                "evaluation.",
+            )
+        rows = [[Cell(name), f"{value:.5g}"] for name, value in tuned.values.items()]
+        table = Table("Gains", ("gain", "value"), rows)
+        gains = {"table": table, "facts": facts, "remarks": tuned.remarks, "image": curve}
+    return {
+        "verdicts": [str(verdict) for verdict in tuned.verdicts], "gains": gains, "flight": image,
+        "certificate": None if certificate is None else _certificate(certificate),
+        "text": str(tuned),
+    }  # fmt: skip
+
+
+def _certificate(certificate: "Certificate") -> dict[str, object]:
+    """Its figure, and designs side by side, by every quantity that was evaluated."""
+    from jaxquad.tuning import KNOWN_INERTIA, QUANTITIES
+
+    every, summary_of = certificate.designs.values(), certificate.summaries
+    summaries = summary_of.values()
+    quantities = [
+        quantity
+        for quantity in ("itae", "sensitivity_peak")
+        if all(quantity in x.by_axis and np.isfinite(x.of(quantity)).any() for x in every)
+    ]
+    designs = tuple(certificate.designs)[:_DRAWN]
+    titles = " and ".join(QUANTITIES[quantity].title for quantity in quantities)
+    image = embed_figure(
+        lambda: plot.certificate_figure(certificate, quantities=quantities, designs=designs),
+        alt=f"Every member over its inertia: whether it is stable, and its {titles}, for "
+        f"{', '.join(designs)}.",
+    )
+    percent = lambda x: "n/a" if x is None else f"{100 * x:.3g}"
+    share = lambda row: None if row.unstable is None else row.unstable / row.members
+    rows = [["unstable, %", "found", *(percent(share(row)) for row in summaries)]]
+    if certificate.independent:
+        bounds = [percent(row.unstable_at_most) for row in summaries]
+        rows.append(["unstable, % (95 % confidence)", "at most", *bounds])
+    diverged = [percent(row.diverged / row.members) for row in summaries]
+    rows.append(["diverged, %", "found", *diverged])
+    for quantity in certificate.design.by_axis:
+        shown = QUANTITIES[quantity]
+        title = f"{shown.title}, {shown.unit}" if shown.unit else shown.title
+        for which in ("mean", "worst"):
+            cells = [
+                shown.text(row.statistics[quantity]._asdict()[which], unit=False)
+                if quantity in row.statistics
+                else "n/a"
+                for row in summaries
+            ]
+            rows.append([title, which, *cells])
+    heads = ("quantity", "of the members", *map(Cell, summary_of))
+    title = f"{certificate.name} and other designs on {certificate.members} members"
+    return {
+        "verdict": str(certificate).splitlines()[0],
+        "limits": [str(distance) for distance in certificate.distances],
+        "remarks": certificate.remarks,
+        "untuned": KNOWN_INERTIA if KNOWN_INERTIA in certificate.designs else "",
+        "designs": Table(title, heads, rows, texts=2), "image": image,
+    }  # fmt: skip

@@ -1,30 +1,18 @@
-"""Commands around one log: channels, identify, report and verify."""
+"""Commands on logs: channels, identify, report, verify, and batch for all logs of a folder."""
 
 import argparse
 import math
 import sys
+from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import jaxquad.workflows as workflows
 from jaxquad.records import parse_mix, require_file
-from jaxquad.workflows import default_folder, IdentifySettings, in_options, open_logs
+from jaxquad.workflows import BatchSettings, default_folder, IdentifySettings, in_options, open_logs
 
-from ._options import (
-    add_config,
-    add_log,
-    add_log_option,
-    add_output,
-    add_result,
-    add_settings,
-    command,
-    folder_to_write,
-    print_json,
-    Run,
-    settings_of,
-    start_computing,
-    stdout_for_json,
-    typed_settings,
-)
+from . import _options as shell
+from ._options import command, Run
 
 
 if TYPE_CHECKING:
@@ -47,9 +35,9 @@ exit codes: 0 done, 2 unusable input
 """,
 )
 def channels(declared: argparse.ArgumentParser) -> Run:
-    add_log(declared)
-    add_settings(declared, IdentifySettings, only={"time": "", "time_unit": "", "dt": ""})
-    add_output(declared, "the list", quiet=False, force="")
+    shell.add_paths(declared, "file")
+    shell.add_settings(declared, IdentifySettings, only={"time": "", "time_unit": "", "dt": ""})
+    shell.add_output(declared, "the list", quiet=False, force="")
 
     def run(options: argparse.Namespace) -> int:
         from jaxquad.records import channels, flights
@@ -59,7 +47,7 @@ def channels(declared: argparse.ArgumentParser) -> Run:
             options.file, time=typed("time"), time_unit=typed("time_unit"), dt=typed("dt")
         )
         if options.json:
-            print_json([channel._asdict() for channel in listed])
+            shell.print_json([channel._asdict() for channel in listed])
             return 0
         heads = ("channel", "samples", "rate, Hz", "from, s", "to, s", "minimum", "maximum", "unit")
         rows: list[tuple[str, ...]] = [heads]
@@ -89,9 +77,9 @@ def finish_identification(
     verified = result.settings.verify
     sources = [*result.paths, *([verified] if verified else [])]
     same = {"settings": result.settings.content()}
-    with stdout_for_json(options):
+    with shell.stdout_for_json(options):
         print(in_options(result.message()), flush=True)
-        path = result.write(folder_to_write(options, folder, "result.json", same, sources))
+        path = result.write(shell.folder_to_write(options, folder, "result.json", same, sources))
         drawn = [name for name in result.figure_names if path.with_name(name).exists()]
         names = ", ".join(["report.html", *drawn])
         print(f"\n{path}, {names}{note.format(report=path.with_name('report.html'))}")
@@ -127,12 +115,12 @@ def identify(declared: argparse.ArgumentParser) -> Run:
     text = "a log of an autopilot, CSV, NPZ, MAT, HDF5, ...; several logs of one vehicle in one "
     text += "condition are fitted together"
     declared.add_argument("file", type=Path, nargs="+", help=text)
-    add_config(declared)
-    add_settings(declared, IdentifySettings)
-    add_output(declared, "result.json", folder="results/NAME of the first file")
+    shell.add_paths(declared, "--config")
+    shell.add_settings(declared, IdentifySettings)
+    shell.add_output(declared, "result.json", folder="results/NAME of the first file")
 
     def run(options: argparse.Namespace) -> int:
-        settings = settings_of(options, IdentifySettings)
+        settings = shell.settings_of(options, IdentifySettings)
         for path in options.file:
             require_file(path)
             if path.is_dir() and not (path / "metadata.yaml").is_file():  # no ROS 2 bag
@@ -149,15 +137,13 @@ def identify(declared: argparse.ArgumentParser) -> Run:
                 )
         if settings.verify:
             require_file(settings.verify)
-        start_computing()
-        from jaxquad.workflows import identify_opened
-
+        shell.start_computing()
         opened = open_logs(options.file, settings)
         if opened.proposal is not None:
-            with stdout_for_json(options):
+            with shell.stdout_for_json(options):
                 print(f"{opened.proposal}\n", flush=True)
         folder = options.out or default_folder(options.file[0])
-        return finish_identification(options, identify_opened(opened), folder)
+        return finish_identification(options, workflows.identify_opened(opened), folder)
 
     return run
 
@@ -172,18 +158,13 @@ The log is identified again with the settings in result.json. It has to be the s
     + _CODES,
 )
 def report(declared: argparse.ArgumentParser) -> Run:
-    add_result(declared)
-    add_log_option(declared)
-    add_output(declared, "result.json", folder="the folder of the result")
+    shell.add_paths(declared, "result", "--log")
+    shell.add_output(declared, "result.json", folder="the folder of the result")
 
     def run(options: argparse.Namespace) -> int:
-        from jaxquad.workflows import load_result
-
-        stored = load_result(options.result)
-        start_computing()
-        from jaxquad.workflows import identify_again
-
-        result = identify_again(stored, log=options.log)
+        stored = workflows.load_result(options.result)
+        shell.start_computing()
+        result = workflows.identify_again(stored, log=options.log)
         return finish_identification(options, result, options.out or stored.folder)
 
     return run
@@ -217,24 +198,22 @@ parameters of the model, or the result holds none
 """,
 )
 def verify(declared: argparse.ArgumentParser) -> Run:
-    add_result(declared)
-    add_log(declared)
-    add_settings(declared, IdentifySettings, only=_OF_A_RECORD)
+    shell.add_paths(declared, "result", "file")
+    shell.add_settings(declared, IdentifySettings, only=_OF_A_RECORD)
     file = ("PNG", "draw both outputs into a figure")
-    add_output(declared, "the measures of agreement", file=file, force="")
+    shell.add_output(declared, "the measures of agreement", file=file, force="")
 
     def run(options: argparse.Namespace) -> int:
-        from jaxquad.workflows import load_result
-
-        stored = load_result(options.result)
+        stored = workflows.load_result(options.result)
         require_file(options.file)
-        start_computing()
+        shell.start_computing()
         from jaxquad.plot import compare, headless
         from jaxquad.report import verification_content
-        from jaxquad.workflows import verify_result
 
-        check = verify_result(stored, options.file, typed_settings(options, IdentifySettings))
-        with stdout_for_json(options):
+        check = workflows.verify_result(
+            stored, options.file, shell.typed_settings(options, IdentifySettings)
+        )
+        with shell.stdout_for_json(options):
             if stored.doubts:
                 print(f"THE MODEL IS WEAK: {stored.doubts[0]}")
                 print("  a good agreement below does not make up for that")
@@ -249,7 +228,80 @@ def verify(declared: argparse.ArgumentParser) -> Run:
                 print(picture)
         if options.json:
             model = {"identifiable": stored.identifiable, "verdict": stored.summary}
-            print_json(model | verification_content(check))
+            shell.print_json(model | verification_content(check))
         return 0 if stored.identifiable else NOT_IDENTIFIABLE
+
+    return run
+
+
+_SOME_FAILED = 4
+
+
+@command(
+    "identify all logs of a folder",
+    """examples:
+  jaxquad batch logs/ --config fleet.toml
+  jaxquad batch logs/ --config fleet.toml --workers 4 --out results/fleet
+  jaxquad batch logs/ --config fleet.toml --scheduler tcp://10.0.0.1:8786
+
+fleet.toml, in which every key may be left out:
+  logs = "**/*.ulg"             # a file pattern below the folder, or a list of them
+  timeout = 600                 # s for one log; workers and scheduler likewise
+  input = "roll=-m1-m2+m3+m4"   # without input and output, an autopilot's log proposes them
+  output = "p"
+  reference = "setpoint"
+  units = { p = "rad/s" }
+  band = [0.7, 12]              # Hz
+  lag = false                   # as --no-lag
+  [[override]]
+  logs = "flight_07*"           # these logs alone
+  segments = [[22, 30], [41, 49.5]]
+The other keys are the options of jaxquad identify (--unit and --segment are units and segments).
+
+A batch that was stopped or killed continues where it was: start it again.
+exit codes: 0 done, 2 unusable input, 4 some logs failed (see table.csv)
+A log that is not identifiable has not failed.
+""",
+)
+def batch(declared: argparse.ArgumentParser) -> Run:
+    declared.add_argument("folder", type=Path, help="the folder that contains the logs")
+    shell.add_paths(declared, "--config")
+    text = "identify logs again that failed before"
+    declared.add_argument("--again", action="store_true", help=text)
+    shell.add_settings(declared, BatchSettings)
+    shell.add_output(
+        declared, "the rows of the table", folder="results/NAME of the folder", force=""
+    )
+
+    def run(options: argparse.Namespace) -> int:
+        from tqdm import tqdm
+
+        settings = shell.settings_of(options, BatchSettings)
+        out = options.out or Path("results") / options.folder.resolve().name
+        logs = workflows.find_logs(options.folder, settings, out=out)
+        # A bar on a terminal, plain lines elsewhere, nothing with --quiet.
+        bar = tqdm(total=len(logs), unit="log", leave=False, disable=options.quiet or None)
+        shown: list[str] = []
+
+        def show(row: dict) -> None:
+            text = f"{row['log']}: {row['status']}"
+            shown.append("".join(c if c.isprintable() else "?" for c in text))
+            if not bar.disable:
+                bar.set_postfix_str(shown[-1], refresh=False)
+                bar.update()
+            elif not options.quiet:
+                print(f"{len(shown)}/{len(logs)} {shown[-1]}", file=sys.stderr, flush=True)
+
+        with shell.stdout_for_json(options), bar:
+            rows = workflows.batch(
+                options.folder, settings, out=out, again=options.again, listener=show
+            )
+        if options.json:
+            shell.print_json(rows)
+        else:
+            counts = Counter(row["status"] for row in rows)
+            print(f"{len(rows)} logs:", ", ".join(f"{n} {state}" for state, n in counts.items()))
+            print(f"{out / 'summary.html'}, table.csv")
+        return _SOME_FAILED if any(row["status"] == "failed" for row in rows) else 0
 
     return run

@@ -1,10 +1,82 @@
-"""`jaxquad design`: a signal to excite the vehicle with."""
+"""Before there is a flight: a demonstration, and a signal to excite the vehicle with."""
 
 import argparse
 from itertools import chain, count
 from pathlib import Path
 
-from ._options import add_output, command, print_json, Run
+import jaxquad.workflows as workflows
+from jaxquad.workflows import AutopilotSettings
+
+from . import _options as shell
+from ._logs import finish_identification
+from ._options import command, Run
+from ._tune import run_autopilot
+
+
+_NEXT = """
+
+The log is simulated: one axis under rate feedback, in gusts, excited by a sweep of its command.
+True values: gain {gain:g}, lag {lag:g} s, delay {delay:g} s, so lag + delay = {sum:.4g} s.
+Look at {{report}}
+Then identify your own log:
+  jaxquad channels YOUR.LOG
+  jaxquad identify YOUR.LOG"""
+_NEXT_FLIGHT = """
+
+The flight is measured: an ANT-X quadrotor on a pitch test stand in closed loop, with a binary
+sequence on the set-point x0 of its position.
+Look at {report}"""
+_NEXT_CHIRP = """
+
+The log is simulated, as Betaflight 2026.6 writes it: a 5-inch quadrotor with default gains rests,
+takes off, and flies a chirp on roll from 0.5 to 40 Hz, in gusts and gyro noise.
+True plant of roll: gain {gain:g}, lag {lag:g} s, delay {delay:g} s.
+Look at {{page}}
+Then your own log:
+  jaxquad autopilot YOUR.BFL"""
+
+
+@command(
+    "write a simulated log whose true model is known, and identify it",
+    """examples:
+  jaxquad demo
+  jaxquad demo --autopilot
+  jaxquad demo --flight
+
+exit codes: 0 done, 2 the folder cannot be written, or the flight is not found; with --autopilot
+those of jaxquad autopilot
+""",
+)
+def demo(declared: argparse.ArgumentParser) -> Run:
+    text = "identify a measured flight instead: a quadrotor on a pitch test stand (JAXQUAD_DATA)"
+    source = declared.add_mutually_exclusive_group()
+    source.add_argument("--flight", action="store_true", help=text)
+    text = "tune the gains of a simulated Betaflight chirp flight instead, to a parameter file"
+    source.add_argument("--autopilot", action="store_true", help=text)
+    content = "result.json, or autopilot.json,"
+    shell.add_output(declared, content, folder="results/demo, demo_flight or demo_autopilot")
+
+    def run(options: argparse.Namespace) -> int:
+        if options.autopilot:
+            shell.start_computing()
+            from jaxquad.autopilot import CHIRP_TRUTH, write_chirp_log
+
+            folder = options.out or Path("results/demo_autopilot")
+            log, axis = write_chirp_log(folder / "demo.bfl"), AutopilotSettings(axis="roll")
+            return run_autopilot(options, log, axis, folder, _NEXT_CHIRP.format(**CHIRP_TRUTH))
+        if options.flight:
+            log, settings = workflows.find_demo_flight()  # before JAX: it may not be there
+            folder, note = Path("results/demo_flight"), _NEXT_FLIGHT
+            shell.start_computing()
+        else:
+            shell.start_computing()
+            settings, truth, folder = workflows.DEMO, workflows.DEMO_TRUTH, Path("results/demo")
+            log = workflows.write_demo_log((options.out or folder) / "demo.csv")
+            note = _NEXT.format(**truth, sum=truth["lag"] + truth["delay"])
+        result = workflows.identify(log, settings)
+        return finish_identification(options, result, options.out or folder, note)
+
+    return run
 
 
 _BELOW_GUIDELINE = 4
@@ -36,7 +108,7 @@ def design(declared: argparse.ArgumentParser) -> Run:
     add("--phase-crossover", type=float, metavar="HZ", help=text)
     force = "overwrite another signal; without it, that is kept, and CSV-2 written"
     file = ("CSV", "by default sweep.csv or multisine.csv")
-    add_output(declared, "the guidelines", file=file, force=force, quiet=False)
+    shell.add_output(declared, "the guidelines", file=file, force=force, quiet=False)
     return _design
 
 
@@ -86,7 +158,9 @@ def _design(options: argparse.Namespace) -> int:
     write_file(out, content)
     if options.json:
         rules = [rule._asdict() for rule in check]
-        print_json({"file": str(out), "samples": signal.time.size, "ok": check.ok, "rules": rules})
+        shell.print_json(
+            {"file": str(out), "samples": signal.time.size, "ok": check.ok, "rules": rules}
+        )
     else:
         hertz = f"{low:g} to {high:g} Hz ({band[0]:.3g} to {band[1]:.3g} rad/s)"
         print(f"{signal.time.size} samples, {signal.time[-1]:.4g} s, {hertz}\n{check}\n{out}")
