@@ -7,16 +7,17 @@ import abc
 import dataclasses
 import importlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any, Literal, NamedTuple
+from typing import Any, cast, Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Complex, Float
 
 from jaxquad._core import Number
 from jaxquad.identify import CurveFirmware
+from jaxquad.records import AXES
 from jaxquad.records.firmware import firmware_names, FirmwareLog, register_log
 
-from ._filters import Filter, FilterChain
+from ._filters import Butterworth, Filter, FilterChain
 from ._law import FlownLoop
 
 
@@ -231,8 +232,19 @@ class Firmware(abc.ABC):
         self, loop: FlownLoop, values: Mapping[str, str], version: Sequence[int], axis: int,
         throttle: float,
     ) -> Iterator[LowPass]:  # fmt: skip
-        """Those of gyro and D term that are on, whose cutoffs may change."""
-        return iter(())
+        """Those of gyro and D term that are on, whose cutoffs may change.
+
+        By default those with parameters of the fields "gyro" and "derivative_hz".
+        """
+        law, rows = loop.law, self.parameters.values()
+        for row in (row for row in rows if row.field == "gyro"):
+            for x in (x for x in law.gyro.filters if isinstance(x, Butterworth)):
+                yield LowPass("gyro", {row.name: float(x.cutoff_hz)}, x, law.gyro.rate_hz)
+        for row in (row for row in rows if row.field == "derivative_hz" and row.axis in (-1, axis)):
+            chain, shared = law.derivative_chain(axis), row.axis < 0
+            d = np.broadcast_to(law.d, (3,))[slice(None) if shared else axis]
+            for x in chain.filters if np.any(d > 0) else ():
+                yield LowPass("derivative", {row.name: cutoff_of(x)}, x, chain.rate_hz, shared)
 
     def notch(self, centre_hz: float, second: float) -> Filter:
         """A static notch by the values of two parameters, see `notches`."""
@@ -259,7 +271,7 @@ class Firmware(abc.ABC):
 
     def curve_kind(self, version: Sequence[int]) -> CurveFirmware:
         """What `jq.identify` calls the family of the `thrust_curve`."""
-        raise NotImplementedError
+        return cast(CurveFirmware, self.log.name)
 
     def flies_adrc(self, values: Mapping[str, str]) -> bool:
         """Whether the log is of a flight with Betaflight's proposed ADRC."""
@@ -272,7 +284,10 @@ class Firmware(abc.ABC):
         return 1.0, 1.0, 1.0
 
     def angle_parameters(self, axis: str, p: float) -> dict[str, float]:
-        """The angle loop's parameters for a gain in 1/s."""
+        """The angle loop's parameters for a gain in 1/s, by default of the field "angle.p"."""
+        for row in self.parameters.values():
+            if row.field == "angle.p" and AXES[row.axis] == axis:
+                return {row.name: p}
         raise ValueError(f"{self.log.title} has no angle loop here.")
 
     def no_ladrc(self) -> str:

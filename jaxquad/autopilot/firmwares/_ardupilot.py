@@ -21,11 +21,10 @@ from jaxquad._core import (
     require_positive,
 )
 from jaxquad.control import Reference, Setpoint
-from jaxquad.identify import CurveFirmware
 from jaxquad.records import AXES
 
 from .._filters import Butterworth, FilterChain, Notch, PT1, Section
-from .._firmware import Channels, Firmware, LowPass, Numbers, OuterLoop, Parameter, rows_of_axes
+from .._firmware import Channels, Firmware, Numbers, OuterLoop, Parameter, rows_of_axes
 from .._law import (
     Advance,
     AngleLoop,
@@ -479,21 +478,6 @@ class ArduPilot(Firmware):
 
     def angle_loop(self, values, axis, dt, *, levelled):
         return OuterLoop.of(values, f"ATC_ANG_{_SHORT[axis]}_P", 1.0, dt, closed=True)
-
-    def low_passes(self, loop, values, version, axis, throttle):
-        law, of_axis = loop.law, lambda x: float(np.broadcast_to(x, (3,))[axis])
-        for x in (x for x in law.gyro.filters if isinstance(x, Butterworth)):
-            yield LowPass("gyro", {"INS_GYRO_FILTER": float(x.cutoff_hz)}, x, law.gyro.rate_hz)
-        slope = of_axis(law.derivative_hz)
-        if slope > 0 and of_axis(law.d) > 0:
-            flown = {f"ATC_RAT_{_SHORT[axis]}_FLTD": slope}
-            yield LowPass("derivative", flown, PT1(slope), 1 / law.dt, shared=False)
-
-    def curve_kind(self, version: Sequence[int]) -> CurveFirmware:
-        return "ardupilot"
-
-    def angle_parameters(self, axis: str, p: float) -> dict[str, float]:
-        return {f"ATC_ANG_{_SHORT[AXES.index(axis)]}_P": p}
 
 
 FIRMWARE = ArduPilot()

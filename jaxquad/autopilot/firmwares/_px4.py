@@ -1,7 +1,7 @@
 """PX4: its rate and attitude loops, parameters, channels and files."""
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import ClassVar
 
 import equinox as eqx
@@ -11,7 +11,6 @@ from jaxtyping import Array, Float, PyTree
 
 from jaxquad._core import as_float, broadcast_gain, Message, per_member, require_positive
 from jaxquad.control import Reference, Setpoint
-from jaxquad.identify import CurveFirmware
 from jaxquad.records import AXES
 
 from .._filters import BandwidthNotch, Butterworth, Filter, FilterChain, PT1, Section
@@ -19,7 +18,6 @@ from .._firmware import (
     Channels,
     Firmware,
     joined_lines,
-    LowPass,
     number_text,
     Numbers,
     OuterLoop,
@@ -276,25 +274,11 @@ class PX4(Firmware):
         name = f"MC_{AXES[axis].upper()}_P"
         return OuterLoop.of(values, name, 1.0, 0.5 * _ESTIMATE + dt, closed=True)
 
-    def low_passes(self, loop, values, version, axis, throttle):
-        law = loop.law
-        for x in (x for x in law.gyro.filters if isinstance(x, Butterworth)):
-            yield LowPass("gyro", {"IMU_GYRO_CUTOFF": float(x.cutoff_hz)}, x, law.gyro.rate_hz)
-        slope = {"IMU_DGYRO_CUTOFF": float(law.derivative_hz)}
-        if law.derivative_hz > 0 and np.any(np.asarray(law.d) > 0):
-            yield LowPass("derivative", slope, PT1(law.derivative_hz), law.gyro.rate_hz)
-
     def notch(self, centre_hz: float, second: float) -> Filter:
         return BandwidthNotch(centre_hz, second)
 
     def notch_width(self, centre_hz: float, half_width: float) -> float:
         return float(np.rint(2 * half_width * centre_hz))
-
-    def curve_kind(self, version: Sequence[int]) -> CurveFirmware:
-        return "px4"
-
-    def angle_parameters(self, axis: str, p: float) -> dict[str, float]:
-        return {f"MC_{axis.upper()}_P": p}
 
     def parameter_file(self, values, title, *, version, profile, raised, words):
         rows = [f"# {title}"] if title else []
