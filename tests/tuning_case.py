@@ -23,10 +23,9 @@ from jaxquad.loops import Loop
 from jaxquad.models import DecoupledAxes
 from jaxquad.simulation import Pulse, Saturation, scenario, Sine, Step
 from jaxquad.tuning import Objective
-from jaxquad.tuning._cost import evaluate_cost, initial_multipliers, stack_copies, Subproblem
+from jaxquad.tuning._cost import count_members, evaluate_cost, stack_copies, Subproblem
 from jaxquad.tuning._lbfgs import minimise as minimise  # for its test and its benchmark
-from jaxquad.tuning._parameters import select_coordinates
-from jaxquad.tuning._problem import linear_loops, make_problem, TimeSpan
+from jaxquad.tuning._problem import linear_loops, make_problem, select_coordinates, TimeSpan
 
 
 KT, J0, LIMIT, DT = 0.0468, 0.0552, 10.0, 0.002  # N m/V, kg m^2, V, s
@@ -136,11 +135,11 @@ def pose(controller, drawn, *, limits=(), fly=True, multiplier=0.0, copies=1):
     Over flights, or the linear loops alone. `multiplier` is that of every limit and member.
     """
     problem = make_problem(controller, drawn, flight(), span=TimeSpan(EVENTS))
-    given = initial_multipliers(problem, limits, copies)
-    given = given._replace(values=tuple(multiplier + x for x in given.values))
+    sizes = [count_members(problem, limit) for limit in limits]
     subproblem = Subproblem(
-        stack_copies(objective(), copies), stack_copies(tuple(limits), copies), given,
-        jnp.full(copies, fly), jnp.full(copies, -0.75),
+        stack_copies(objective(), copies), stack_copies(tuple(limits), copies),
+        tuple(jnp.full((copies, size), multiplier) for size in sizes),
+        jnp.full((copies, len(sizes)), 4.0), jnp.full(copies, fly), jnp.full(copies, -0.75),
     )  # fmt: skip
     return problem, subproblem
 

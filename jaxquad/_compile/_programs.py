@@ -33,8 +33,7 @@ from jaxtyping import Array, PyTree
 
 from jaxquad._core import thread_settings
 
-from ._compile_cache import own_folder
-from ._door import brief_options, compiler_options, compilers
+from ._door import brief_options, compiler_options, compilers, own_folder
 
 
 Numbers = Array | np.ndarray

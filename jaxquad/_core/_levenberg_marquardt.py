@@ -44,11 +44,9 @@ Evaluate = Callable[[Float[Array, " parameters *batch"]], Normal]
 
 
 def minimise(
-    evaluate: Evaluate,
-    z0: Float[Array, " parameters *batch"],
-    max_steps: int | Int[Array, ""],
+    evaluate: Evaluate, z0: Float[Array, " parameters *batch"], max_steps: int | Int[Array, ""],
     tolerance: float = TOLERANCE,
-) -> Descent:
+) -> Descent:  # fmt: skip
     """Lower half the sum of squares of every member until all have stopped.
 
     Damping is by the identity: `z` is a vector of logarithms or of relative values, so that one
@@ -128,11 +126,9 @@ def _with_next_step(state: Descent, tolerance: float) -> Descent:
     # A step that damping has shortened says nothing about the distance to the minimum.
     last = (state.status == RUNNING) & definite & (state.damping <= DAMPING) & enough
     return state._replace(
-        z=_select(last, state.z + change, state.z),
-        change=change,
-        predicted=predicted,
+        z=_select(last, state.z + change, state.z), change=change, predicted=predicted,
         status=jnp.where(last, CONVERGED, state.status),
-    )
+    )  # fmt: skip
 
 
 @runtime_checkable
@@ -158,14 +154,9 @@ P = TypeVar("P", bound=Point)
 
 
 def minimise_on_host(
-    start: P,
-    move: Callable[[P, Float[np.ndarray, " parameters"]], P],
-    max_steps: int,
-    *,
-    tolerance: float = 1e-6,
-    saving: float = 1e-12,
-    damping: float = 1e-3,
-) -> tuple[P, int, int]:
+    start: P, move: Callable[[P, Float[np.ndarray, " parameters"]], P], max_steps: int, *,
+    tolerance: float = 1e-6, saving: float = 1e-12, damping: float = 1e-3,
+) -> tuple[P, int, int]:  # fmt: skip
     """The descent of `minimise` for one problem, as a loop of Python; also its status and steps.
 
     `move` makes the next point from a point and a step, whose coordinates may be those of that

@@ -235,12 +235,9 @@ def nested(head: str, lines: Iterable[str]) -> Lines:
 
 
 def run(
-    loop: Loop,
-    lines: Lines,
-    inputs: tuple[Sequence[Rows | Tile], Flat],
-    outputs: tuple[Sequence[Rows | Tile], Sequence[Shaped]],
-    shared: int = 0,
-) -> Flat:
+    loop: Loop, lines: Lines, inputs: tuple[Sequence[Rows | Tile], Flat],
+    outputs: tuple[Sequence[Rows | Tile], Sequence[Shaped]], shared: int = 0,
+) -> Flat:  # fmt: skip
     """What a kernel of these lines makes of arguments and writes to results.
 
     Each block has some bytes of its own.

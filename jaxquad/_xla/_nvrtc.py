@@ -33,14 +33,9 @@ class CannotCompile(Exception):
 
 
 def launch(
-    text: str,
-    name: str,
-    args: Sequence[Array],
-    outs: Sequence[Any],
-    threads: int,
-    block: int,
+    text: str, name: str, args: Sequence[Array], outs: Sequence[Any], threads: int, block: int,
     shared: int,
-) -> list[Array]:
+) -> list[Array]:  # fmt: skip
     """What the kernel `name` of a text in CUDA C writes to `outs`, [`block`] `threads` at a time.
 
     Its parameters are pointers to the arguments and then to the results. A block has so many bytes
@@ -61,7 +56,7 @@ def launch(
             block_y=one,
             block_z=one,
             shared_mem_bytes=np.int32(shared),
-        )
+        )  # fmt: skip
     )
 
 

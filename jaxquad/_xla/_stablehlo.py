@@ -48,13 +48,9 @@ def hold_in_kernel(
 
 
 def _new_function(
-    name: str,
-    inputs: list[ir.Type],
-    kinds: list[ir.Type],
-    call: Op,
-    module: ir.Module,
+    name: str, inputs: list[ir.Type], kinds: list[ir.Type], call: Op, module: ir.Module,
     symbols: ir.SymbolTable,
-) -> tuple[func.FuncOp, str]:
+) -> tuple[func.FuncOp, str]:  # fmt: skip
     with call.location, ir.InsertionPoint(module.body):
         function = func.FuncOp(name, ir.FunctionType.get(inputs, kinds), visibility="private")
     return function, ir.StringAttr(symbols.insert(function)).value

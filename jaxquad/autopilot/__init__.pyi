@@ -7,6 +7,7 @@ from ._files import (
     WordChange as WordChange,
     write_parameter_files as write_parameter_files,
 )
+from ._filter_bank import filter_choices as filter_choices
 from ._filters import (
     ardupilot_notch as ardupilot_notch,
     BandwidthNotch as BandwidthNotch,
@@ -36,6 +37,7 @@ from ._firmware import (
     rows_of_axes as rows_of_axes,
 )
 from ._flight_channels import (
+    best_filters as best_filters,
     FlightChannels as FlightChannels,
     FlownAutopilot as FlownAutopilot,
     read_channels_if_any as read_channels_if_any,
@@ -43,7 +45,6 @@ from ._flight_channels import (
     settings_of as settings_of,
 )
 from ._flown_law import (
-    best_filters as best_filters,
     flown_law as flown_law,
     FlownLaw as FlownLaw,
     loop_of_law as loop_of_law,
@@ -83,7 +84,6 @@ from ._page import (
 from ._parameters import (
     change_filters as change_filters,
     check_ranges as check_ranges,
-    filter_choices as filter_choices,
     find_parameter as find_parameter,
     firmware_of as firmware_of,
     flown_loop as flown_loop,
@@ -106,39 +106,43 @@ from ._reproduce_flight import (
     reproduce_flight as reproduce_flight,
     Reproduction as Reproduction,
 )
-from .ardupilot._firmware import ardupilot_loop as ardupilot_loop, FlownArduPilot as FlownArduPilot
-from .ardupilot._law import (
+from .firmwares._ardupilot import (
     ardupilot_harmonic_notch as ardupilot_harmonic_notch,
+    ardupilot_loop as ardupilot_loop,
     ArduPilotAttitude as ArduPilotAttitude,
     ArduPilotRate as ArduPilotRate,
+    FlownArduPilot as FlownArduPilot,
     HarmonicNotch as HarmonicNotch,
 )
-from .betaflight._adrc import (
-    adrc_b0 as adrc_b0,
+from .firmwares._betaflight import (
+    betaflight_loop as betaflight_loop,
+    flies_adrc as flies_adrc,
+    FlownBetaflight as FlownBetaflight,
+)
+from .firmwares._betaflight_adrc import (
     adrc_parameters as adrc_parameters,
     b0_law as b0_law,
     betaflight_adrc_loop as betaflight_adrc_loop,
-    BetaflightADRC as BetaflightADRC,
-    flies_adrc as flies_adrc,
+    Flown as Flown,
     FlownADRC as FlownADRC,
 )
-from .betaflight._adrc_loops import (
+from .firmwares._betaflight_adrc_design import (
+    ADRCProposal as ADRCProposal,
     ADRCStage as ADRCStage,
     ADRCTargets as ADRCTargets,
-    Flown as Flown,
-    gyro_filters as gyro_filters,
+    propose_adrc as propose_adrc,
 )
-from .betaflight._adrc_result import (
+from .firmwares._betaflight_adrc_result import (
     ADRCAutopilot as ADRCAutopilot,
     doubted_throttle as doubted_throttle,
 )
-from .betaflight._adrc_search import ADRCProposal as ADRCProposal, propose_adrc as propose_adrc
-from .betaflight._demo_flight import CHIRP_TRUTH as CHIRP_TRUTH, write_chirp_log as write_chirp_log
-from .betaflight._header import (
-    betaflight_loop as betaflight_loop,
-    FlownBetaflight as FlownBetaflight,
+from .firmwares._betaflight_demo import (
+    CHIRP_TRUTH as CHIRP_TRUTH,
+    write_chirp_log as write_chirp_log,
 )
-from .betaflight._law import (
+from .firmwares._betaflight_law import (
+    adrc_b0 as adrc_b0,
+    BetaflightADRC as BetaflightADRC,
     BetaflightAngle as BetaflightAngle,
     BetaflightPID as BetaflightPID,
     DMax as DMax,
@@ -146,8 +150,8 @@ from .betaflight._law import (
     ItermRelax as ItermRelax,
     tpa_factor as tpa_factor,
 )
-from .crazyflie._firmware import (
+from .firmwares._crazyflie import (
     CrazyflieAttitude as CrazyflieAttitude,
     CrazyflieRate as CrazyflieRate,
 )
-from .px4._firmware import px4_loop as px4_loop, PX4Attitude as PX4Attitude, PX4Rate as PX4Rate
+from .firmwares._px4 import px4_loop as px4_loop, PX4Attitude as PX4Attitude, PX4Rate as PX4Rate

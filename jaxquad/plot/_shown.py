@@ -144,9 +144,7 @@ _POINTS = 300
 
 
 def frequencies_of(
-    measured: list[Measured],
-    modelled: list[Modelled],
-    omega: Float[np.ndarray, "..."] | None,
+    measured: list[Measured], modelled: list[Modelled], omega: Float[np.ndarray, "..."] | None
 ) -> Float[np.ndarray, " frequencies"]:
     """Where models are drawn, in rad/s: as given, over what was measured, or about their poles."""
     if omega is not None:

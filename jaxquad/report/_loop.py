@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib.figure import Figure
 
+import jaxquad.spectra as spectra
 from jaxquad.identify import (
     as_sampled,
     behind_filters,
@@ -18,14 +19,7 @@ from jaxquad.identify import (
 from jaxquad.models import Model
 from jaxquad.plot import plain_ticks, short_names, StepBand, steps_figure, unit_label
 from jaxquad.records import Record
-from jaxquad.spectra import (
-    BrokenLoop,
-    Entry,
-    estimate_broken_loop,
-    estimate_step,
-    FrequencyResponse,
-    StepResponse,
-)
+from jaxquad.spectra import BrokenLoop, Entry, FrequencyResponse, StepResponse
 
 from ._page import embed_figure, Section, Table
 
@@ -47,21 +41,17 @@ class Prediction(NamedTuple):
 
 
 def step_section(
-    fit: Fit,
-    frf: FrequencyResponse,
-    record: Record,
-    filters: Sequence[KnownFilter] = (),
+    fit: Fit, frf: FrequencyResponse, record: Record, filters: Sequence[KnownFilter] = (),
     computed: StepBand | None = None,
-) -> Section | None:
+) -> Section | None:  # fmt: skip
     """Measured and predicted step response; None without a reference or room for one.
 
-    The model is up to the input of the `filters`. What is `computed` from law and model is shown
-    where the log does not show a step.
+    What is `computed` from law and model is shown where the log does not show a step.
     """
     if not record.reference_names:
         return None
     try:
-        step = estimate_step(record, output=frf.output_names[0])
+        step = spectra.estimate_step(record, output=frf.output_names[0])
     except ValueError:
         return None
     (reference, output), image = step.names, None
@@ -69,15 +59,16 @@ def step_section(
     if not step.is_conclusive:
         if computed is not None:
             over = 100 * max(float(np.max(computed.middle)) - 1, 0.0)
-            image = embed_figure(
-                lambda: steps_figure({"law and model": computed}),
-                alt="Rate after a step of 1 of the set-point by law and model: overshoot "
-                f"{over:.0f} %.",
-                caption="The logged rate after a step of 1 of the set-point, computed from the law "
-                "of the log's parameters, with the integral as set, and the identified model: "
-                f"overshoot {over:.0f} %; median and 95 % of the plants that the log leaves "
-                "possible.",
+            caption = (
+                "The logged rate after a step of 1 of the set-point, computed from the law of the "
+                "log's parameters, with the integral as set, and the identified model: overshoot "
+                f"{over:.0f} %; median and 95 % of the plants that the log leaves possible."
             )
+            alt = (
+                f"Rate after a step of 1 of the set-point by law and model: overshoot {over:.0f} %."
+            )
+            draw = lambda: steps_figure({"law and model": computed})
+            image = embed_figure(draw, alt=alt, caption=caption)
         return head | {"image": None, "table": None, "notes": [], "computed": image}
     predicted = None
     if fit.verdict.fitted:
@@ -108,18 +99,30 @@ def step_section(
 
 
 def predict_step(fit: Fit, frf: FrequencyResponse, record: Record) -> Prediction | None:
-    """What the model makes of the flown inputs, through the filter of the measured step.
+    """What the model makes of the flown inputs, through the filter of the measured step; None for
+    an unstable one, whose output says nothing."""
+    inputs = np.stack([record.channel(name) for name in frf.input_names], axis=1)
+    inputs -= inputs.mean(0)
 
-    No controller has to be known. None for an unstable model, whose output says nothing.
-    """
-    mean = _stepped(fit.model, frf, record)
+    def stepped(model: Model) -> tuple[Samples, Samples] | None:
+        """The simulated step with its error by the scatter between windows."""
+        driven, integrators = _driven(as_sampled(model, frf), inputs, record.dt)
+        if driven is None:
+            return None
+        output = frf.output_names[0]
+        step = spectra.estimate_step(record, output=output, simulated=driven, drift=integrators)
+        if step.simulated is None or step.simulated_error is None:
+            return None
+        return step.simulated, step.simulated_error
+
+    mean = stepped(fit.model)
     if mean is None or not np.all(np.isfinite(fit.covariance)) or not np.all(fit.standard_errors):
         return None if mean is None else Prediction(mean[0], None)
     places, slopes = fit.parameters.places[: len(fit.names)], []
     for k, error in enumerate(fit.standard_errors):
         values = np.array(fit.values, float)
         values[k] += _SMALL * error
-        moved = _stepped(with_values(fit.model, places, values), frf, record)
+        moved = stepped(with_values(fit.model, places, values))
         if moved is None:
             return Prediction(mean[0], None)
         slopes.append((moved[0] - mean[0]) / (_SMALL * error))
@@ -127,28 +130,11 @@ def predict_step(fit: Fit, frf: FrequencyResponse, record: Record) -> Prediction
     return Prediction(mean[0], np.sqrt(np.maximum(spread, 0.0) + mean[1] ** 2))
 
 
-def _stepped(
-    model: Model, frf: FrequencyResponse, record: Record
-) -> tuple[Samples, Samples] | None:
-    """The simulated step with its error by the scatter between windows."""
-    inputs = np.stack([record.channel(name) for name in frf.input_names], axis=1)
-    driven, integrators = _driven(as_sampled(model, frf), inputs - inputs.mean(0), record.dt)
-    if driven is None:
-        return None
-    step = estimate_step(record, output=frf.output_names[0], simulated=driven, drift=integrators)
-    if step.simulated is None or step.simulated_error is None:
-        return None
-    return step.simulated, step.simulated_error
-
-
 def _driven(
     model: Model, inputs: Float[np.ndarray, "flight inputs"], dt: float
 ) -> tuple[Float[np.ndarray, " flight"] | None, int]:
-    """The first output of a model at rest, None if it is unstable; and its integrators.
-
-    As many integrators as the response has at low frequencies are taken out of the spectrum, where
-    they are infinite, and are done in time.
-    """
+    """The first output of a model at rest, None if it is unstable; and its integrators, which are
+    taken out of the spectrum, where they are infinite, and are done in time."""
     count = len(inputs)
     size = 2 ** int(np.ceil(np.log2(_ROOM * count)))  # quick to transform
     omega = 2 * np.pi * np.fft.rfftfreq(size, dt)
@@ -263,10 +249,8 @@ class LawLoop(NamedTuple):
 def loop_section(
     frf: FrequencyResponse, record: Record, law: LawLoop | None = None
 ) -> Section | None:
-    """Bode diagram, crossover and margins, by the law where it is known.
-
-    Without it None where the units do not tell where the reference enters.
-    """
+    """Bode diagram, crossover and margins, by the law where it is known; without it None where the
+    units do not tell where the reference enters."""
     if law is not None and law.measured.omega.size >= _FEWEST:
         loop, model, note = law.measured, law.model, law.note
         origin = "the law times the plant's response"
@@ -274,7 +258,7 @@ def loop_section(
         entry = entry_of(record, frf)
         if entry is None:
             return None
-        loop = estimate_broken_loop(
+        loop = spectra.estimate_broken_loop(
             record, entry=entry, output=frf.output_names[0], input=frf.input_names[0]
         )
         if loop.omega.size < _FEWEST:

@@ -7,21 +7,10 @@ from itertools import product
 
 import numpy as np
 
+import jaxquad.plot as plot
 from jaxquad.identify import Verification
 from jaxquad.models import Model
-from jaxquad.plot import (
-    bode,
-    channels_of,
-    COHERENT,
-    compare,
-    record_figure,
-    resid,
-    residuals_of,
-    ROWS,
-    short_names,
-    spectrogram,
-    unit_label,
-)
+from jaxquad.plot import COHERENT, short_names, unit_label
 from jaxquad.records import clock_start, Record, show_times
 from jaxquad.spectra import find_line, FrequencyResponse
 
@@ -51,28 +40,18 @@ def response_section(
         for pair in pairs[:share]:
             images.append(_bode(frf, model, others, *pair))
             images += [] if model is None else [_residuals(frf, model, *pair)]
-        rest = len(pairs) - share
-        sections.append(
-            {
-                "name": name if len(frfs) > 1 else "",
-                "images": images,
-                "left_out": f"{rest} more responses are not drawn." if rest > 0 else "",
-            }
-        )
+        rest, name = len(pairs) - share, name if len(frfs) > 1 else ""
+        left_out = f"{rest} more responses are not drawn." if rest > 0 else ""
+        sections.append({"name": name, "images": images, "left_out": left_out})
     return sections
 
 
 def _bode(
-    frf: FrequencyResponse,
-    model: Model | None,
-    others: Mapping[str, FrequencyResponse],
-    output: int,
-    source: int,
-) -> Image:
-    shorten = lambda response: replace(
-        response,
-        input_names=short_names(response.input_names),
-        output_names=short_names(response.output_names),
+    frf: FrequencyResponse, model: Model | None, others: Mapping[str, FrequencyResponse],
+    output: int, source: int,
+) -> Image:  # fmt: skip
+    shorten = lambda x: replace(
+        x, input_names=short_names(x.input_names), output_names=short_names(x.output_names)
     )
     short = shorten(frf)
     same_channels = {
@@ -90,7 +69,7 @@ def _bode(
         )
     pair = (short.output_names[output], short.input_names[source])
     return embed_figure(
-        lambda: bode(short, same_channels, {"identified": model} if model else {}, pair=pair),
+        lambda: plot.bode(short, same_channels, {"identified": model} if model else {}, pair=pair),
         alt=f"Bode diagram of {' / '.join(names)}: magnitude, phase and coherence with "
         f"their 95 % band{' and the identified model' if model is not None else ''}. {coherence}",
         ratio=names,
@@ -99,7 +78,7 @@ def _bode(
 
 
 def _residuals(frf: FrequencyResponse, model: Model, output: int, source: int) -> Image:
-    residuals = residuals_of(frf, model, output, source)
+    residuals = plot.residuals_of(frf, model, output, source)
     names, count = (frf.output_names[output], frf.input_names[source]), residuals.coherent.sum()
     summary = f"no frequency has a coherence of {COHERENT} or more."
     if count:
@@ -111,7 +90,7 @@ def _residuals(frf: FrequencyResponse, model: Model, output: int, source: int) -
             f"{COHERENT} or more."
         )
     return embed_figure(
-        lambda: resid(residuals),
+        lambda: plot.resid(residuals),
         alt=f"Residuals of {' / '.join(names)} over frequency, in units of the random error. "
         f"{summary}",
         ratio=names,
@@ -123,8 +102,8 @@ def record_section(records: Mapping[str, Record]) -> list[dict[str, object]]:
     """Every channel over time, and its size."""
     sections = []
     for name, record in records.items():
-        channels = channels_of(record)
-        drawn, rest = channels[:ROWS], channels[ROWS:]
+        channels = plot.channels_of(record)
+        drawn, rest = channels[: plot.ROWS], channels[plot.ROWS :]
         names = ", ".join(f"{role} {channel}" for role, channel in drawn)
         text = (
             f"{record.samples} samples, {record.duration:.6g} s at {record.sample_rate:.6g} Hz, "
@@ -132,7 +111,7 @@ def record_section(records: Mapping[str, Record]) -> list[dict[str, object]]:
         )
         text += "" if record.reference_names else " There is no external reference."
         image = embed_figure(
-            lambda record=record, drawn=drawn: record_figure(record, drawn),
+            lambda record=record, drawn=drawn: plot.record_figure(record, drawn),
             alt=f"Over time, from top to bottom: {names}.",
             caption=f"{len(rest)} more channels are not drawn." if rest else "",
         )
@@ -143,15 +122,9 @@ def record_section(records: Mapping[str, Record]) -> list[dict[str, object]]:
             numbers = (values.mean(), values.std(), values.min(), values.max())
             rows.append([Cell(channel), role, _unit(unit), *(f"{x:.4g}" for x in numbers)])
         heads = ("channel", "role", "unit", "mean", "std. deviation", "minimum", "maximum")
-        sections.append(
-            {
-                "name": name if len(records) > 1 else "",
-                "source": record.source,
-                "text": text,
-                "image": image,
-                "channels": Table("Channels", heads, rows, texts=3),
-            }
-        )
+        section = {"name": name if len(records) > 1 else "", "source": record.source, "text": text}
+        table = Table("Channels", heads, rows, texts=3)
+        sections.append(section | {"image": image, "channels": table})
     return sections
 
 
@@ -176,18 +149,13 @@ def check_section(checks: Mapping[str, Verification]) -> dict[str, object]:
             for one, short in zip(check.outputs, names, strict=True)
         )
         image = embed_figure(
-            lambda check=check, outputs=outputs: compare(replace(check, outputs=outputs)),
+            lambda check=check, outputs=outputs: plot.compare(replace(check, outputs=outputs)),
             alt=f"Measured and simulated {check.output_name} over time, {name}: fit "
             f"{check.fit_percent:.1f} %, TIC {check.tic:.3f}.",
         )
-        sections.append(
-            {
-                "name": name,
-                "image": image,
-                "measures": Table(f"Agreement, {within}", heads, rows, texts=2),
-                "omitted": str(check.omitted) if check.omitted else "",
-            }
-        )
+        measures = Table(f"Agreement, {within}", heads, rows, texts=2)
+        omitted = str(check.omitted) if check.omitted else ""
+        sections.append({"name": name, "image": image, "measures": measures, "omitted": omitted})
     return {"good": GOOD_TIC, "checks": sections}
 
 
@@ -200,7 +168,7 @@ def spectrum_section(frf: FrequencyResponse, record: Record) -> Section | None:
     overs = ["time", *([throttle] if throttle else [])]
     images = [
         embed_figure(
-            lambda over=over: spectrogram(record, output, over=over),
+            lambda over=over: plot.spectrogram(record, output, over=over),
             alt=f"Power spectral density of {output} over {over}.",
             caption=f"Spectrum of {output} over {over}.",
             is_map=True,

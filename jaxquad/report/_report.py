@@ -13,17 +13,16 @@ from jaxquad.records import Record
 from jaxquad.spectra import FrequencyResponse
 
 from ._answers import answer_section
-from ._fit import identifiability_section, parameter_section
 from ._loop import LawLoop, loop_section, step_section
-from ._measured import (
-    check_section,
-    GOOD_TIC,
-    record_section,
-    response_section,
-    spectrum_section,
+from ._measured import check_section, GOOD_TIC, record_section, response_section, spectrum_section
+from ._numbers import (
+    identifiability_section,
+    parameter_section,
+    tuned_section,
+    verdict_headlines,
 )
 from ._page import Headline, render_page
-from ._provenance import attempt, Provenance, provenance_section
+from ._results import attempt, Provenance, provenance_section
 
 
 if TYPE_CHECKING:
@@ -38,25 +37,16 @@ _ORDER = (
 
 
 def write_report(
-    path: str | Path,
-    *,
-    fit: Fit,
-    frf: FrequencyResponse | Mapping[str, FrequencyResponse],
+    path: str | Path, *, fit: Fit, frf: FrequencyResponse | Mapping[str, FrequencyResponse],
     models: Mapping[str, Model] | None = None,
     others: Mapping[str, FrequencyResponse] | None = None,
-    record: Record | Mapping[str, Record] | None = None,
-    spectrum: Record | None = None,
-    filters: Sequence[KnownFilter] = (),
-    law: LawLoop | None = None,
+    record: Record | Mapping[str, Record] | None = None, spectrum: Record | None = None,
+    filters: Sequence[KnownFilter] = (), law: LawLoop | None = None,
     checks: Verification | Mapping[str, Verification] | None = None,
-    derived: Sequence[Combination] = (),
-    texts: Mapping[str, str] | None = None,
-    tuned: "Tuned | Certificate | None" = None,
-    flights: "Mapping[str, Simulation] | None" = None,
-    provenance: Provenance | None = None,
-    title: str = "",
-    formula: str = "",
-) -> Path:
+    derived: Sequence[Combination] = (), texts: Mapping[str, str] | None = None,
+    tuned: "Tuned | Certificate | None" = None, flights: "Mapping[str, Simulation] | None" = None,
+    provenance: Provenance | None = None, title: str = "", formula: str = "",
+) -> Path:  # fmt: skip
     """Write one self-contained HTML page on a fit, whole or not at all.
 
     The verdict and all remarks come first, then what the log can answer and what to fly next,
@@ -119,8 +109,6 @@ def write_report(
     headlines = [fit_headline(fit, len(remarks))]
     headlines += [check_headline(name, check, fit) for name, check in verified.items()]
     if tuned is not None:
-        from ._tuned import tuned_section, verdict_headlines  # the room of tuning takes 0.2 s
-
         headlines += verdict_headlines(tuned)
         sections["tuned"] = attempt(tuned_section, tuned, flights or {})
     sections["response"] = attempt(response_section, frfs, drawn, others or {})
@@ -135,15 +123,10 @@ def write_report(
     if verified:
         sections["verification"] = attempt(check_section, verified)
     text = render_page(
-        "report.html",
-        title=f"{headlines[0].word}: {title or ' / '.join(names)}",
-        title_text=title,
-        names=names,
-        headlines=headlines,
-        remarks=remarks,
-        formula=formula,
+        "report.html", title=f"{headlines[0].word}: {title or ' / '.join(names)}",
+        title_text=title, names=names, headlines=headlines, remarks=remarks, formula=formula,
         sections={name: sections[name] for name in _ORDER if sections.get(name) is not None},
-    )
+    )  # fmt: skip
     return write_file(path, text)
 
 

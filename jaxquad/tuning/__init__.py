@@ -7,18 +7,16 @@ from ._certify import (
     KNOWN_INERTIA as KNOWN_INERTIA,
     paper_designs as paper_designs,
     peers as peers,
+    worst_flights as worst_flights,
 )
-from ._cost import Evaluation as Evaluation
+from ._cost import Evaluation as Evaluation, GaussNewton as GaussNewton
 from ._design_result import (
     DesignResult as DesignResult,
     DesignSummary as DesignSummary,
-    Distance as Distance,
-    front_point as front_point,
     LinearMembers as LinearMembers,
     share_interval as share_interval,
     upper_bound as upper_bound,
 )
-from ._gauss_newton import GaussNewton as GaussNewton
 from ._lbfgs import LBFGS as LBFGS
 from ._objective import (
     CVaR as CVaR,
@@ -27,16 +25,12 @@ from ._objective import (
     Mix as Mix,
     Objective as Objective,
     Penalty as Penalty,
+    QUANTITIES as QUANTITIES,
+    Quantity as Quantity,
     Worst as Worst,
 )
-from ._pareto import Pareto as Pareto, pareto as pareto
-from ._quantities import QUANTITIES as QUANTITIES, Quantity as Quantity
+from ._pareto import front_point as front_point, Pareto as Pareto, pareto as pareto
+from ._problem import Bound as Bound
 from ._tail import Tail as Tail
-from ._tune import tune as tune
-from ._tuned import (
-    LimitResult as LimitResult,
-    Optimum as Optimum,
-    Tuned as Tuned,
-    worst_flights as worst_flights,
-)
-from ._verdict import Bound as Bound, Verdict as Verdict
+from ._tune import LimitResult as LimitResult, Optimum as Optimum, tune as tune, Tuned as Tuned
+from ._verdict import Distance as Distance, Verdict as Verdict

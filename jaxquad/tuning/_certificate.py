@@ -14,13 +14,12 @@ from jaxquad.control import LADRC
 from ._design_result import (
     DesignResult,
     DesignSummary,
-    Distance,
     LinearMembers,
     summarise_design,
     upper_bound,
 )
-from ._quantities import QUANTITIES
-from ._verdict import judge_performance, judge_stability, NOT_TUNED, overall, Verdict
+from ._objective import QUANTITIES
+from ._verdict import Distance, joined, judge_performance, judge_stability, NOT_TUNED, Verdict
 
 
 class Provenance(TypedDict):
@@ -61,20 +60,6 @@ def member_text(certificate: "Certificate", index: int) -> str:
     return f"member {index}: {', '.join(parts)}"
 
 
-def worst_lines(certificate: "Certificate") -> list[str]:
-    """The worst value of each quantity and its member; a member is named once."""
-    by_member: dict[int, list[str]] = {}
-    for quantity in _NAMED:
-        if quantity not in certificate.design.by_axis:
-            continue
-        worst = certificate.design.worst_member(quantity)
-        if worst is not None:
-            value = certificate.design.of(quantity)[worst]
-            text = f"{QUANTITIES[quantity].title} {QUANTITIES[quantity].text(value)}"
-            by_member.setdefault(worst, []).append(text)
-    return [f"{', '.join(what)}: {member_text(certificate, k)}" for k, what in by_member.items()]
-
-
 def _joined(values: Float[np.ndarray, "..."]) -> str:
     texts = [f"{x:.3g}" for x in np.atleast_1d(values)]
     return texts[0] if len(set(texts)) == 1 else "/".join(texts)
@@ -98,37 +83,6 @@ _LINES = (
     ("saturated, %", "mean", "saturation_share", "mean"),
     ("disturbance err., N m", "mean", "disturbance_rmse", "mean"),
 )  # fmt: skip
-
-
-def describe(certificate: "Certificate") -> str:
-    """The verdicts, the limits, the designs side by side, the worst members, and the remarks."""
-    lines = [headline(certificate), *(f"  {verdict}" for verdict in certificate.verdicts)]
-    lines += [f"  ! {remark}" for remark in certificate.remarks]
-    lines += [f"  {distance}" for distance in certificate.distances]
-    lines += _table(certificate.summaries)
-    if certificate.independent:
-        most = 100 * upper_bound(0, certificate.members)
-        lines.append(
-            f"  worst: of {certificate.members} members; at most {most:.2g} % of all are beyond it "
-            "(95 % confidence)"
-        )
-    lines += [f"  worst members of {certificate.name}:"]
-    lines += [f"    {line}" for line in worst_lines(certificate)]
-    source = certificate.provenance
-    versions = ", ".join(f"{name} {version}" for name, version in source["versions"].items())
-    loops = f" and {source['linear_members']} linear loops" if source["linear_members"] else ""
-    count = f"{source['members']} members{loops}"
-    lines.append(f"  {count}, {source['sampling']}, key {source['key']}; {versions}")
-    return "\n".join(lines)
-
-
-def headline(certificate: "Certificate") -> str:
-    """One line: whether the design may be flown, or which of the three verdicts fails."""
-    fresh = "fresh " * certificate.provenance["fresh"]
-    text, further = f"{certificate.members} {fresh}members", certificate.further
-    if further is not None:
-        text += f" ({certificate.members + further.design.members} linear loops)"
-    return overall(certificate.verdicts, text)
 
 
 def _table(rows: dict[str, DesignSummary]) -> list[str]:
@@ -249,24 +203,20 @@ class Certificate(eqx.Module):
     def stable(self) -> bool:
         """No member is linearly unstable, none diverged, and no observer is unstable by itself."""
         design, observer = self.design, self.design.observer_instability
-        tail = self.further is not None and bool(self.further.design.unstable_count)
-        return (
-            design.unstable_count == 0 and not tail and not design.diverged.any() and not observer
-        )
+        tail = 0 if self.further is None else self.further.design.unstable_count
+        return not (design.unstable_count != 0 or tail or design.diverged.any() or observer)
 
     @property
     def stability(self) -> Verdict:
         """Whether all members are stable and within the limits."""
-        return judge_stability(
-            self.design, self.distances, further=self.further, independent=self.independent,
-            place=lambda index: member_text(self, index),
-        )  # fmt: skip
+        place = lambda index: member_text(self, index)
+        return judge_stability(self.design, self.distances, self.further, self.independent, place)
 
     @property
     def performance(self) -> Verdict:
         """Whether the design is of use, against doing nothing and beside its start."""
-        compared = (self.design, self.idle, self.start, self.error)
-        return judge_performance(*compared, independent=self.independent)
+        compared = self.design, self.idle, self.start
+        return judge_performance(*compared, self.error, self.independent)
 
     @property
     def verdicts(self) -> tuple[Verdict, Verdict, Verdict]:
@@ -289,12 +239,6 @@ class Certificate(eqx.Module):
         summarise = ft.partial(summarise_design, independent=self.independent)
         return {name: summarise(design) for name, design in self.designs.items()}
 
-    @property
-    def _baselines(self) -> dict[str, DesignSummary]:
-        summarise = ft.partial(summarise_design, independent=self.independent)
-        start = {} if self.start is None else {"start": summarise(self.start)}
-        return {"doing nothing": summarise(self.idle)} | start
-
     def member(self, index: int) -> dict[str, Float[np.ndarray, " axes"]]:
         """The parameters of one member, per axis, in SI units; further ones follow those flown."""
         facts = self.facts
@@ -304,14 +248,17 @@ class Certificate(eqx.Module):
 
     def content(self) -> dict[str, object]:
         """Everything, arrays per member included, for `jaxquad.report.write_json`."""
+        baselines = {"doing nothing": self.idle}
+        baselines |= {} if self.start is None else {"start": self.start}
+        summarise = ft.partial(summarise_design, independent=self.independent)
         return {
-            "certificate": headline(self),
+            "certificate": self._headline,
             "holds": self.holds,
             "verdicts": [verdict._asdict() for verdict in self.verdicts],
             "provenance": self.provenance,
             "limits": [distance.content() for distance in self.distances],
             "designs": {name: row.content() for name, row in self.summaries.items()},
-            "baselines": {name: row.content() for name, row in self._baselines.items()},
+            "baselines": {name: summarise(x).content() for name, x in baselines.items()},
             "error": self.error,
             "remarks": self.remarks,
             "members": self.facts | {"nominal_inertia": self.nominal},
@@ -319,5 +266,40 @@ class Certificate(eqx.Module):
             "further": None if self.further is None else self.further.content(),
         }
 
+    @property
+    def _headline(self) -> str:
+        """Whether the design may be flown, or which of the three verdicts fails."""
+        on = f"{self.members} {'fresh ' * self.provenance['fresh']}members"
+        if self.further is not None:
+            on += f" ({self.members + self.further.design.members} linear loops)"
+        failed = [v.name for v in self.verdicts if v.holds is False]
+        if failed:
+            return f"CERTIFICATE FAILS on {on}, not to be flown: {joined(failed)}"
+        holding = [v.name for v in self.verdicts if v.holds is not None]
+        return f"CERTIFICATE HOLDS on {on}: {joined(holding)}"
+
     def __str__(self) -> str:
-        return describe(self)
+        lines = [self._headline, *(f"  {verdict}" for verdict in self.verdicts)]
+        lines += [f"  ! {remark}" for remark in self.remarks]
+        lines += [f"  {distance}" for distance in self.distances]
+        lines += _table(self.summaries)
+        if self.independent:
+            most = 100 * upper_bound(0, self.members)
+            lines.append(
+                f"  worst: of {self.members} members; at most {most:.2g} % of all are beyond it "
+                "(95 % confidence)"
+            )
+        lines += [f"  worst members of {self.name}:"]
+        by_member: dict[int, list[str]] = {}  # each is named once
+        for name in _NAMED:
+            worst = self.design.worst_member(name) if name in self.design.by_axis else None
+            if worst is not None:
+                shown, value = QUANTITIES[name], self.design.of(name)[worst]
+                by_member.setdefault(worst, []).append(f"{shown.title} {shown.text(value)}")
+        lines += [f"    {', '.join(x)}: {member_text(self, k)}" for k, x in by_member.items()]
+        source = self.provenance
+        versions = ", ".join(f"{name} {version}" for name, version in source["versions"].items())
+        loops = f" and {source['linear_members']} linear loops" if source["linear_members"] else ""
+        count = f"{source['members']} members{loops}"
+        lines.append(f"  {count}, {source['sampling']}, key {source['key']}; {versions}")
+        return "\n".join(lines)

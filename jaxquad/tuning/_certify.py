@@ -1,8 +1,9 @@
-"""Designs that a tuned one is compared with."""
+"""Certificates of designs, what they are compared with, and their worst flights."""
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from importlib.metadata import version
+from typing import TYPE_CHECKING
 
 import equinox as eqx
 import jax
@@ -10,31 +11,45 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key, PyTree
 
-from jaxquad.control import certainty_equivalence, LADRC, Reference, ScheduledLADRC
-from jaxquad.ensembles import Ensemble, Members
+from jaxquad._core import as_array
+from jaxquad.control import (
+    certainty_equivalence,
+    LADRC,
+    Reference,
+    schedule_for_flight,
+    ScheduledLADRC,
+)
+from jaxquad.ensembles import Ensemble, Members, Posterior
 from jaxquad.loops import Loop
 from jaxquad.models import DecoupledAxes, Multirotor, QUANSER_HOVER
-from jaxquad.simulation import Authority, beyond_authority, find_authority, Scenario
+from jaxquad.simulation import (
+    beyond_authority,
+    find_authority,
+    Scenario,
+    simulate,
+    Simulation,
+)
 
 from ._certificate import Certificate, find_ladrc, lag_remark, Provenance
-from ._design_result import measure_distances
-from ._evaluate_design import analyse_further, evaluate_design, member_facts
-from ._objective import Limit
+from ._design_result import analyse_further, evaluate_design, member_facts
+from ._objective import Limit, QUANTITIES
 from ._problem import decouple, DeviceChoice, Plant, require_same_rate, TimeSpan
-from ._quantities import QUANTITIES
+from ._verdict import measure_distances
+
+
+if TYPE_CHECKING:
+    from ._tune import Tuned
 
 
 class _Idle(eqx.Module):
     """The controller that does nothing."""
 
     def init(self, like: Float[Array, " axes *ensemble"]) -> None:
-        """It remembers nothing."""
         return None
 
     def step(
         self, state: None, reference: Reference, measurement: Float[Array, " axes *ensemble"]
     ) -> tuple[None, Float[Array, " axes *ensemble"]]:
-        """The command 0."""
         return None, jnp.zeros_like(measurement)
 
 
@@ -103,7 +118,7 @@ def certify(
             f"ensemble is a {type(ensemble).__name__}: give jq.Ensemble(inertia=...), or "
             "jq.ensembles.Members of it"
         )
-    span, peers = TimeSpan(tuple(events), start, stop, load_start), dict(peers or {})
+    span, peers = TimeSpan(tuple(events), start, stop, load_start), peers or {}
     if name in peers:
         raise ValueError(f"a peer has the name {name!r} of the design itself: rename it")
     # Independent draws, as the bound of a share needs.
@@ -147,47 +162,55 @@ def certify(
         error="itae" if np.any(np.asarray(flight.reference) != 0) else "rms",
         further=further,
     )
-    members_loop = drawn.loop(loop.controller)
-    authority = _find_authority(members_loop.plant, members_loop.drive, members_loop.controller)
-    remarks = _remarks(certificate, loop.controller, drawn) + beyond_authority(authority, flight)
-    if isinstance(ensemble, Ensemble) and ensemble.plants is not None:
-        remarks += _beyond_band(loop.controller, ensemble.plants.band)
-        remarks += _beyond_record(authority, ensemble.plants.largest_command)
+    plants = ensemble.plants if isinstance(ensemble, Ensemble) else None
+    remarks = _remarks(certificate, loop.controller, drawn, flight, plants)
     return dataclasses.replace(certificate, remarks=tuple(remarks))
 
 
 _find_authority = eqx.filter_jit(find_authority)  # many small operations, as one program
-
-
 _ROUNDED = 1.01  # by which a number may exceed what the record knows without a word
 
 
-def _beyond_record(authority: Authority | None, largest: float | None) -> list[str]:
-    """Whether the command may exceed all that the record has, where both are known."""
+def _remarks(
+    certificate: Certificate, controller: PyTree, drawn: Members, flight: Scenario,
+    plants: Posterior | None,
+) -> Iterator[str]:  # fmt: skip
+    missed = [x for x in certificate.distances if QUANTITIES[x.quantity].linear and not x.met]
+    lag = lag_remark(controller, drawn.delay, decouple(drawn.plant).lag)
+    if lag and (missed or not certificate.stable):
+        yield lag
+    if not certificate.independent:
+        yield "the members were given: whether the tuner saw them is not known"
+    counts = {n: x.unstable_count for n, x in certificate.designs.items() if x.unstable_count}
+    if counts:
+        text = ", ".join(f"{count} of {n}" for n, count in counts.items())
+        yield f"no Ms and no margins (n/a) over members that are unstable: {text}"
+    for name, design in certificate.designs.items():
+        if name != certificate.name and design.observer_instability:
+            yield f"of {name}: {design.observer_instability}"
+    loop = drawn.loop(controller)
+    authority = _find_authority(loop.plant, loop.drive, loop.controller)
+    yield from beyond_authority(authority, flight)
+    if plants is None:
+        return
+    ladrc, band, largest = find_ladrc(controller), plants.band, plants.largest_command
+    for name in ("wc", "wo") if ladrc is not None and band is not None else ():
+        value = float(np.max(np.asarray(vars(ladrc)[name])))
+        if value > _ROUNDED * band[1]:
+            hertz = f"{band[0] / (2 * np.pi):.3g} to {band[1] / (2 * np.pi):.3g} Hz"
+            yield (
+                f"{name} = {value:.4g} rad/s lies beyond the identified band of {band[0]:.3g} to "
+                f"{band[1]:.3g} rad/s ({hertz}): the design relies on a model that no data support "
+                f"there. Hold {name} at {band[1]:.2g} rad/s or below, or record to higher "
+                "frequencies"
+            )
     limit = np.inf if authority is None else float(np.max(np.asarray(authority.command)))
-    if largest is None or not np.isfinite(limit) or limit <= _ROUNDED * largest:
-        return []
-    return [
-        f"the limit of the command, {limit:.4g}, is {limit / largest:.2g} times the largest "
-        f"command of the record, {largest:.3g}: the model is not known there. Lower the limit to "
-        f"{largest:.2g}, or record larger commands"
-    ]
-
-
-def _beyond_band(controller: PyTree, band: tuple[float, float] | None) -> list[str]:
-    """Which bandwidths of a LADRC lie beyond the identified band, where it is known."""
-    ladrc = find_ladrc(controller)
-    if band is None or ladrc is None:
-        return []
-    rates = {name: float(np.max(np.asarray(vars(ladrc)[name]))) for name in ("wc", "wo")}
-    hertz = f"{band[0] / (2 * np.pi):.3g} to {band[1] / (2 * np.pi):.3g} Hz"
-    return [
-        f"{name} = {value:.4g} rad/s lies beyond the identified band of {band[0]:.3g} to "
-        f"{band[1]:.3g} rad/s ({hertz}): the design relies on a model that no data support "
-        f"there. Hold {name} at {band[1]:.2g} rad/s or below, or record to higher frequencies"
-        for name, value in rates.items()
-        if value > _ROUNDED * band[1]
-    ]
+    if largest is not None and np.isfinite(limit) and limit > _ROUNDED * largest:
+        yield (
+            f"the limit of the command, {limit:.4g}, is {limit / largest:.2g} times the largest "
+            f"command of the record, {largest:.3g}: the model is not known there. Lower the limit "
+            f"to {largest:.2g}, or record larger commands"
+        )
 
 
 def describe_controller(controller: PyTree) -> dict[str, object]:
@@ -195,21 +218,6 @@ def describe_controller(controller: PyTree) -> dict[str, object]:
     leaves = jax.tree_util.tree_leaves_with_path(eqx.filter(controller, eqx.is_array))
     numbers = {jax.tree_util.keystr(path)[1:]: np.asarray(x).tolist() for path, x in leaves}
     return {"class": type(controller).__name__, "numbers": numbers}
-
-
-def _remarks(certificate: Certificate, controller: PyTree, drawn: Members) -> list[str]:
-    missed = [x for x in certificate.distances if QUANTITIES[x.quantity].linear and not x.met]
-    lag = lag_remark(controller, drawn.delay, decouple(drawn.plant).lag)
-    remarks = [lag] if lag and (missed or not certificate.stable) else []
-    if not certificate.independent:
-        remarks.append("the members were given: whether the tuner saw them is not known")
-    counts = {n: x.unstable_count for n, x in certificate.designs.items() if x.unstable_count}
-    if counts:
-        text = ", ".join(f"{count} of {n}" for n, count in counts.items())
-        remarks.append(f"no Ms and no margins (n/a) over members that are unstable: {text}")
-    others = {n: x for n, x in certificate.designs.items() if n != certificate.name}
-    whys = {n: x.observer_instability for n, x in others.items()}
-    return remarks + [f"of {n}: {why}" for n, why in whys.items() if why]
 
 
 WC, WO = 10.0, 30.0  # rad/s, the paper's
@@ -294,3 +302,91 @@ def _nominal_numbers(
         )
     KT, J = np.broadcast_arrays(np.asarray(axes.torque_gain, float), np.asarray(axes.inertia))
     return KT, J
+
+
+def worst_flights(
+    design: "Tuned | Certificate",
+    loop: Loop,
+    ensemble: Ensemble | Members,
+    scenario: Scenario,
+    *,
+    quantities: Sequence[str] = ("itae", "sensitivity_peak"),
+) -> dict[str, Simulation]:
+    """Fly the nominal loop, and the members of a certificate that are worst in some quantity.
+
+    The members have the noise that was theirs.
+
+    **Arguments:**
+
+    - `design`: a tuned design with its certificate, or a certificate, whose design is
+        `loop.controller`.
+    - `loop`, `ensemble`, `scenario`: those that it was made with. Where it was made on given
+        members, these are the `ensemble`.
+    - `quantities`: names of `jaxquad.tuning`.
+
+    **Returns:** simulations by what they are: "nominal", "worst ITAE (member 12)".
+
+    **Raises:** ValueError for a design without certificate, for unknown quantities, and for parts
+    that the certificate was not made with.
+    """
+    certificate, controller = design, loop.controller
+    if not isinstance(certificate, Certificate):
+        certificate, controller = certificate.certificate, certificate.controller
+    if certificate is None:
+        raise ValueError(
+            "the design has no certificate, so that its worst members are not known: tune with "
+            "fresh=256, or simulate some members with jq.simulate"
+        )
+    unknown = [name for name in quantities if name not in certificate.design.by_axis]
+    if unknown or not quantities:
+        computed = ", ".join(certificate.design.by_axis)
+        raise ValueError(f"no quantities {unknown} in the certificate: choose from {computed}")
+    worst: dict[int, list[str]] = {}
+    for name in quantities:
+        index = certificate.design.worst_member(name)
+        if index is not None:
+            worst.setdefault(index, []).append(QUANTITIES[name].title)
+    inertia = certificate.nominal
+    if inertia is None:
+        inertia = np.exp(np.mean(np.log(certificate.facts["inertia"]), axis=1))
+    nominal = loop.with_controller(schedule_for_flight(controller, inertia))
+    flights = {"nominal": simulate(nominal, scenario)}
+    if worst:
+        members = _certified_flights(certificate, loop, ensemble).take(list(worst))
+        flown = simulate(members.loop(controller), members.flight(scenario))
+        for k, (member, names) in enumerate(worst.items()):
+            flights[f"worst {' and '.join(names)} (member {member})"] = _member(flown, k)
+    return flights
+
+
+def _certified_flights(
+    certificate: Certificate, loop: Loop, ensemble: Ensemble | Members
+) -> Members:
+    members, data = ensemble, certificate.provenance["key"]
+    if isinstance(members, Ensemble):
+        if data is None:
+            raise ValueError(
+                "the certificate was made on members that were given: give these as the ensemble"
+            )
+        key = jax.random.wrap_key_data(as_array(np.asarray(data, np.uint32)))
+        members = members.fresh(loop, certificate.members, key)
+    shape = certificate.facts["assumed_inertia"].shape
+    if members.assumed_inertia.shape != shape:
+        raise ValueError(
+            f"the members have the shape {members.assumed_inertia.shape}, but the certificate was "
+            f"made on {shape}: give the loop and ensemble that it was made with"
+        )
+    return members
+
+
+def _member(flights: Simulation, k: int) -> Simulation:
+    """One of an ensemble of simulations. Compiles nothing."""
+    count = flights.diverged.shape
+    at = lambda x: as_array(np.asarray(x)[..., k])
+    pick = lambda x: at(x) if x.shape[-1:] == count and x.ndim > 2 else x
+    parts = {name: pick(part) for name, part in flights.scenario.parts.items()}
+    return Simulation(
+        flights.time, at(flights.angle), at(flights.measurement), at(flights.command),
+        at(flights.saturated), {}, at(flights.diverged), Scenario(**parts, dt=flights.scenario.dt),
+        flights.dt,
+    )  # fmt: skip

@@ -1,4 +1,4 @@
-"""The cost of many designs at once, with its gradient; the history of its evaluations."""
+"""What a descent lowers: the cost of many designs at once with its gradient, or its residuals."""
 
 import functools as ft
 import sys
@@ -15,11 +15,22 @@ from jaxtyping import Array, Bool, Float, PyTree
 from jaxquad._compile import brief_options, Jit
 from jaxquad._core import as_array
 from jaxquad.control import ObserverController
+from jaxquad.simulation import SampleResult, scan_loop
 
-from ._objective import Limit, Objective, soft, Worst
-from ._parameters import Coordinates
-from ._problem import Problem
-from ._quantities import QUANTITIES, split_quantities
+from ._objective import (
+    is_gated,
+    Limit,
+    Mean,
+    Objective,
+    Penalty,
+    QUANTITIES,
+    risk_text,
+    soft,
+    split_quantities,
+    stability_gate,
+    Worst,
+)
+from ._problem import Coordinates, Problem
 
 
 _BARRIER = 0.01  # weight of the barrier before observers that are slower than the feedback
@@ -41,19 +52,13 @@ def take_problem(tree: Tree, index: int) -> Tree:
     return eqx.combine(jax.tree.map(lambda x: as_array(np.asarray(x)[index]), arrays), rest)
 
 
-class Multipliers(NamedTuple):
-    """Of the augmented Lagrangian, with a constraint for each limit and member."""
-
-    values: tuple[Float[Array, "problems members"], ...]  # of each limit
-    stiffness: Float[Array, "problems limits"]
-
-
 class Subproblem(NamedTuple):
     """What is minimised: the abscissa, down to `rate`, or the objective with its limits."""
 
     objective: Objective  # arrays [problems, ...]
     limits: tuple[Limit, ...]  # the same
-    multipliers: Multipliers
+    multipliers: tuple[Float[Array, "problems members"], ...]  # of each limit, for each member
+    stiffness: Float[Array, "problems limits"]
     fly: Bool[Array, " problems"]  # the second phase
     rate: Float[Array, " problems"]  # 1/s
 
@@ -107,20 +112,15 @@ def evaluate_cost(
 def _evaluate_one(
     z: Float[Array, " n"], coordinates: Coordinates, problem: Problem, subproblem: Subproblem
 ) -> CostResult:
-    def total(z: Float[Array, " n"]) -> tuple[Array, PyTree]:
-        controller = coordinates.controller_at(z)
-        value, others = _cost(controller, problem, subproblem)
-        if isinstance(controller, ObserverController):
-            value = value + _BARRIER * controller.observer_barrier(coordinates.arrays)
-        return value, others
-
-    (value, others), gradient = jax.value_and_grad(total, has_aux=True)(z)
+    run = jax.value_and_grad(_cost, has_aux=True)
+    (value, others), gradient = run(z, coordinates, problem, subproblem)
     return CostResult(value, gradient, *others)
 
 
 def _cost(
-    controller: PyTree, problem: Problem, subproblem: Subproblem
+    z: Float[Array, " n"], coordinates: Coordinates, problem: Problem, subproblem: Subproblem
 ) -> tuple[Float[Array, ""], PyTree]:
+    controller = coordinates.controller_at(z)
     objective, limits = subproblem.objective, subproblem.limits
     wanted = objective.quantities | {limit.quantity for limit in limits}
     in_flight, linear = split_quantities(wanted)
@@ -144,11 +144,12 @@ def _cost(
     # The augmented Lagrangian of Powell, Hestenes and Rockafellar.
     penalty = jnp.zeros(())
     for k, levels in enumerate(beyond):
-        multiplier = subproblem.multipliers.values[k]
-        stiffness = subproblem.multipliers.stiffness[k]
+        multiplier, stiffness = subproblem.multipliers[k], subproblem.stiffness[k]
         forced = jnp.maximum(multiplier + stiffness * levels, 0)
         penalty = penalty + jnp.sum(forced**2 - multiplier**2) / (2 * stiffness)
     total = jnp.where(subproblem.fly, cost + penalty, settling)
+    if isinstance(controller, ObserverController):
+        total = total + _BARRIER * controller.observer_barrier(coordinates.arrays)
     return total, (cost, costs, worst, limited, beyond)
 
 
@@ -192,11 +193,23 @@ class Progress:
         if self.shown:
             print(text, file=sys.stderr, flush=True)
 
-    def add(self, evaluation: Evaluation) -> None:
-        self.history.append(evaluation)
-        self.say(describe_evaluation(len(self.history), evaluation))
+    def add(self, result: CostResult, z: np.ndarray, on: np.ndarray, fly: bool) -> None:
+        hide = lambda x: np.where(on, np.asarray(x), np.nan)
+        abscissa, counted = np.asarray(result.numbers["abscissa"]), result.costs.shape[1]
+        now = Evaluation(
+            phase="optimise" if fly else "stabilise",
+            z=np.array(z),
+            cost=hide(result.value),
+            gradient_norm=hide(np.linalg.norm(result.gradient, axis=1)),
+            stable=hide(np.mean(abscissa < 0, axis=1)),
+            worst=hide(np.argmax(result.costs if fly else abscissa, axis=1)),
+            means={n: hide(np.mean(x[:, :counted], axis=1)) for n, x in result.numbers.items()},
+            seconds=self.seconds,
+        )
+        self.history.append(now)
+        self.say(describe_evaluation(len(self.history), now))
         if self.listener is not None:
-            self.listener(evaluation)
+            self.listener(now)
 
 
 def describe_evaluation(count: int, now: Evaluation) -> str:
@@ -214,67 +227,135 @@ def describe_evaluation(count: int, now: Evaluation) -> str:
     return "  ".join([*parts, f"{now.seconds:.1f} s"])
 
 
-MET = 2e-3  # beyond a limit, as a level: 0.2 %
-_STIFFNESS, _STIFFER = 4.0, 4.0
-_STALLED = 0.9  # of what a limit was missed by before: it falls no further
-_AS_GOOD = 1.05  # of the least miss: of rounds that miss limits so nearly alike, the cost decides
+_LEAST = 1e-12
 
 
-def initial_multipliers(problem: Problem, limits: Sequence[Limit], problems: int) -> Multipliers:
-    """Before anything is known of the limits."""
-    sizes = [count_members(problem, limit) for limit in limits]
-    values = tuple(as_array(np.zeros((problems, size))) for size in sizes)
-    return Multipliers(values, as_array(np.full((problems, len(sizes)), _STIFFNESS)))
+class GaussNewton(eqx.Module):
+    """Least squares on the tracking errors of all members, by Levenberg-Marquardt.
 
+    Residuals are sqrt(t) times the errors, so tracking counts as ITSE, the integral of t error^2;
+    ITAE itself is no sum of squares. Each member's errors are in units of their size at the start,
+    which stands for the logarithm, and penalties enter by their square roots.
 
-def update_multipliers(
-    result: CostResult,
-    multipliers: Multipliers,
-    before: Float[np.ndarray, "problems limits"],
-    on: Bool[np.ndarray, " problems"],
-) -> tuple[Multipliers, Float[np.ndarray, "problems limits"]]:
-    """The next multipliers of problems that are `on`, and how far each limit is missed.
+    **Arguments:**
 
-    A limit becomes stiffer where it is missed by more than a quarter of what it was `before`.
+    - `steps`: the most steps.
+    - `tolerance`: relative, of cost and parameters.
+    - `stride`: samples that share a residual.
+
+    **Raises:**
+
+    - `ValueError`: `steps` or `stride` is below 1. A tune raises it for terms other than ITAE, for
+        risks other than the mean and for limits, none of which are sums of squares.
     """
-    keep, values, most = np.asarray(on)[:, None], [], []
-    stiffness = np.asarray(multipliers.stiffness)
-    for k, beyond in enumerate(map(np.asarray, result.beyond)):
-        old = np.asarray(multipliers.values[k])
-        raised = np.maximum(old + stiffness[:, k : k + 1] * beyond, 0)
-        values.append(as_array(np.where(keep, raised, old)))
-        most.append(beyond.max(axis=1))
-    missed = np.stack(most, axis=1)
-    slow = missed > np.maximum(0.25 * before, MET)
-    stiffer = np.where(slow & keep, _STIFFER, 1.0) * stiffness
-    return Multipliers(tuple(values), as_array(stiffer)), missed
+
+    steps: int = 30
+    tolerance: float = 1e-4
+    stride: int = 10
+
+    def __check_init__(self):
+        if self.steps < 1 or self.stride < 1:
+            raise ValueError(f"steps is {self.steps} and stride {self.stride}: give 1 or more")
 
 
-class Rounds:
-    """Where each round of multipliers ended, and whether another one is worth it."""
+class _Squares(eqx.Module):
+    coordinates: Coordinates
+    problem: Problem
+    penalties: Sequence[Penalty]
+    scale: Float[Array, "axes members"]  # of the squared errors' sums
+    stride: int = eqx.field(static=True)
 
-    def __init__(self) -> None:
-        self.points: list[Float[np.ndarray, "problems n"]] = []
-        self.costs: list[Float[np.ndarray, " problems"]] = []
-        self.missed: list[Float[np.ndarray, " problems"]] = []
 
-    def add(self, z: np.ndarray, cost: np.ndarray, beyond: np.ndarray) -> None:
-        self.points.append(np.array(z))
-        self.costs.append(np.asarray(cost))
-        self.missed.append(np.maximum(beyond, 0).sum(axis=1))
+def require_squares(objective: Objective, limits: Sequence[Limit]) -> None:
+    """Raise ValueError for what is no sum of squares."""
+    odd = [name for name in objective.terms if name != "itae"]
+    odd += [f"limit on {limit.quantity}" for limit in limits]
+    if not isinstance(objective.risk, Mean):
+        odd.append(f"risk {risk_text(objective.risk)}")
+    if odd:
+        raise ValueError(
+            f"GaussNewton cannot minimise {', '.join(odd)}: no sum of squares. Take LBFGS(), "
+            "or the term itae with penalties and the mean risk"
+        )
 
-    @property
-    def stalled(self) -> Bool[np.ndarray, " problems"]:
-        """Which problems miss limits by more than 2 %, and came no nearer to them in two rounds."""
-        if len(self.missed) < 3:
-            return np.zeros(len(self.points[0]), bool)
-        least, last, now = np.min(self.missed[:-2], axis=0), *self.missed[-2:]
-        return (now > 10 * MET) & (np.minimum(last, now) > _STALLED * least)
 
-    def best(self) -> Float[np.ndarray, "problems n"]:
-        """The last round's end where it meets the limits, else the one that misses them least."""
-        missed, costs = np.stack(self.missed), np.stack(self.costs)
-        near = missed <= _AS_GOOD * missed.min(axis=0)
-        chosen = np.argmin(np.where(near, costs, np.inf), axis=0)
-        chosen = np.where(missed[-1] <= 2 * MET, len(missed) - 1, chosen)
-        return np.stack([self.points[r][k] for k, r in enumerate(chosen)])
+def minimise_squares(
+    coordinates: Coordinates,
+    problem: Problem,
+    objective: Objective,
+    start: Float[np.ndarray, " n"],
+    method: GaussNewton,
+) -> tuple[Float[np.ndarray, " n"], int, bool]:
+    """Where the descent ended, its steps, and whether it converged."""
+    import lineax as lx
+    import optimistix as optx
+
+    units = jnp.ones((problem.linear.assumed_inertia.shape[0], problem.members))
+    squares = _Squares(coordinates, problem, objective.penalties, units, method.stride)
+    size = jnp.sum(_errors(jnp.asarray(start), squares) ** 2, axis=0)
+    squares = eqx.tree_at(
+        lambda s: s.scale, squares, jnp.sum(size, axis=0, keepdims=True) + 0 * size
+    )
+    solver = optx.LevenbergMarquardt(
+        rtol=method.tolerance, atol=method.tolerance, linear_solver=lx.Normal(lx.Cholesky())
+    )
+    with jax.numpy_dtype_promotion("standard"):
+        solution = optx.least_squares(
+            _linearised, solver, jnp.asarray(start), squares, max_steps=method.steps, throw=False
+        )
+    done = bool(solution.result == optx.RESULTS.successful)
+    return np.asarray(solution.value), int(solution.stats["num_steps"]), done
+
+
+def _residuals(z: Float[Array, " n"], squares: _Squares) -> tuple[Array, Array]:
+    members = squares.problem.members
+    tracking = _errors(z, squares) / jnp.sqrt(squares.scale + _LEAST)[None]
+    controller = squares.coordinates.controller_at(z)
+    flights, linear = split_quantities({p.quantity for p in squares.penalties} | {"abscissa"})
+    numbers = squares.problem.linear.numbers(controller, linear, SMOOTHING)
+    if flights:
+        numbers |= squares.problem.in_time(controller, flights)
+    gate = stability_gate(numbers["abscissa"])
+    costs = [
+        p(
+            QUANTITIES[p.quantity].combine_axes(numbers[p.quantity]),
+            gate if is_gated(p.quantity) else gate + 1,
+        )
+        for p in squares.penalties
+    ]
+    bounds = jnp.sqrt(jnp.stack(costs) + _LEAST) if costs else jnp.zeros((0, members))
+    # ITSE goes as the square of ITAE: half of it, for the same change of the cost.
+    return tracking / np.sqrt(2 * members), bounds / np.sqrt(members)
+
+
+_linearised = eqx.filter_custom_jvp(_residuals)
+
+
+@_linearised.def_jvp
+def _with_columns(primals: PyTree, tangents: PyTree) -> PyTree:
+    # A column for each parameter, one flight after the other: linearised, the loop would store all.
+    (z, _), run = primals, lambda z: _residuals(z, primals[1])
+    column = lambda unit: jax.jvp(run, (z,), (unit,))[1]
+    columns = jax.lax.map(column, jnp.eye(z.size, dtype=z.dtype))
+    return run(z), jax.tree.map(lambda c: jnp.tensordot(tangents[0], c, 1), columns)
+
+
+class _Errors(eqx.Module):
+    """Stores the error of every sample, rad."""
+
+    def begin(self, like: Array) -> None:
+        return None
+
+    def update(self, total: None, now: SampleResult) -> tuple[None, Array]:
+        return total, now.reference - now.angle
+
+
+def _errors(z: Float[Array, " n"], squares: _Squares) -> Float[Array, "points axes members"]:
+    """sqrt(t) error every few samples, t from the last event."""
+    problem, stride = squares.problem, squares.stride
+    loop = problem.loop_around(squares.coordinates.controller_at(z))
+    stored = scan_loop(loop, problem.flight, _Errors())[1]
+    index = np.arange(int(problem.window.first), int(problem.window.last) + 1, stride)
+    since = np.min([np.where(index >= a, index - a, np.inf) for a, _ in problem.parts], axis=0)
+    weight = np.sqrt(since * loop.dt * loop.dt * stride)
+    return stored[index] * weight[:, None, None]

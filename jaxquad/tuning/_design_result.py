@@ -1,16 +1,45 @@
-"""The numbers of one design on every member, their statistics, and how far they are from limits."""
+"""One design on every member of an ensemble: its flights, its linear loops, their statistics."""
 
-from collections.abc import Mapping, Sequence
+import dataclasses
+import functools as ft
+from collections.abc import Iterator, Mapping
 from typing import NamedTuple
 
 import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Array, Bool, Float, Key, PyTree
 
-from jaxquad._core import as_array
+from jaxquad._compile import brief_options, Jit
+from jaxquad._core import as_array, map_in_threads
+from jaxquad.control import (
+    LADRC,
+    LinearisableController,
+    ObserverController,
+    PID,
+    schedule_for_analysis,
+)
+from jaxquad.ensembles import Ensemble, Members
+from jaxquad.loops import Loop, loop_numbers, LoopNumbers
+from jaxquad.simulation import (
+    check_run,
+    Devices,
+    find_authority,
+    find_steps,
+    FlightMetrics,
+    loop_over_devices,
+    over_cores,
+    placed,
+    SampleResult,
+    scan_loop,
+    Scenario,
+    Window,
+    window,
+)
 
-from ._objective import Limit, Risk, risk_text
-from ._quantities import QUANTITIES
+from ._objective import LINEAR, QUANTITIES
+from ._problem import decouple, DeviceChoice, TimeSpan
 
 
 Numbers = Float[np.ndarray, " members"]
@@ -42,16 +71,9 @@ class DesignResult(eqx.Module):
         return None if self.unstable is None else int(np.sum(self.unstable))
 
     def of(self, quantity: str, *, worst_axis: bool = False) -> Numbers:
-        """One number for each member.
+        """One number for each member, with `worst_axis` of its worst axis for integrals, too.
 
-        **Arguments:**
-
-        - `quantity`: a name from `jq.tuning.QUANTITIES`.
-        - `worst_axis`: take the worst axis of integrals, too, instead of their sum.
-
-        **Raises:**
-
-        - `ValueError`: the quantity was not computed.
+        Raise ValueError for a name that is not in `by_axis`.
         """
         if quantity not in self.by_axis:
             computed = ", ".join(self.by_axis)
@@ -111,24 +133,13 @@ def with_further(design: DesignResult, further: LinearMembers | None) -> DesignR
 
 
 def upper_bound(count: int, draws: int, *, level: float = 0.95) -> float:
-    """The exact one-sided confidence bound of a share, by Clopper and Pearson.
+    """The share that the true one exceeds with a probability of at most 1 - `level`, where `count`
+    of `draws` independent members showed the event: the exact one-sided bound.
 
     None of 256 bounds the share by 1.2 %, none of 2304 by 0.13 %.
     Source: Clopper and Pearson, Biometrika 26 (1934).
 
-    **Arguments:**
-
-    - `count`: how many of the independent members showed the event.
-    - `draws`: how many members there were.
-    - `level`: the confidence.
-
-    **Returns:**
-
-    The share that the true one exceeds with a probability of at most 1 - `level`.
-
-    **Raises:**
-
-    - `ValueError`: there are fewer draws than counted, or the level is not between 0 and 1.
+    **Raises:** ValueError for fewer draws than counted, or a level that is not between 0 and 1.
     """
     if not (0 <= count <= draws and draws >= 1):
         raise ValueError(f"{count} of {draws} members: give 1 draw or more, and a count among them")
@@ -142,24 +153,10 @@ def upper_bound(count: int, draws: int, *, level: float = 0.95) -> float:
 
 
 def share_interval(count: int, draws: int, *, level: float = 0.95) -> tuple[float, float]:
-    """The exact two-sided confidence interval of a share, by Clopper and Pearson.
+    """The lower and the upper end of a share, outside of each of which the true one lies with
+    (1 - `level`) / 2 at most; arguments, source and errors as of `jq.tuning.upper_bound`.
 
     171 of 256 bound the share by 60.7 and 72.5 %, 1408 of 2000 by 68.3 and 72.4 %.
-    Source: Clopper and Pearson, Biometrika 26 (1934).
-
-    **Arguments:**
-
-    - `count`: how many of the independent members showed the event.
-    - `draws`: how many members there were.
-    - `level`: the confidence.
-
-    **Returns:**
-
-    The lower and the upper end; outside of each the true share lies with (1 - `level`) / 2 at most.
-
-    **Raises:**
-
-    - `ValueError`: as `jq.tuning.upper_bound` does.
     """
     one_sided = 0.5 * (1 + level)
     low = 1 - upper_bound(draws - count, draws, level=one_sided)
@@ -221,144 +218,209 @@ def _statistics(design: DesignResult, name: str) -> Statistics:
     return Statistics(float(np.mean(numbers)), sign * p95, worst, numbers.size, member)
 
 
-class Distance(NamedTuple):
-    """How far a design is from one limit, in the SI unit of the limit."""
-
-    quantity: str
-    over: str  # the number over the members that is bounded, such as "worst"
-    sense: str  # "at most" or "at least"
-    bound: float
-    reached: float  # NaN if it is not known, infinite with unstable members
-    slack: float  # met by this much; below 0, missed
-    percent: float  # slack over the bound
-    beyond: int  # members that are beyond the bound themselves
-    without: int  # members that are unstable and have no such number
-    of_others: float  # what is found without those
-    members: int
-    member: int | None  # the worst one
-    beyond_at_most: float | None = None  # share of all members, with 95 % confidence
-
-    def content(self) -> Mapping[str, object]:
-        """Everything, for `jaxquad.report.write_json`."""
-        names = {"reached": "found"}  # as result files have it
-        plain = {names.get(name, name): value for name, value in self._asdict().items()}
-        return plain | {"met": self.met}
-
-    @property
-    def met(self) -> bool:
-        """Whether the limit is met, by every member if it is one on the worst.
-
-        An unknown number does not meet it.
-        """
-        return bool(self.slack >= 0)
-
-    def __str__(self) -> str:
-        shown = QUANTITIES[self.quantity]
-        demand = f"{shown.title}, {self.over}, {self.sense} {shown.text(self.bound)}"
-        if np.isnan(self.reached):
-            return f"{demand}: not known, because the scenario or the controller does not have it"
-        beyond = self._beyond
-        if self.without:
-            finite = np.isfinite(self.of_others)
-            others = f"; of the others {shown.text(self.of_others)}" if finite else ""
-            return f"{demand}: missed, {self.without} members are unstable{others}{beyond}"
-        if not np.isfinite(self.reached):
-            return (
-                f"{demand}: {shown.text(self.reached)}, {'met' if self.met else 'missed'}{beyond}"
-            )
-        difference = abs(shown.number(self.reached) - shown.number(self.bound))
-        by = f"{'met' if self.met else 'missed'} by {difference:.3g} {shown.unit}".rstrip()
-        share = f" ({abs(self.percent):.2g} %)" if np.isfinite(self.percent) else ""
-        return f"{demand}: {shown.text(self.reached)}, {by}{share}{beyond}"
-
-    @property
-    def _beyond(self) -> str:
-        """How many members are beyond the limit, and what that proves of all."""
-        if not covers(self):
-            return ""
-        count = f", {self.beyond} of {self.members} members beyond"
-        if self.beyond_at_most is None:
-            return count
-        most = 100 * self.beyond_at_most
-        return f"{count} (proven: at most {most:.2g} % of all, 95 % confidence)"
+def evaluate_design(
+    controller: PyTree, members: Members, flight: Scenario, span: TimeSpan, devices: DeviceChoice
+) -> DesignResult:
+    """`controller` on all `members`, in a `flight` that has their noise in it."""
+    flown = fly(flying_loop(controller, members), flight, span, devices)
+    numbers = flown.numbers
+    linear = _linear(controller, members, flight)
+    if linear is not None:
+        numbers |= {name: linear._asdict()[name] for name in LINEAR}
+    unstable = None if linear is None else ~np.all(linear.stable, axis=0)
+    observed = isinstance(controller, ObserverController)
+    why = controller.observer_instability() if observed else ""
+    # Carried off: the error exceeds all that the reference moves by more than a quarter turn.
+    reference = np.asarray(flight.reference)
+    moved = max(float(np.max(reference)), 0.0) - min(float(np.min(reference)), 0.0)
+    lost = flown.diverged | ~(flown.greatest <= _TILTED + moved)
+    return DesignResult(numbers, unstable, flown.diverged, lost, why)
 
 
-def covers(distance: Distance) -> bool:
-    """Whether every single member has to keep the limit, and not a mean or a quantile."""
-    return distance.over == "worst"
+def flying_loop(controller: PyTree, members: Members) -> Loop:
+    """The loops of all members around a controller, its gains as wide as all of its kind have."""
+    loop = members.loop(controller)
+    return loop.with_controller(_widen(loop.controller, members.axes, members.size))
 
 
-def beyond_limit(design: DesignResult, distance: Distance) -> Bool[np.ndarray, " members"]:
-    """Which members are beyond the bound themselves; a number that is not known counts as so."""
-    sign = 1.0 if distance.sense == "at most" else -1.0
-    return ~(sign * _with_unstable(design, distance.quantity) <= sign * distance.bound)
+_MULTIPLE, _MOST = 8, 2048  # of members that fly, and at most
 
 
-def measure_distances(
-    design: DesignResult,
-    limits: Sequence[Limit],
+def analyse_further(
+    loop: Loop,
+    ensemble: Ensemble,
+    scenario: Scenario,
+    key: Key[Array, ""],
     *,
-    independent: bool,
-    further: LinearMembers | None = None,
-) -> tuple[Distance, ...]:
-    """Of one design to each of the limits; bounds of shares only for `independent` members.
+    flown: int,
+    count: int | None,
+) -> LinearMembers | None:
+    """Of at least `count` further members, in slices of as many as have `flown`."""
 
-    Limits of the linear loop count `further` members, too. Raise ValueError for quantities that
-    were not computed.
-    """
-    every = with_further(design, further)
-    pick = lambda limit: every if QUANTITIES[limit.quantity].linear else design
-    return tuple(_distance(pick(limit), limit, independent) for limit in limits)
+    def analyse(drawn: Members) -> tuple[LoopNumbers | None, dict[str, np.ndarray]]:
+        still = dataclasses.replace(drawn, noise=None, gust=None)
+        return _linear(loop.controller, drawn, still.flight(scenario)), member_facts(drawn)
+
+    parts = map_in_threads(analyse, _draw_further(loop, ensemble, key, flown, count))
+    loops = [linear for linear, _ in parts if linear is not None]
+    if not loops:
+        return None
+    facts = [some for _, some in parts]
+    join = lambda parts: np.concatenate(parts, axis=-1)
+    numbers = {name: join([x._asdict()[name] for x in loops]) for name in LINEAR}
+    unstable = ~np.all(join([x.stable for x in loops]), axis=0)
+    none = np.zeros_like(unstable)
+    joined = {name: join([x[name] for x in facts]) for name in facts[0]}
+    return LinearMembers(DesignResult(numbers, unstable, none, none), joined)
 
 
-def _distance(design: DesignResult, limit: Limit, independent: bool) -> Distance:
-    bound, sign = float(limit.bound), limit.sign
-    values = sign * _with_unstable(design, limit.quantity)  # larger is worse
-    reached = sign * _risk(limit.over, values)
-    slack = sign * (bound - reached)
-    over, beyond = risk_text(limit.over), int(np.sum(~(values <= sign * bound)))
-    proven = independent and over == "worst"
-    return Distance(
-        quantity=limit.quantity,
-        over=over,
-        sense="at least" if limit.at_most is None else "at most",
-        bound=bound,
-        reached=reached,
-        slack=slack,
-        percent=100 * slack / abs(bound) if bound else np.copysign(np.inf, slack),
-        beyond=beyond,
-        without=int(np.sum(np.isposinf(values))),
-        of_others=sign * _risk(limit.over, values[~np.isposinf(values)]),
-        members=values.size,
-        member=None if np.isnan(values).any() else int(np.argmax(values)),
-        beyond_at_most=upper_bound(beyond, values.size) if proven else None,
+_FURTHER = 0xF0C5  # folded into the key of members that do not fly
+
+
+def _draw_further(
+    loop: Loop, ensemble: Ensemble, key: Key[Array, ""], flown: int, count: int | None
+) -> Iterator[Members]:
+    count = min(_MULTIPLE * flown, _MOST) if count is None else count
+    keys = jax.random.split(jax.random.fold_in(key, _FURTHER), -(-count // flown))
+    for data in np.asarray(jax.random.key_data(keys)):  # in NumPy: to index keys compiles
+        slice_key = jax.random.wrap_key_data(as_array(data), impl=jax.random.key_impl(keys))
+        yield ensemble.fresh(loop, flown, slice_key)
+
+
+def certified_members(
+    loop: Loop, ensemble: Ensemble, key: Key[Array, ""], *, flown: int
+) -> list[Members]:
+    """The members of a certificate with that key: those that flew, and the further ones."""
+    further = _draw_further(loop, ensemble, key, flown, None)
+    return [ensemble.fresh(loop, flown, key), *further]
+
+
+def member_facts(drawn: Members) -> dict[str, Float[np.ndarray, "axes members"]]:
+    """Inertia, torque gain, lag and delay in SI units; assumed_inertia over the true one."""
+    plant = decouple(drawn.plant)
+    parameters = {"inertia": plant.inertia, "torque_gain": plant.torque_gain, "lag": plant.lag}
+    shape = (plant.shape[0], drawn.size)
+    wide = lambda x: np.broadcast_to(np.asarray(x) if x.ndim > 1 else x[:, None], shape)
+    facts = {n: np.array(wide(x)) for n, x in parameters.items() if x is not None}
+    facts["delay"] = np.array(np.broadcast_to(np.asarray(drawn.delay), shape))
+    return facts | {"assumed_inertia": np.asarray(drawn.assumed_inertia) / facts["inertia"]}
+
+
+_TILTED = np.pi / 2  # rad: a vehicle that is turned further pushes downwards
+_PER_MEMBER = ("b0", "kp", "ki", "kd", "feedforward")  # what scheduling may change
+
+
+def _widen(controller: PyTree, axes: int, members: int) -> PyTree:
+    """The gains of a LADRC or PID in one shape, so that all of a kind share a compile."""
+    if not isinstance(controller, LADRC | PID):
+        return controller
+
+    def full(gain: Array, name: str) -> Array:
+        shape = (axes, members) if name in _PER_MEMBER or gain.ndim > 1 else (axes,)
+        values = np.asarray(gain)
+        if values.ndim:
+            values = values.reshape(values.shape + (1,) * (len(shape) - values.ndim))
+        return as_array(np.broadcast_to(values, shape))
+
+    gains = {name: x for name, x in vars(controller).items() if isinstance(x, Array)}
+    return dataclasses.replace(controller, **{name: full(x, name) for name, x in gains.items()})
+
+
+def _linear(controller: PyTree, members: Members, flight: Scenario) -> LoopNumbers | None:
+    scheduled = schedule_for_analysis(controller, members.assumed_inertia)
+    if not isinstance(scheduled, LinearisableController):
+        return None
+    axes = flight.reference.shape[1]
+    loop = members.loop(controller).with_controller(_widen(scheduled, axes, members.size))
+    plants = [members.plant]
+    if flight.payload is not None:  # with the most and the least that the flight makes it carry
+        extremes = [np.max(flight.payload, axis=0), np.min(flight.payload, axis=0)]
+        plants += [members.plant.with_added_inertia(x) for x in extremes if np.any(x != 0)]
+    # Of the same members as different plants: stable where all are, else NaN as one of them.
+    wide = lambda x: np.broadcast_to(x.reshape(len(x), -1), (len(x), members.size))
+    loops = [LoopNumbers(*map(wide, loop_numbers(loop.with_plant(x), range(axes)))) for x in plants]
+    stable = np.all([loop.stable for loop in loops], axis=0)
+    worst = {"abscissa": np.max([loop.abscissa for loop in loops], axis=0)}
+    for name in LoopNumbers._fields[2:]:
+        find = np.min if name.endswith("margin") else np.max
+        extreme = find([loop._asdict()[name] for loop in loops], axis=0)
+        worst[name] = np.where(stable, extreme, np.nan)
+    return LoopNumbers(stable, **worst)
+
+
+_OF_ALL = ("activity", "energy", "saturation_share", "peak", "rms", "disturbance_rmse")
+_INTEGRALS = ("itae", "iae", "ise")
+_OF_PARTS = (*_INTEGRALS, "overshoot", "peak")
+
+
+class Flown(NamedTuple):
+    """What a flight was, by members."""
+
+    numbers: dict[str, Float[np.ndarray, "axes members"]]
+    diverged: Bool[np.ndarray, " members"]
+    greatest: Float[np.ndarray, " members"]  # rad, the error at any time and of any axis
+
+
+def fly(loop: Loop, flight: Scenario, span: TimeSpan, devices: DeviceChoice = None) -> Flown:
+    """From event to event the integrals' clock starts again, and the greatest overshoot counts."""
+    check_run(loop, flight)
+    samples, dt = len(flight.reference), loop.dt
+    span_of_all = window(samples, dt, start=span.start, stop=span.stop, load_start=span.load_start)
+    parts = [window(samples, dt, start=a, stop=b, load_start=None) for a, b in span.parts]
+    windows = tuple(Window(*map(as_array, x)) for x in (span_of_all, *parts))
+    run, places = placed(loop, flight, devices)
+    *metrics, diverged = over_cores(_run, run, (windows,), places)
+    numbers, by_part = jax.tree.map(lambda x: np.asarray(x, float), tuple(metrics))
+    stack = lambda name: np.stack([part[name] for part in by_part])
+    overshoot = stack("overshoot")
+    some = ~np.isnan(overshoot)  # no part with a step: none
+    greatest = np.max(np.where(some, overshoot, -np.inf), axis=0)
+    numbers |= {name: stack(name).sum(axis=0) for name in _INTEGRALS}
+    numbers["overshoot"] = np.where(some.any(axis=0), greatest, np.nan)
+    numbers["activity_rate"] = numbers["activity"] / ((span_of_all[1] + 1 - span_of_all[0]) * dt)
+    return Flown(numbers, np.asarray(diverged), np.max(stack("peak"), axis=(0, 1)))
+
+
+_Finished = tuple[dict[str, Array], list[dict[str, Array]], Bool[Array, "*ensemble"]]
+
+
+@ft.partial(Jit, options=brief_options)
+def _run(
+    loop: Loop, scenario: Scenario, windows: tuple[Window, ...], devices: Devices | None = None
+) -> _Finished:
+    return loop_over_devices(_measure, (loop, scenario), windows, devices)
+
+
+def _measure(run: tuple[Loop, Scenario], windows: tuple[Window, ...]) -> _Finished:
+    loop, scenario = run
+    authority = find_authority(loop.plant, loop.drive, loop.controller)
+    sums = _Parts(
+        tuple(
+            FlightMetrics(
+                wanted=_OF_PARTS if k else _OF_ALL,
+                window=span,
+                dt=loop.dt,
+                steps=find_steps(scenario.reference, [(span.first, span.until)]),
+                from_first=jnp.asarray(span.first == 0) if k else None,
+                torque_gain=None if authority is None else authority.torque_gain,
+                limit=None if authority is None else authority.command,
+            )
+            for k, span in enumerate(windows)
+        )
     )
+    total, _, running = scan_loop(loop, scenario, sums)
+    numbers, *by_part = [one.finish(x) for one, x in zip(sums.parts, total, strict=True)]
+    return numbers, by_part, ~running
 
 
-def _with_unstable(design: DesignResult, quantity: str) -> Numbers:
-    """The numbers of the members; an unstable one has the worst number possible."""
-    values = design.of(quantity, worst_axis=True)
-    if QUANTITIES[quantity].linear and design.unstable is not None:
-        worst = QUANTITIES[quantity].sign * np.inf
-        return np.where(design.unstable & np.isnan(values), worst, values)
-    return values
+class _Parts(eqx.Module):
+    """Adds up the numbers of several windows of one flight."""
 
+    parts: tuple[FlightMetrics, ...]
 
-def _risk(over: Risk, values: Numbers) -> float:
-    if not values.size or np.isnan(values).any():
-        return np.nan
-    if np.isposinf(values).any():
-        return np.inf  # whatever its weight: 0 times it would be nan
-    return float(over(as_array(values)))
+    def begin(self, like: Float[Array, " axes *ensemble"]) -> tuple[PyTree, ...]:
+        return tuple(part.begin(like) for part in self.parts)
 
-
-def front_point(design: DesignResult, over: str) -> tuple[float, float]:
-    """Where a design stands beside a front: its effort and its mean ITAE.
-
-    The effort is the mean of `over`, or the worst Ms, which is infinite with unstable members.
-    """
-    values = design.of(over)
-    if over != "sensitivity_peak":
-        return float(np.mean(values)), float(np.mean(design.of("itae")))
-    unstable = design.unstable is None or bool(design.unstable.any())
-    return np.inf if unstable else float(np.max(values)), float(np.mean(design.of("itae")))
+    def update(self, total: tuple[PyTree, ...], now: SampleResult) -> tuple[tuple, None]:
+        pairs = zip(self.parts, total, strict=True)
+        return tuple(part.update(sums, now)[0] for part, sums in pairs), None

@@ -1,5 +1,6 @@
 """L-BFGS for many problems at once: each evaluation serves all of them."""
 
+import functools as ft
 from collections.abc import Callable, Generator, Sequence
 from typing import NamedTuple
 
@@ -70,6 +71,10 @@ class _Point(NamedTuple):
     value: float
     gradient: Vector
 
+    @property
+    def finite(self) -> bool:
+        return bool(np.isfinite(self.value) and np.all(np.isfinite(self.gradient)))
+
 
 _TRIALS = 7  # of a line search
 _End = tuple[_Point, bool, str, Pairs]
@@ -83,22 +88,20 @@ def minimise(
     method: LBFGS,
     *,
     on: Bool[np.ndarray, " problems"] | None = None,
-    enough: Callable[[int, float], bool] | None = None,
+    enough: Callable[[int, float], bool] = lambda problem, value: False,
     pairs: Sequence[Pairs] | None = None,
 ) -> Descent:
     """Run all problems in lockstep: `evaluate(z, on)` gives values and gradients of those `on`.
 
-    Problems that are not `on` from the start stay there. `enough(problem, value)` ends a problem
-    early. One that is done stays where it is best. `pairs` are those of a descent before, of a cost
-    with nearly the same curvature.
+    `enough(problem, value)` ends a problem early. `pairs` are those of a descent before.
     """
     z = np.array(start, float)
     on = np.ones(len(z), bool) if on is None else np.array(on)
     curvature = [Pairs() for _ in z] if pairs is None else pairs
-    searches = [_lbfgs(x, method, _bound(enough, k), curvature[k]) for k, x in enumerate(z)]
-    still = [_Point(x, np.nan, np.full_like(x, np.nan)) for x in z]
+    searches = [_lbfgs(x, method, ft.partial(enough, k), curvature[k]) for k, x in enumerate(z)]
     ends: list[_End] = [
-        (point, False, "not started", curvature[k]) for k, point in enumerate(still)
+        (_Point(x, np.nan, np.full_like(x, np.nan)), False, "not started", curvature[k])
+        for k, x in enumerate(z)
     ]
     counts = np.zeros(len(z), int)
     z = np.stack([next(search) for search in searches])
@@ -112,25 +115,14 @@ def minimise(
                 ends[k], on[k] = stop.value, False
                 z[k] = stop.value[0].z
     points, converged, reasons, learnt = zip(*ends, strict=True)  # type: ignore[misc]
-    return Descent(
-        z=np.stack([p.z for p in points]),
-        value=np.array([p.value for p in points]),
-        gradient=np.stack([p.gradient for p in points]),
-        evaluations=counts,
-        converged=np.array(converged),
-        reasons=tuple(reasons),
-        pairs=tuple(learnt),
-    )
-
-
-def _bound(enough: Callable[[int, float], bool] | None, problem: int) -> Callable[[float], bool]:
-    return (lambda value: False) if enough is None else (lambda value: enough(problem, value))
+    z, value, gradient = (np.stack(x) for x in zip(*points, strict=True))
+    return Descent(z, value, gradient, counts, np.array(converged), tuple(reasons), tuple(learnt))
 
 
 def _lbfgs(z: Vector, method: LBFGS, enough: Callable[[float], bool], pairs: Pairs) -> _Descending:
     point = _Point(z, *(yield z))
     left, idle = method.evaluations - 1, 0
-    if not _finite(point):
+    if not point.finite:
         return point, False, "the cost is not finite at the start", pairs
     while True:
         if enough(point.value):
@@ -142,7 +134,9 @@ def _lbfgs(z: Vector, method: LBFGS, enough: Callable[[float], bool], pairs: Pai
         direction = _direction(point.gradient, pairs)
         if direction @ point.gradient >= 0:  # rounding has spoilt the pairs
             pairs, direction = [], -point.gradient
-        step = _first(direction, pairs, method)
+        # Without pairs the gradient's size says nothing about that of a step.
+        longest = np.max(np.abs(direction))
+        step = min(1.0, method.longest_step / longest) if pairs else method.first_step / longest
         lower, left = yield from _search_line(point, direction, step, left, method.longest_step)
         if lower is None and pairs:
             pairs = []  # once more, downhill
@@ -172,14 +166,6 @@ def _direction(gradient: Vector, pairs: Pairs) -> Vector:
     return -q
 
 
-def _first(direction: Vector, pairs: Pairs, method: LBFGS) -> float:
-    longest = np.max(np.abs(direction))
-    if pairs:
-        return min(1.0, method.longest_step / longest)
-    # Nothing is known of the curvature: the gradient's size says nothing about that of a step.
-    return method.first_step / longest
-
-
 def _search_line(
     start: _Point, direction: Vector, step: float, left: int, longest: float
 ) -> _Searching:
@@ -195,7 +181,7 @@ def _search_line(
         z = start.z + step * direction
         point = _Point(z, *(yield z))
         left -= 1
-        if not _finite(point):
+        if not point.finite:
             high, step = (step, np.inf), low[0] + 0.5 * (step - low[0])
             continue
         here = float(point.gradient @ direction)
@@ -208,16 +194,13 @@ def _search_line(
             if here > 0 if high is None else here * (high[0] - low[0]) >= 0:
                 high = low
             low, low_slope = (step, point.value), here
-        step = (
-            _further(low, low_slope, slope, most) if high is None else _within(low, low_slope, high)
-        )
+        if high is not None:
+            step = _within(low, low_slope, high)
+            continue
+        # Where the slope would vanish if it changed as from the start, but not too far.
+        share = slope / (slope - low_slope) if low_slope > slope else np.inf
+        step = min(low[0] * float(np.clip(share, 1.5, 4.0)), most)
     return best, left
-
-
-def _further(low: tuple[float, float], here: float, slope: float, most: float) -> float:
-    """Where the slope would vanish if it changed as from the start, but not too far."""
-    share = slope / (slope - here) if here > slope else np.inf
-    return min(low[0] * float(np.clip(share, 1.5, 4.0)), most)
 
 
 def _within(low: tuple[float, float], slope: float, high: tuple[float, float]) -> float:
@@ -228,7 +211,3 @@ def _within(low: tuple[float, float], slope: float, high: tuple[float, float]) -
     bend = (high[1] - low[1] - slope * width) / width**2
     share = -slope / (2 * bend * width) if bend > 0 else 0.5
     return low[0] + width * float(np.clip(share, 0.1, 0.9))
-
-
-def _finite(point: _Point) -> bool:
-    return bool(np.isfinite(point.value) and np.all(np.isfinite(point.gradient)))

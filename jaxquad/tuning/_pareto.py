@@ -1,3 +1,5 @@
+"""What better tracking costs: a front of designs, tuned together."""
+
 import dataclasses
 import functools as ft
 from collections.abc import Mapping, Sequence
@@ -15,53 +17,17 @@ from jaxquad.simulation import Scenario
 
 from ._certificate import Certificate
 from ._certify import certify
-from ._cost import Progress, stack_copies
-from ._design_result import DesignResult, DesignSummary, front_point, summarise_design
+from ._design_result import DesignResult, summarise_design
 from ._lbfgs import LBFGS
-from ._objective import Limit, Objective, Penalty
-from ._parameters import build_design, find_bounds, select_coordinates
-from ._phases import solve
-from ._problem import DeviceChoice, make_problem, TimeSpan
-from ._quantities import QUANTITIES
-from ._tail import draw_or_take, tighten
-from ._tune import judge_descent, require_kinds, stabilising_rate
+from ._objective import Limit, Objective, Penalty, QUANTITIES
+from ._problem import build_design, DeviceChoice
+from ._tuner import Tuner
 
 
-def describe_front(pareto: "Pareto") -> str:
-    """A line for each point, then for each peer."""
-    shown = QUANTITIES[pareto.over]
-    over = f"{shown.title}{', ' + shown.unit if shown.unit else ''}"
-    members = pareto.certificates[0].members
-    kept, count = int(np.sum(pareto.front)), len(pareto.controllers)
-    lines = [
-        f"{kept} of {count} points are on the front of ITAE over {over}, on {members} fresh "
-        f"members; up to {pareto.evaluations.max()} gradients each, {pareto.seconds:.1f} s",
-        f"  {'':<24}{'held at':>9}{over:>18}{'ITAE, deg s^2':>15}{'worst':>9}{'Ms worst':>10}"
-        f"{'unstable, %':>13}",
-    ]
-    points = (pareto.levels, pareto.certificates, pareto.front, pareto.converged)
-    for k, (level, certificate, on, done) in enumerate(zip(*points, strict=True)):
-        name = f"{k + 1}{'' if on else ', dominated'}{'' if done else ', not done'}"
-        lines.append(
-            _row(name, f"{level:.3g}", certificate.summaries[certificate.name], pareto.over)
-        )
-    for name, design in pareto.peers.items():
-        lines.append(_row(name, "", summarise_design(design, independent=False), pareto.over))
-    return "\n".join(lines)
-
-
-def _row(name: str, level: str, row: DesignSummary, over: str) -> str:
-    itae, peak = row.statistics["itae"], row.statistics.get("sensitivity_peak")
-    worst = f"{peak.worst:.3g}" if peak is not None and row.unstable == 0 else "n/a"
-    effort = row.statistics["activity_rate"].mean if over == "activity_rate" else None
-    first = worst if effort is None else f"{effort:.4g}"
-    share = "n/a" if row.unstable is None else f"{100 * row.unstable / row.members:.3g}"
-    numbers = [f"{QUANTITIES['itae'].number(x):.4g}" for x in (itae.mean, itae.worst)]
-    return f"  {name:<24}{level:>9}{first:>18}{numbers[0]:>15}{numbers[1]:>9}{worst:>10}{share:>13}"
-
-
-_NAMES = {"activity": "activity_rate", "activity_rate": "activity_rate"} | {
-    "sensitivity_peak": "sensitivity_peak"
+_NAMES = {
+    "activity": "activity_rate",
+    "activity_rate": "activity_rate",
+    "sensitivity_peak": "sensitivity_peak",
 }
 _REACH = {"activity_rate": (0.1, 10.0), "sensitivity_peak": (0.65, 1.75)}  # times the knee
 _WEIGHT = 4.0  # of the penalty that holds a point at its level
@@ -105,23 +71,60 @@ class Pareto(eqx.Module):
 
     def content(self) -> dict[str, object]:
         """Every point's numbers, for `jaxquad.report.write_json`."""
-        fields = vars(self) | {
-            "effort": self.effort,
-            "tracking": self.tracking,
-            "front": self.front,
-        }
-        names = ("over", "levels", "effort", "tracking", "front", "converged", "evaluations")
-        summaries = [c.summaries[c.name] for c in self.certificates]
-        rows = [
-            {**x.content(), "holds": c.holds}
-            for x, c in zip(summaries, self.certificates, strict=True)
-        ]
         summarise = ft.partial(summarise_design, independent=self.certificates[0].independent)
-        peers = {name: summarise(x).content() for name, x in self.peers.items()}
-        return {name: fields[name] for name in names} | {"points": rows, "peers": peers}
+        names = ("over", "levels", "effort", "tracking", "front", "converged", "evaluations")
+        return {name: getattr(self, name) for name in names} | {
+            "points": [
+                {**summarise(c.design).content(), "holds": c.holds} for c in self.certificates
+            ],
+            "peers": {name: summarise(x).content() for name, x in self.peers.items()},
+        }
 
     def __str__(self) -> str:
-        return describe_front(self)
+        shown = QUANTITIES[self.over]
+        over = f"{shown.title}{', ' + shown.unit if shown.unit else ''}"
+        first = self.certificates[0]
+        lines = [
+            f"{np.sum(self.front)} of {len(self.controllers)} points are on the front of ITAE over "
+            f"{over}, on {first.members} fresh members; up to {self.evaluations.max()} gradients "
+            f"each, {self.seconds:.1f} s",
+            f"  {'':<24}{'held at':>9}{over:>18}{'ITAE, deg s^2':>15}{'worst':>9}{'Ms worst':>10}"
+            f"{'unstable, %':>13}",
+        ]
+        points = (self.levels, self.certificates, self.front, self.converged)
+        rows = [
+            (
+                f"{k + 1}{'' if on else ', dominated'}{'' if done else ', not done'}",
+                f"{level:.3g}",
+                certificate.design,
+            )
+            for k, (level, certificate, on, done) in enumerate(zip(*points, strict=True))
+        ]
+        rows += [(name, "", design) for name, design in self.peers.items()]
+        for name, level, design in rows:
+            row = summarise_design(design, independent=first.independent)
+            itae, peak = row.statistics["itae"], row.statistics.get("sensitivity_peak")
+            worst = f"{peak.worst:.3g}" if peak is not None and row.unstable == 0 else "n/a"
+            by_effort = self.over == "activity_rate"
+            effort = f"{row.statistics[self.over].mean:.4g}" if by_effort else worst
+            share = "n/a" if row.unstable is None else f"{100 * row.unstable / row.members:.3g}"
+            mean, most = (f"{QUANTITIES['itae'].number(x):.4g}" for x in (itae.mean, itae.worst))
+            lines.append(
+                f"  {name:<24}{level:>9}{effort:>18}{mean:>15}{most:>9}{worst:>10}{share:>13}"
+            )
+        return "\n".join(lines)
+
+
+def front_point(design: DesignResult, over: str) -> tuple[float, float]:
+    """Where a design stands beside a front: its effort and its mean ITAE.
+
+    The effort is the mean of `over`, or the worst Ms, which is infinite with unstable members.
+    """
+    values = design.of(over)
+    if over != "sensitivity_peak":
+        return float(np.mean(values)), float(np.mean(design.of("itae")))
+    unstable = design.unstable is None or bool(design.unstable.any())
+    return np.inf if unstable else float(np.max(values)), float(np.mean(design.of("itae")))
 
 
 def pareto(
@@ -165,49 +168,43 @@ def pareto(
     """
     if over not in _NAMES:
         raise ValueError(f"no front over {over!r}: choose one of {', '.join(_NAMES)}")
-    over, objective = _NAMES[over], Objective() if objective is None else objective
-    method = LBFGS() if method is None else method
-    require_kinds(loop, ensemble, scenario, objective, limits, method)
-    levels_of = _levels(over, objective, points, levels)
+    over = _NAMES[over]
+    tuner = Tuner(
+        loop, ensemble, scenario, objective, limits, reserve=reserve, free=free, members=members,
+        method=method, key=key, progress=progress, listener=None, devices=devices,
+    )  # fmt: skip
+    levels_of = _levels(over, tuner.objective, points, levels)
     if isinstance(ensemble, Members) and not isinstance(fresh, Members):
         raise ValueError("the members to tune on are given: give fresh=, other members, too")
-    key = jax.random.key(0) if key is None else key
-    span, watched = TimeSpan.of(objective), Progress(progress)
-    coordinates = select_coordinates(loop.controller, free)
-    drawn = draw_or_take(loop, ensemble, members, key)
-    problem = make_problem(loop.controller, drawn, scenario, span=span, devices=devices)
-    tightened = tuple(tighten(limit, reserve) for limit in limits)
-    solution = solve(
-        coordinates, problem, np.tile(coordinates.start, (len(levels_of), 1)),
-        _objectives(objective, over, levels_of), stack_copies(tightened, len(levels_of)),
-        method=method, rate=stabilising_rate(objective), progress=watched,
-    )  # fmt: skip
-    seconds = watched.seconds
-    designs = [build_design(coordinates, jnp.asarray(z)) for z in solution.z]
-    others, count = (fresh, 0) if isinstance(fresh, Members) else (ensemble, fresh)
+    others = tuple(p for p in tuner.objective.penalties if p.quantity != over)
+    objectives = [  # by a penalty of its own for each level
+        eqx.tree_at(
+            lambda o: o.penalties, tuner.objective, (*others, Penalty(over, level, _WEIGHT)),
+            is_leaf=lambda x: x is tuner.objective.penalties,
+        )
+        for level in levels_of
+    ]  # fmt: skip
+    start = np.tile(tuner.coordinates.start, (len(levels_of), 1))
+    tuner.solve(start, jax.tree.map(lambda *x: jnp.stack(x), *objectives))
+    seconds = tuner.progress.seconds
+    designs = [build_design(tuner.coordinates, jnp.asarray(z)) for z in tuner.z]
+    drawn, count = (fresh, 0) if isinstance(fresh, Members) else (ensemble, fresh)
     certificates = [
         certify(
-            loop.with_controller(design), others, scenario, limits=limits,
-            peers={} if k else peers, members=count, key=key, devices=devices, **span._asdict(),
+            loop.with_controller(design), drawn, scenario, limits=limits,
+            peers={} if k else peers, members=count, key=tuner.key, devices=devices,
+            **tuner.span._asdict(),
         )
         for k, design in enumerate(designs)
     ]  # fmt: skip
+    peer_designs = {name: x for name, x in certificates[0].designs.items() if name != "tuned"}
     certificates = [
-        dataclasses.replace(
-            one,
-            convergence=judge_descent(
-                solution, k, find_bounds(coordinates, solution.z[k], solution.gradient[k])
-            ),
-        )
+        dataclasses.replace(one, designs={"tuned": one.design}, convergence=tuner.judge(k)[1])
         for k, one in enumerate(certificates)
     ]
-    peer_designs = {name: x for name, x in certificates[0].designs.items() if name != "tuned"}
-    certificates[0] = dataclasses.replace(
-        certificates[0], designs={"tuned": certificates[0].design}
-    )
     return Pareto(
-        over, levels_of, tuple(designs), tuple(certificates), peer_designs, solution.converged,
-        solution.evaluations, seconds,
+        over, levels_of, tuple(designs), tuple(certificates), peer_designs, tuner.converged,
+        tuner.evaluations, seconds,
     )  # fmt: skip
 
 
@@ -227,16 +224,3 @@ def _levels(
     if values.ndim != 1 or values.size < 2 or not rising:
         raise ValueError(f"levels are {levels}: give 2 or more above 0 that rise")
     return values
-
-
-def _objectives(objective: Objective, over: str, levels: np.ndarray) -> Objective:
-    """One for each level, stacked."""
-    others = tuple(p for p in objective.penalties if p.quantity != over)
-    mine = [
-        eqx.tree_at(
-            lambda o: o.penalties, objective, (*others, Penalty(over, level, _WEIGHT)),
-            is_leaf=lambda x: x is objective.penalties,
-        )
-        for level in levels
-    ]  # fmt: skip
-    return jax.tree.map(lambda *x: jnp.stack(x), *mine)

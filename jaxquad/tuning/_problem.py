@@ -1,7 +1,7 @@
-"""The members of a tune in their flights: everything that does not change while it runs."""
+"""What a tune works on: the coordinates of a controller, and the members in their flights."""
 
 import dataclasses
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from typing import NamedTuple
 
 import equinox as eqx
@@ -10,9 +10,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, PyTree
 
-from jaxquad._core import as_array, mark_members
-from jaxquad.control import schedule_for_analysis, schedule_for_flight
+from jaxquad._core import as_array, ensemble_shape, mark_members
+from jaxquad.control import (
+    find_transform,
+    ObserverController,
+    schedule_for_analysis,
+    schedule_for_flight,
+    Transform,
+    Tunable,
+)
 from jaxquad.ensembles import Members
+from jaxquad.identify import Free, name_places, Parameters, Place, select_parameters, with_values
 from jaxquad.loops import linear_numbers, Loop
 from jaxquad.models import DecoupledAxes, Multirotor
 from jaxquad.simulation import (
@@ -30,7 +38,151 @@ from jaxquad.simulation import (
     window,
 )
 
-from ._objective import Objective
+
+class Block(eqx.Module):
+    """An array that is tuned as a whole, in the coordinates of its `transform`."""
+
+    places: tuple[Place, ...] = eqx.field(static=True)
+    shape: tuple[int, ...] = eqx.field(static=True)
+    transform: Transform
+    start: Float[Array, " numbers"]
+
+
+class Coordinates(eqx.Module):
+    """Tuned numbers as one vector z: logarithms of gains first, then the arrays in `blocks`."""
+
+    controller: PyTree
+    parameters: Parameters | None
+    blocks: tuple[Block, ...]
+
+    @property
+    def start(self) -> Float[np.ndarray, " n"]:
+        """z of the controller as it was given."""
+        gains = self.parameters
+        some = [] if gains is None else [np.asarray(gains.start)[: gains.count]]
+        return np.concatenate([*some, *(np.asarray(block.start) for block in self.blocks)])
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The name of each tuned number."""
+        names = () if self.parameters is None else self.parameters.names
+        return names + tuple(place.name for block in self.blocks for place in block.places)
+
+    @property
+    def arrays(self) -> frozenset[str]:
+        """The names of the arrays that the tuned numbers are in."""
+        return frozenset(name.partition("[")[0] for name in self.names)
+
+    def controller_at(self, z: Float[Array, " n"]) -> PyTree:
+        """The controller with its tuned numbers set."""
+        controller, first = self.controller, 0
+        if self.parameters is not None:
+            first = self.parameters.count
+            controller = self.parameters.insert(controller, z[:first])
+        for block in self.blocks:
+            part = z[first : first + len(block.places)].reshape(block.shape)
+            values = block.transform.forward(part).reshape(-1)
+            controller = with_values(controller, block.places, values)
+            first += len(block.places)
+        return controller
+
+    def values(self, z: Float[np.ndarray, " n"]) -> dict[str, float]:
+        """The tuned numbers by name."""
+        tuned = eqx.filter(build_design(self, as_array(z)), eqx.is_inexact_array)
+        leaves = [np.asarray(x).reshape(-1) for x in jax.tree.leaves(tuned)]
+        places = {place.name: place for place in name_places(self.controller)}
+        at = lambda place: float(leaves[place.leaf][place.index])
+        return {name: at(places[name]) for name in self.names}
+
+
+@eqx.filter_jit
+def build_design(coordinates: Coordinates, z: Float[Array, " n"]) -> PyTree:
+    """`coordinates.controller_at(z)`, compiled as one."""
+    return coordinates.controller_at(z)
+
+
+def select_coordinates(controller: PyTree, free: Free = None) -> Coordinates:
+    """Those in which a controller is tuned: an array with a transform that is named as a whole,
+    such as the knots of a `jq.control.InertiaMap`, in the coordinates of that.
+    """
+    if ensemble := ensemble_shape(controller):
+        raise ValueError(
+            f"the controller is an ensemble of {ensemble}: give one controller; "
+            "a tune makes its own copies for members and starts"
+        )
+    if free is None and not isinstance(controller, Tunable):
+        raise ValueError(
+            f"a {type(controller).__name__} does not say which of its numbers are tuned: name "
+            'them, free=["kp", "kd"], or give it a method tunable()'
+        )
+    free = list(controller.tunable()) if free is None else free
+    places = name_places(controller)
+    blocks: list[Block] = []
+    chosen, items = (
+        (free, []) if callable(free) else ([], [free] if isinstance(free, str) else free)
+    )
+    for item in items:
+        transform = find_transform(controller, item) if isinstance(item, str) else None
+        if transform is None:
+            chosen.append(item)
+            continue
+        mine = tuple(p for p in places if p.name == item or p.name.startswith(f"{item}["))
+        leaves = jax.tree.leaves(eqx.filter(controller, eqx.is_inexact_array))
+        values = np.asarray(leaves[mine[0].leaf])
+        start = as_array(np.asarray(transform.inverse(values)).reshape(-1))
+        blocks.append(Block(mine, values.shape, transform, start))
+    parameters = select_parameters(controller, chosen) if callable(chosen) or chosen else None
+    if parameters is None and not blocks:
+        raise ValueError('free is empty: name the numbers to tune, as ["wc", "wo"]')
+    return Coordinates(controller, parameters, tuple(blocks))
+
+
+_NEAR, _FLAT = 0.02, 1e-3  # nepers to a bound, and the slope per neper that pushes against it
+
+
+def find_refusal(controller: PyTree) -> str:
+    """Why a controller, unchecked so far, cannot be built or must not be flown; empty if it can."""
+    for part in _iter_modules(controller):
+        try:
+            for kind in type(part).__mro__:  # as when it is made
+                if "__check_init__" in vars(kind):
+                    vars(kind)["__check_init__"](part)
+        except ValueError as error:
+            return str(error)
+    if not isinstance(controller, ObserverController):
+        return ""
+    return controller.observer_instability() or controller.observer_slowness()
+
+
+class Bound(NamedTuple):
+    """A tuned number that stands at the end of what the controller allows."""
+
+    name: str
+    value: float
+    reason: str  # why it can go no further
+
+
+def find_bounds(
+    coordinates: Coordinates, z: Float[np.ndarray, " n"], gradient: Float[np.ndarray, " n"]
+) -> tuple[Bound, ...]:
+    """The numbers that could lower the cost if the controller allowed them a small step more."""
+    bounds, values = [], coordinates.values(z)
+    for k, name in enumerate(values):
+        step = np.zeros_like(z)
+        step[k] = -_NEAR * np.sign(gradient[k])
+        if abs(gradient[k]) <= _FLAT:
+            continue
+        if why := find_refusal(build_design(coordinates, as_array(z + step))):
+            bounds.append(Bound(name, values[name], why))
+    return tuple(bounds)
+
+
+def _iter_modules(tree: PyTree) -> Iterator[eqx.Module]:
+    """`tree` and the modules in it."""
+    if isinstance(tree, eqx.Module):
+        yield tree
+        for part in vars(tree).values():
+            yield from _iter_modules(part)
 
 
 DeviceChoice = int | Sequence[jax.Device] | None  # see `jq.evaluate`
@@ -45,20 +197,12 @@ class TimeSpan(NamedTuple):
     stop: float | None = None
     load_start: float | None = None
 
-    @classmethod
-    def of(cls, objective: Objective) -> "TimeSpan":
-        """That of an objective."""
-        return cls(objective.events, objective.start, objective.stop, objective.load_start)
-
     @property
     def parts(self) -> list[tuple[float, float | None]]:
         """From event to event, in s."""
         ends = np.inf if self.stop is None else self.stop
         inside = sorted({float(t) for t in self.events if self.start < t < ends})
         return list(zip([self.start, *inside], [*inside, self.stop], strict=True))
-
-
-_SOFTNESS = 0.005  # of the limit, about which a command counts as saturated in part
 
 
 _FULL_FLIGHT = TimeSpan()
@@ -79,19 +223,14 @@ class LinearLoops(eqx.Module):
         """How many there are."""
         return self.assumed_inertia.shape[-1]
 
-    def replaced(
-        self,
-        places: Int[np.ndarray, " some"],
-        others: "LinearLoops",
-        chosen: Int[np.ndarray, " some"],
-    ) -> "LinearLoops":
-        """The same with the members at `places` replaced by `chosen` ones of the `others`."""
+    def replaced(self, places: Int[np.ndarray, " some"], others: "LinearLoops") -> "LinearLoops":
+        """The same with the `others` in the places of some members."""
 
         def put(mine: Array, other: Array, varies: bool) -> Array:
             if not varies:
                 return mine
             values = np.array(mine)
-            values[..., places] = np.asarray(other)[..., chosen]
+            values[..., places] = np.asarray(other)
             return as_array(values)
 
         marks = mark_members(self.axes, (self.members,))
@@ -110,13 +249,9 @@ class LinearLoops(eqx.Module):
 
         def run(loops: PyTree, controller: PyTree) -> dict[str, Array]:
             axes, delay, inertia = loops
-            loop = Loop(
-                axes,
-                schedule_for_analysis(controller, inertia),
-                delay=delay if self.longest_delay else 0.0,
-                longest_delay=self.longest_delay or None,
-                dt=self.dt,
-            )
+            delays = (delay, self.longest_delay) if self.longest_delay else (0.0, None)
+            controller = schedule_for_analysis(controller, inertia)
+            loop = Loop(axes, controller, delay=delays[0], longest_delay=delays[1], dt=self.dt)
             places = range(len(inertia))
             numbers = linear_numbers(loop, places, wanted, smoothing=smoothing, smooth=True)
             wide = lambda x: jnp.broadcast_to(x.reshape(len(x), -1), inertia.shape)
@@ -149,55 +284,45 @@ class Problem(eqx.Module):
 
     def loop_around(self, controller: PyTree) -> Loop:
         """The loops of all members around another controller."""
-        return self.loop.with_controller(
-            schedule_for_flight(controller, self.linear.assumed_inertia)
-        )
+        inertia = self.linear.assumed_inertia
+        return self.loop.with_controller(schedule_for_flight(controller, inertia))
 
     def in_time(
         self, controller: PyTree, wanted: Collection[str]
     ) -> dict[str, Float[Array, "axes members"]]:
         """The wanted quantities of a flight of each member."""
-        run = (self.loop_around(controller), self.flight)
         names = tuple(sorted({"activity" if n == "activity_rate" else n for n in wanted}))
-        summed = lambda run, _: self._summed(run[0], run[1], names)
+
+        def summed(run: tuple[Loop, Scenario], _: None) -> dict[str, Array]:
+            loop, flight = run
+            authority = find_authority(loop.plant, loop.drive, loop.controller)
+            sums = FlightMetrics(
+                wanted=names, window=self.window, dt=loop.dt,
+                steps=find_steps(flight.reference, self.parts),
+                torque_gain=None if authority is None else authority.torque_gain,
+                limit=None if authority is None else authority.command,
+                smooth=True,
+            )  # fmt: skip
+            return sums.finish(scan_loop(loop, flight, sums)[0])
+
+        run = (self.loop_around(controller), self.flight)
         numbers = loop_over_devices(summed, run, None, self.linear.devices)
         if "activity_rate" in wanted:
             duration = (self.window.last - self.window.first + 1) * self.loop.dt
             numbers["activity_rate"] = numbers["activity"] / duration
         return {name: numbers[name] for name in wanted}
 
-    def _summed(
-        self, loop: Loop, flight: Scenario, names: tuple[str, ...]
-    ) -> dict[str, Float[Array, "axes members"]]:
-        authority = find_authority(loop.plant, loop.drive, loop.controller)
-        sums = FlightMetrics(
-            wanted=names,
-            window=self.window,
-            dt=loop.dt,
-            steps=find_steps(flight.reference, self.parts),
-            torque_gain=None if authority is None else authority.torque_gain,
-            limit=None if authority is None else authority.command,
-            smooth=True,
-        )
-        return sums.finish(scan_loop(loop, flight, sums)[0])
-
 
 def make_problem(
     controller: PyTree,
     members: Members,
     scenario: Scenario,
-    limited: Members | None = None,
     *,
     span: TimeSpan = _FULL_FLIGHT,
     devices: DeviceChoice = None,
     counted: int | None = None,
 ) -> Problem:
-    """Of `members`, and of the linear loops of the `limited` ones on which limits are kept.
-
-    The first of the members are `counted` in the objective (all, by default).
-
-    Raise ValueError for parts that do not fit together, as `jq.evaluate` does.
-    """
+    """Of `members`, of whom the first are `counted` in the objective (all, by default)."""
     flight, loop = members.flight(scenario), members.loop(controller)
     check_run(loop, flight)
     samples, dt = len(flight.reference), loop.dt
@@ -208,13 +333,11 @@ def make_problem(
         samples, dt, start=span.start, stop=span.stop, load_start=span.load_start
     )
     windows = [window(samples, dt, start=a, stop=b, load_start=None) for a, b in span.parts]
-    parts = [(int(x[0]), int(x[1])) for x in windows]
-    if len(parts) == 1:
-        parts = [(first, until)]
+    parts = [(int(x[0]), int(x[1])) for x in windows] if len(windows) > 1 else [(first, until)]
     return Problem(
         loop=loop,
         linear=linear_loops(members, devices),
-        limited=None if limited is None else linear_loops(limited, devices),
+        limited=None,
         flight=flight,
         window=Window(first, last, loaded, parts[-1][1]),
         parts=tuple(parts),

@@ -1,7 +1,6 @@
 """Gains tuned by gradient through the closed loops of an ensemble, with a certificate."""
 
 import dataclasses
-import time
 from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 
@@ -14,24 +13,186 @@ from jaxquad._core import as_array
 from jaxquad.ensembles import Ensemble, Members
 from jaxquad.identify import Free
 from jaxquad.loops import Loop
-from jaxquad.simulation import find_steps, Scenario
+from jaxquad.simulation import Scenario
 
 from ._certificate import Certificate, lag_remark
 from ._certify import certify
-from ._cost import Listener, Progress, stack_copies
-from ._evaluate_design import certified_members
-from ._gauss_newton import GaussNewton, require_squares
-from ._lbfgs import LBFGS
-from ._objective import Limit, Objective
-from ._parameters import build_design, Coordinates, find_bounds, select_coordinates
-from ._phases import go_on, Solution, solve
-from ._problem import DeviceChoice, Problem, TimeSpan
-from ._tail import certified_beyond, draw_or_take, Job, make_search, pose_problem, Search, tighten
-from ._tuned import distinct_optima, LimitResult, scatter_starts, Tuned
-from ._verdict import Bound, judge_convergence, Verdict
+from ._cost import Evaluation, Listener, stack_copies
+from ._design_result import certified_members
+from ._objective import Limit, Objective, QUANTITIES
+from ._problem import Bound, build_design, DeviceChoice
+from ._tail import ADDED, Beyond, GUARDS, rank_beyond, Tail, take_members
+from ._tuner import Method, Tuner
+from ._verdict import covers, Verdict, with_further
 
 
-Method = LBFGS | GaussNewton
+_COST, _PLACE = 2e-3, 0.1  # within which two ends are one: of the cost, and in nepers
+
+
+class Optimum(NamedTuple):
+    """A point at which some of the starts ended; its cost is NaN if it was not stabilised."""
+
+    cost: float
+    z: Float[np.ndarray, " n"]
+    values: dict[str, float]  # of the tuned numbers
+    starts: tuple[int, ...]  # which of them led here; 0 is the controller as given
+    converged: bool
+
+    def __str__(self) -> str:
+        cost = "not stabilised" if np.isnan(self.cost) else f"cost {self.cost:.5g}"
+        shown = ", ".join(map(str, self.starts[:8])) + ", ..." * (len(self.starts) > 8)
+        return f"{cost}, from {len(self.starts)} of the starts ({shown})"
+
+
+def scatter_starts(
+    start: Float[np.ndarray, " n"], count: int, scatter: float, seed: int
+) -> Float[np.ndarray, "starts n"]:
+    """The start itself, and others about it: normal by `scatter` (nepers), a Latin hypercube."""
+    from scipy.special import ndtri
+
+    if not isinstance(count, int) or count < 1 or not 0 < scatter < np.inf:
+        raise ValueError(
+            f"starts is {count} with a scatter of {scatter}: give 1 for the controller as it is, "
+            "or more, and a scatter above 0"
+        )
+    if count == 1:
+        return start[None]
+    rng = np.random.default_rng(seed)
+    cells = np.stack([rng.permutation(count - 1) for _ in range(start.size)], axis=1)
+    deviates = ndtri((cells + rng.uniform(0.01, 0.99, cells.shape)) / (count - 1))
+    return np.concatenate([start[None], start + scatter * deviates])
+
+
+def distinct_optima(tuner: Tuner) -> tuple[Optimum, ...]:
+    """The distinct points at which the starts ended, the best first."""
+    optima: list[Optimum] = []
+    cost, z = tuner.cost, tuner.z
+    for k in np.argsort(np.where(np.isnan(cost), np.inf, cost), kind="stable"):
+        same = [
+            i for i, o in enumerate(optima)
+            if abs(o.cost - cost[k]) < _COST and np.max(np.abs(o.z - z[k])) < _PLACE
+        ]  # fmt: skip
+        if same:
+            old = optima[same[0]]
+            optima[same[0]] = old._replace(starts=(*old.starts, int(k)))
+        else:
+            values, done = tuner.coordinates.values(z[k]), bool(tuner.converged[k])
+            optima.append(Optimum(float(cost[k]), z[k], values, (int(k),), done))
+    return tuple(optima)
+
+
+class LimitResult(NamedTuple):
+    """How a limit ended on the members that were tuned on."""
+
+    limit: Limit
+    reached: float  # in the limit's unit
+    met: bool
+    active: bool  # the cost would be lower without it
+
+    def __str__(self) -> str:
+        text = f"limit on {self.limit}: {self.reached:.4g}"
+        if self.met:
+            return f"{text} on the members tuned on, {'active' if self.active else 'not active'}"
+        return (
+            f"{text} (by {abs(self.reached - float(self.limit.bound)):.3g}) on the members tuned "
+            "on, MISSED: it cannot be met together with the others"
+        )
+
+
+class Tuned(eqx.Module):
+    """A tuned controller, and what is known of it.
+
+    `str()` begins with three verdicts: `stability` and `performance` on fresh members, and the
+    `convergence` of the tuning. Only where all of them hold the design may be flown. `certificate`
+    is None if no fresh members were asked for. `limits` and `minima` are on the members that were
+    tuned on. `evaluations` counts gradients through the flights of all members, `stabilising` those
+    of the linear loops alone that came before. `tail` says how many members were searched for
+    those beyond a limit, how many of these were tuned on, too, and which certificate this one is.
+    """
+
+    controller: PyTree
+    certificate: Certificate | None
+    stabilised: bool  # every member that was tuned on
+    converged: bool
+    cost: float
+    values: dict[str, float]  # of the tuned numbers
+    limits: tuple[LimitResult, ...]
+    minima: tuple[Optimum, ...]  # at which the starts ended, the best first
+    bounds: tuple[Bound, ...]  # the tuned numbers that stand at the end of what is allowed
+    convergence: Verdict
+    evaluations: int
+    stabilising: int
+    history: tuple[Evaluation, ...]
+    seconds: float  # of the descent, compilation included, without the certificate
+    remarks: tuple[str, ...]
+    tail: Tail = Tail()  # of the ensemble, searched for members beyond limits
+
+    @property
+    def active(self) -> tuple[Limit, ...]:
+        """The limits without which the cost would be lower."""
+        return tuple(one.limit for one in self.limits if one.active)
+
+    @property
+    def stability(self) -> Verdict:
+        """Whether all fresh members are stable and within the limits."""
+        return _UNSEEN[0] if self.certificate is None else self.certificate.stability
+
+    @property
+    def performance(self) -> Verdict:
+        """Whether the design is of use on the fresh members, against doing nothing."""
+        return _UNSEEN[1] if self.certificate is None else self.certificate.performance
+
+    @property
+    def verdicts(self) -> tuple[Verdict, Verdict, Verdict]:
+        """Stability, performance and convergence."""
+        return self.stability, self.performance, self.convergence
+
+    @property
+    def holds(self) -> bool:
+        """Whether all three verdicts hold: only then the design may be flown."""
+        return all(verdict.holds is True for verdict in self.verdicts)
+
+    def __str__(self) -> str:
+        first, *rest = ["NOT CERTIFIED: no fresh members were asked for", *self.verdicts]
+        if self.certificate is not None:
+            first, *rest = str(self.certificate).splitlines()
+        numbers = ", ".join(f"{name} {value:.4g}" for name, value in self.values.items())
+        lines = [
+            first,
+            *map(str, rest[:3]),
+            f"tuned: {numbers}",
+            f"  cost {self.cost:.5g}, {'converged' if self.converged else 'not converged'} after "
+            f"{self.evaluations} gradients ({self.stabilising} more of the linear loops, to "
+            f"stabilise) in {self.seconds:.1f} s",
+            *(f"  {one}" for one in self.limits),
+        ]
+        lines += [f"  {describe_tail(self.tail)}"] if self.tail.searches else []
+        if len(self.minima) > 1:
+            count = sum(len(o.starts) for o in self.minima)
+            lines.append(f"  {count} starts, {len(self.minima)} optima:")
+            lines += [f"    {optimum}" for optimum in self.minima]
+        lines += [f"  ! {remark}" for remark in self.remarks]
+        return "\n".join([*lines, *map(str, rest[3:])])
+
+
+_UNSEEN = tuple(
+    Verdict(name, None, "not known without fresh members", "Give fresh=, how many to certify on")
+    for name in ("STABILITY", "PERFORMANCE")
+)
+
+
+def describe_tail(tail: Tail) -> str:
+    flights = f" and {tail.flown} flights" if tail.flown else ""
+    loops = f"{tail.searched} further linear loops" if tail.searched else "further members"
+    text = f"limits: {loops}{flights} searched, "
+    text += f"{tail.added} of the worst added to those tuned on" if tail.added else "none beyond"
+    if tail.certificates < 2:
+        return text
+    return (
+        f"{text}; this is certificate {tail.certificates}, on members of its own, because the one "
+        "before found some beyond a limit, which are tuned on, too: read its 95 % as "
+        f"{100 - 5 * tail.certificates} %"
+    )
 
 
 def tune(
@@ -113,27 +274,45 @@ def tune(
 
     - `ValueError`: parts do not fit together, or the controller is in single precision.
     """
-    objective = Objective() if objective is None else objective
-    method = LBFGS() if method is None else method
-    require_kinds(loop, ensemble, scenario, objective, limits, method)
-    key, watched = jax.random.key(0) if key is None else key, Progress(progress, listener)
-    job = Job(loop, ensemble, scenario, tuple(limits), TimeSpan.of(objective), devices, key)
-    coordinates = select_coordinates(loop.controller, free)
-    drawn = draw_or_take(loop, ensemble, members, key)
-    require_fresh(fresh, drawn, peers)
-    size = fresh if isinstance(fresh, int) else _SIZE
-    search = make_search(job, drawn, reserve=reserve, starts=starts, size=size)
-    problem = pose_problem(job, drawn, search)
-    require_steps(problem, objective.quantities | {limit.quantity for limit in limits})
-    tightened = tuple(tighten(limit, reserve) for limit in limits)
-    solution = solve(
-        coordinates, problem, scatter_starts(coordinates.start, starts, scatter, seed=0),
-        stack_copies(objective, starts), stack_copies(tightened, starts), method=method,
-        rate=stabilising_rate(objective), progress=watched, search=search,
+    tuner = Tuner(
+        loop, ensemble, scenario, objective, limits, reserve=reserve, free=free, members=members,
+        method=method, key=key, progress=progress, listener=listener, devices=devices,
     )  # fmt: skip
-    best, seconds = _best(solution), watched.seconds
-    certified = _certify(job, coordinates, watched, fresh, peers, solution, best, search)
-    return _tuned(job, coordinates, problem, certified, best, watched, seconds)
+    require_fresh(fresh, tuner.drawn, peers)
+    start = scatter_starts(tuner.coordinates.start, starts, scatter, seed=0)
+    tuner.solve(
+        start, stack_copies(tuner.objective, starts), fresh if isinstance(fresh, int) else _SIZE
+    )
+    # The lowest cost among the starts that are stable and miss limits least.
+    missed = np.maximum(tuner.beyond, 0).sum(axis=1)
+    cost = np.where(np.isnan(tuner.cost), np.inf, tuner.cost)
+    best = int(np.lexsort((cost, np.where(missed > 5e-3, missed, 0.0), np.isinf(cost)))[0])
+    seconds = tuner.progress.seconds
+    others = fresh if isinstance(fresh, Members) else ensemble
+    certificate, certificates = None, 0
+    # None where none is asked for, or where nothing is left to draw it from.
+    while isinstance(fresh, Members) or (fresh is not None and isinstance(ensemble, Ensemble)):
+        tuner.progress.say("certificate on fresh members ...")
+        salt = _AGAIN + certificates
+        fresh_key = jax.random.fold_in(tuner.key, salt) if certificates else tuner.key
+        certificate = certify(
+            loop.with_controller(build_design(tuner.coordinates, as_array(tuner.z[best]))), others,
+            scenario, limits=tuner.limits, peers=peers,
+            members=0 if isinstance(fresh, Members) else fresh, begun=loop.controller,
+            key=fresh_key, devices=devices, **tuner.span._asdict(),
+        )  # fmt: skip
+        certificates += 1
+        if isinstance(fresh, Members) or not any(tuner.searches) or certificates == _CERTIFICATES:
+            break  # members that are given have one certificate
+        worst = certified_beyond(
+            certificate, certified_members(loop, ensemble, fresh_key, flown=fresh)
+        )
+        if not worst.added:
+            break
+        began = tuner.progress.seconds
+        tuner.go_on(worst, best)
+        seconds += tuner.progress.seconds - began
+    return _tuned(tuner, certificate, certificates, best, seconds)
 
 
 _SIZE = 256  # flights in a slice
@@ -141,106 +320,16 @@ _CERTIFICATES = 3  # at most
 _AGAIN = 0xCE57  # folded into the key of certificates after the first
 
 
-class _Certified(NamedTuple):
-    """Where the descents ended, and what holds there on other members."""
-
-    solution: Solution
-    certificate: Certificate | None
-    certificates: int  # how many were made
-    seconds: float  # of descents between them
-
-
-def _certify(
-    job: Job,
-    coordinates: Coordinates,
-    watched: Progress,
-    fresh: int | Members | None,
-    peers: Mapping[str, PyTree] | None,
-    solution: Solution,
-    best: int,
-    search: Search | None,
-) -> _Certified:
-    """A certificate; and where it has members beyond a limit, tune on these and certify again.
-
-    Members that are given have one certificate. None where none is asked for, or where nothing is
-    left to draw it from.
-    """
-    ensemble = fresh if isinstance(fresh, Members) else job.ensemble
-    if fresh is None or isinstance(fresh, int) and isinstance(ensemble, Members):
-        return _Certified(solution, None, 0, 0.0)
-    count = 0 if isinstance(fresh, Members) else fresh
-
-    def certificate(z: Float[np.ndarray, " n"], key: Key[Array, ""]) -> Certificate:
-        watched.say("certificate on fresh members ...")
-        design = job.loop.with_controller(build_design(coordinates, as_array(z)))
-        return certify(
-            design, ensemble, job.scenario, limits=job.limits, peers=peers, members=count,
-            begun=job.loop.controller, key=key, devices=job.devices, **job.span._asdict(),
-        )  # fmt: skip
-
-    key, certificates, seconds = job.key, 1, 0.0
-    latest = certificate(solution.z[best], key)
-    while search is not None and isinstance(ensemble, Ensemble) and certificates < _CERTIFICATES:
-        members = certified_members(job.loop, ensemble, key, flown=count)
-        worst = certified_beyond(latest, members)
-        if not worst.added:
-            break
-        began = time.perf_counter()
-        solution = go_on(solution, worst, search, best)
-        seconds += time.perf_counter() - began
-        key = jax.random.fold_in(job.key, _AGAIN + certificates)
-        latest, certificates = certificate(solution.z[best], key), certificates + 1
-    return _Certified(solution, latest, certificates, seconds)
-
-
-def _tuned(
-    job: Job,
-    coordinates: Coordinates,
-    problem: Problem,
-    certified: _Certified,
-    best: int,
-    watched: Progress,
-    seconds: float,
-) -> Tuned:
-    solution, certificate = certified.solution, certified.certificate
-    tuned = build_design(coordinates, as_array(solution.z[best]))
-    limits = _limit_results(job.limits, solution, best)
-    bounds = find_bounds(coordinates, solution.z[best], solution.gradient[best])
-    convergence = judge_descent(solution, best, bounds, limits)
-    if certificate is not None:
-        certificate = dataclasses.replace(certificate, convergence=convergence)
-    return Tuned(
-        controller=tuned,
-        certificate=certificate,
-        bounds=bounds,
-        convergence=convergence,
-        stabilised=bool(solution.stabilised[best]),
-        converged=bool(solution.converged[best]),
-        cost=float(solution.cost[best]),
-        values=coordinates.values(solution.z[best]),
-        limits=limits,
-        minima=distinct_optima(solution, coordinates),
-        evaluations=int(solution.evaluations[best]),
-        stabilising=int(solution.stabilising[best]),
-        tail=solution.tail._replace(certificates=certified.certificates),
-        history=tuple(watched.history),
-        seconds=seconds + certified.seconds,
-        remarks=tuple(_remarks(tuned, problem, solution, best, limits)),
-    )
-
-
-def stabilising_rate(objective: Objective) -> float:
-    """The abscissa in 1/s that every member is brought to before anything is flown."""
-    knees = [float(p.knee) for p in objective.penalties if p.quantity == "abscissa"]
-    return min([*knees, -0.1]) if knees else -0.5
-
-
-def _best(solution: Solution) -> int:
-    """The lowest cost among the starts that are stable and miss limits least."""
-    missed = np.maximum(solution.beyond, 0).sum(axis=1) if solution.beyond.size else 0.0
-    missed = np.where(np.asarray(missed) > 5e-3, missed, 0.0)
-    cost = np.where(np.isnan(solution.cost), np.inf, solution.cost)
-    return int(np.lexsort((cost, np.broadcast_to(missed, cost.shape), np.isinf(cost)))[0])
+def certified_beyond(certificate: Certificate, drawn: Sequence[Members]) -> Beyond:
+    """The members of a certificate that are beyond a limit, of those that flew and further ones."""
+    missed = [x for x in certificate.distances if x.beyond and covers(x)]
+    linear = [x for x in missed if QUANTITIES[x.quantity].linear]
+    every = with_further(certificate.design, certificate.further)
+    loops = [divmod(k, drawn[0].size) for k in rank_beyond(every, linear)]
+    others = [x for x in missed if x not in linear]
+    flown = [(0, k) for k in rank_beyond(certificate.design, others)]
+    worst = take_members(drawn, loops[:ADDED]), take_members(drawn, flown[:GUARDS])
+    return Beyond(*worst, len(loops) + len(flown))
 
 
 _ACTIVE = 1e-3  # the multiplier's sum above which a limit costs something
@@ -251,94 +340,57 @@ def _excess(limit: Limit, values: Float[Array, " members"]) -> Float[Array, ""]:
     return limit.excess(values)
 
 
-def _limit_results(
-    limits: Sequence[Limit], solution: Solution, index: int
-) -> tuple[LimitResult, ...]:
-    """Each limit as it was given, on the members that were tuned on."""
-    results = []
-    for k, limit in enumerate(limits):
-        values = as_array(solution.result.limited[k][index])
-        excess = float(_excess(limit, values))
+def _tuned(
+    tuner: Tuner, certificate: Certificate | None, certificates: int, best: int, seconds: float
+) -> Tuned:
+    controller, limits = build_design(tuner.coordinates, as_array(tuner.z[best])), []
+    for k, limit in enumerate(tuner.limits):  # as it was given, on the members that were tuned on
+        excess = float(_excess(limit, as_array(tuner.result.limited[k][best])))
         reached = float(limit.bound) + limit.sign * excess
-        active = float(np.asarray(solution.multipliers.values[k])[index].sum()) > _ACTIVE
-        results.append(LimitResult(limit, reached, excess <= 0, active))
-    return tuple(results)
-
-
-def judge_descent(
-    solution: Solution, index: int, bounds: tuple[Bound, ...], limits: Sequence[LimitResult] = ()
-) -> Verdict:
-    """The verdict on convergence, where all members could be stabilised."""
-    if not solution.stable[index]:
-        text = "nothing was optimised, because not every member could be stabilised"
-        remedy = "Start with slower gains, or narrow the ensemble"
-        return Verdict("CONVERGENCE", False, text, remedy)
-    return judge_convergence(
-        converged=bool(solution.converged[index]),
-        reason=solution.reasons[index],
-        refusal=solution.refusal,
-        gradient=float(np.max(np.abs(solution.gradient[index]))),
-        evaluations=int(solution.evaluations[index]),
+        active = float(np.asarray(tuner.multipliers[k])[best].sum()) > _ACTIVE
+        limits.append(LimitResult(limit, reached, excess <= 0, active))
+    bounds, convergence = tuner.judge(
+        best, [f"{x.limit} cannot be met: {x.reached:.4g} at best" for x in limits if not x.met]
+    )
+    if certificate is not None:
+        certificate = dataclasses.replace(certificate, convergence=convergence)
+    return Tuned(
+        controller=controller,
+        certificate=certificate,
         bounds=bounds,
-        missed=[f"{x.limit} cannot be met: {x.reached:.4g} at best" for x in limits if not x.met],
+        convergence=convergence,
+        stabilised=bool(tuner.stabilised[best]),
+        converged=bool(tuner.converged[best]),
+        cost=float(tuner.cost[best]),
+        values=tuner.coordinates.values(tuner.z[best]),
+        limits=tuple(limits),
+        minima=distinct_optima(tuner),
+        evaluations=int(tuner.evaluations[best]),
+        stabilising=int(tuner.stabilising[best]),
+        tail=tuner.tail._replace(certificates=certificates),
+        history=tuple(tuner.progress.history),
+        seconds=seconds,
+        remarks=tuple(_remarks(tuner, controller, best, limits)),
     )
 
 
 def _remarks(
-    controller: PyTree,
-    problem: Problem,
-    solution: Solution,
-    index: int,
-    limits: Sequence[LimitResult],
+    tuner: Tuner, controller: PyTree, index: int, limits: Sequence[LimitResult]
 ) -> Iterator[str]:
-    slowest = np.asarray(solution.result.numbers["abscissa"][index])
-    if not solution.stable[index]:
+    slowest = np.asarray(tuner.result.numbers["abscissa"][index])
+    if not tuner.stable[index]:
         count = int(np.sum(slowest >= 0))
         yield (
             f"{count} of the {slowest.size} members that were tuned on cannot be stabilised from "
             f"this start (slowest pole {slowest.max():+.3g} 1/s), so nothing was optimised: start "
             "with slower gains, or narrow the ensemble"
         )
-    elif not solution.stabilised[index]:
+    elif not tuner.stabilised[index]:
         yield f"the slowest pole of a member decays at only {-slowest.max():.3g} 1/s"
-    if not all(one.met for one in limits) or not solution.stable[index]:
-        remark = lag_remark(controller, problem.linear.delay, problem.linear.axes.lag)
-        if remark is not None:
+    if not all(one.met for one in limits) or not tuner.stable[index]:
+        linear = tuner.problem.linear
+        if remark := lag_remark(controller, linear.delay, linear.axes.lag):
             yield remark
-
-
-def require_kinds(
-    loop: object,
-    ensemble: object,
-    scenario: object,
-    objective: object,
-    limits: object,
-    method: object,
-) -> None:
-    """Raise ValueError for an argument of another kind, and for limits on no sum of squares."""
-    if not isinstance(loop, Loop):
-        raise ValueError(
-            f"loop is a {type(loop).__name__}: give jq.Loop(plant, controller, ...), whose "
-            "controller is the start"
-        )
-    if not isinstance(ensemble, Ensemble | Members):
-        raise ValueError(
-            f"ensemble is a {type(ensemble).__name__}: give jq.Ensemble(inertia=...), or "
-            "jq.ensembles.Members of it"
-        )
-    if not isinstance(scenario, Scenario):
-        raise ValueError(
-            f"scenario is a {type(scenario).__name__}: give jq.scenario(duration=..., ...)"
-        )
-    if not isinstance(objective, Objective):
-        name = type(objective).__name__
-        raise ValueError(f"objective is a {name}: give jq.Objective(terms={{'itae': 1.0}}, ...)")
-    if not isinstance(limits, Sequence) or not all(isinstance(x, Limit) for x in limits):
-        raise ValueError(f"limits are {limits}: give a list, as [jq.Limit('overshoot', at_most=5)]")
-    if not isinstance(method, LBFGS | GaussNewton):
-        raise ValueError(f"method is {method!r}: give jq.tuning.LBFGS() or jq.tuning.GaussNewton()")
-    if isinstance(method, GaussNewton):
-        require_squares(objective, limits)
 
 
 def require_fresh(fresh: object, drawn: Members, peers: Mapping[str, PyTree] | None) -> None:
@@ -353,15 +405,3 @@ def require_fresh(fresh: object, drawn: Members, peers: Mapping[str, PyTree] | N
                 f"{len(mine & theirs)} of the fresh members are those that are tuned on: a "
                 "certificate needs others, as ensemble.fresh(loop, 256, key) draws them"
             )
-
-
-def require_steps(problem: Problem, wanted: frozenset[str]) -> None:
-    """Raise ValueError for an overshoot where there is no step."""
-    if "overshoot" not in wanted:
-        return
-    steps = find_steps(problem.flight.reference, problem.parts)
-    if not np.any(np.asarray(steps.is_single & (steps.target != steps.before))):
-        raise ValueError(
-            "overshoot is wanted, but the reference makes no step from event to event: give a "
-            "scenario with one, and its times as Objective(events=...)"
-        )

@@ -1,13 +1,6 @@
 from ._autopilot import autopilot as autopilot
 from ._batch import batch as batch, find_logs as find_logs
 from ._batch_workers import Job as Job
-from ._command_line import in_options as in_options
-from ._demo import (
-    DEMO as DEMO,
-    DEMO_TRUTH as DEMO_TRUTH,
-    find_demo_flight as find_demo_flight,
-    write_demo_log as write_demo_log,
-)
 from ._identification import Identification as Identification
 from ._identify import (
     identify as identify,
@@ -16,9 +9,13 @@ from ._identify import (
     verify_result as verify_result,
 )
 from ._log import (
+    DEMO as DEMO,
+    DEMO_TRUTH as DEMO_TRUTH,
+    find_demo_flight as find_demo_flight,
     open_logs as open_logs,
     OpenedLogs as OpenedLogs,
     propose_settings as propose_settings,
+    write_demo_log as write_demo_log,
 )
 from ._options import SettingsError as SettingsError
 from ._result_file import (
@@ -34,6 +31,7 @@ from ._settings import (
     BatchSettings as BatchSettings,
     GROUPS as GROUPS,
     IdentifySettings as IdentifySettings,
+    in_options as in_options,
     Override as Override,
     TuneSettings as TuneSettings,
 )

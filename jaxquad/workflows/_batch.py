@@ -54,14 +54,9 @@ def find_logs(
 
 
 def batch(
-    folder: str | Path,
-    settings: BatchSettings | None = None,
-    *,
-    out: str | Path | None = None,
-    again: bool = False,
-    work: Work = identify_log,
-    listener: Listener | None = None,
-) -> list[Row]:
+    folder: str | Path, settings: BatchSettings | None = None, *, out: str | Path | None = None,
+    again: bool = False, work: Work = identify_log, listener: Listener | None = None,
+) -> list[Row]:  # fmt: skip
     """Identify all logs of a folder, as `jaxquad batch` does.
 
     Each result is stored in `out` as soon as it is there, under a key of the log's content, its
@@ -84,94 +79,72 @@ def batch(
     **Raises:** ValueError where there is no log, where settings exclude each other, where another
     batch runs in `out`, and where no scheduler answers.
     """
-    settings = settings or BatchSettings()
-    out = Path(out or Path("results") / Path(folder).resolve().name).absolute()
+    settings, folder = settings or BatchSettings(), Path(folder)
+    out = Path(out or Path("results") / folder.resolve().name).absolute()
     logs = find_logs(folder, settings, out=out)
-    fleet = _Fleet(Path(folder), logs, settings, out, again, listener)
-    with locked(out):
-        jobs = fleet.jobs()
-        if settings.scheduler is not None:
-            done = perform_on_cluster(settings.scheduler, jobs, work)
-        else:
-            done = perform_locally(jobs, work, settings.workers or available_cores(), fleet.timeout)
-        try:
-            for job, content in done:
-                fleet.answered(job, content)
-        finally:
-            rows = [fleet.rows[log] for log in logs if log in fleet.rows]
-            write_tables(out, rows)
-            write_summary(out, rows, title=Path(folder).resolve().name)
-    return rows
+    timeout = settings.timeout
+    if timeout is None and settings.scheduler is None:
+        timeout = _TIMEOUT
+    names = {log: log.relative_to(folder).as_posix() for log in logs}
+    # Before the first log is read: settings that exclude each other stop the batch.
+    settings_of = {log: settings.of(name) for log, name in names.items()}
+    # Logs of equal content and settings share a result.
+    waiting, results, rows = dict[str, list[Path]](), dict[str, Content](), dict[Path, Row]()
 
+    def add_row(log: Path, key: str, content: Content) -> None:
+        rows[log] = {"log": names[log]} | content | {"key": key}
+        if listener is not None:
+            listener(rows[log])
 
-class _Fleet:
-    """Which logs wait for which result; logs of equal content and settings share one."""
-
-    def __init__(
-        self,
-        folder: Path,
-        logs: list[Path],
-        settings: BatchSettings,
-        out: Path,
-        again: bool,
-        listener: Listener | None,
-    ):
-        self.logs, self.out, self.again, self.listener = logs, out, again, listener
-        self.timeout = settings.timeout
-        if self.timeout is None and settings.scheduler is None:
-            self.timeout = _TIMEOUT
-        self.names = {log: log.relative_to(folder).as_posix() for log in logs}
-        # Before the first log is read: settings that exclude each other stop the batch.
-        self.settings = {log: settings.of(name) for log, name in self.names.items()}
-        self.waiting: dict[str, list[Path]] = {}
-        self.results: dict[str, Content] = {}
-        self.rows: dict[Path, Row] = {}
-
-    def jobs(self) -> Iterator[Job]:
-        """What is left to do; a log is opened when its turn comes."""
-        for log in self.logs:
-            settings = self.settings[log]
-            try:
-                job = Job(str(log.absolute()), key_of(log, settings), settings, str(self.out))
-            except OSError as error:
-                self._add_row(log, "", failure(str(error)))
-                continue
-            if job.key in self.waiting:
-                self.waiting[job.key].append(log)
-                continue
-            result = self.results.get(job.key) or self._earlier_result(job)
-            if result is not None:
-                self.results[job.key] = result
-                self._add_row(log, job.key, result)
-            else:
-                self.waiting[job.key] = [log]
-                yield job
-
-    def answered(self, job: Job, content: Content) -> None:
-        """Note the result of a job for all logs that wait for it."""
-        self.results[job.key] = content
-        for log in self.waiting.pop(job.key):
-            self._add_row(log, job.key, content)
-
-    def _earlier_result(self, job: Job) -> Content | None:
+    def earlier_result(job: Job) -> Content | None:
         earlier = stored_result(job)
         if earlier is None or earlier.get("status") != "failed":
             return earlier
         limit = earlier.get("timeout")
-        longer = limit is not None and (self.timeout is None or self.timeout > limit)
-        if self.again or longer:
+        longer = limit is not None and (timeout is None or timeout > limit)
+        if again or longer:
             job.stored.unlink(missing_ok=True)
             return None
         return earlier
 
-    def _add_row(self, log: Path, key: str, content: Content) -> None:
-        row: Row = {"log": self.names[log]} | content | {"key": key}
-        self.rows[log] = row
-        if self.listener is not None:
-            self.listener(row)
+    def jobs() -> Iterator[Job]:
+        """What is left to do; a log is opened when its turn comes."""
+        for log in logs:
+            try:
+                key = _key_of(log, settings_of[log])
+            except OSError as error:
+                add_row(log, "", failure(str(error)))
+                continue
+            if key in waiting:
+                waiting[key].append(log)
+                continue
+            job = Job(str(log.absolute()), key, settings_of[log], str(out))
+            result = results.get(key) or earlier_result(job)
+            if result is not None:
+                results[key] = result
+                add_row(log, key, result)
+            else:
+                waiting[key] = [log]
+                yield job
+
+    with locked(out):
+        if settings.scheduler is not None:
+            done = perform_on_cluster(settings.scheduler, jobs(), work)
+        else:
+            done = perform_locally(jobs(), work, settings.workers or available_cores(), timeout)
+        try:
+            for job, content in done:
+                results[job.key] = content
+                for log in waiting.pop(job.key):
+                    add_row(log, job.key, content)
+        finally:
+            sorted_rows = [rows[log] for log in logs if log in rows]
+            _write_tables(out, sorted_rows)
+            _write_summary(out, sorted_rows, title=folder.resolve().name)
+    return sorted_rows
 
 
-def key_of(log: Path, settings: IdentifySettings) -> str:
+def _key_of(log: Path, settings: IdentifySettings) -> str:
     """By the log's content, its settings and the version of jaxquad, not by the log's name."""
     with log.open("rb") as file:
         digest = hashlib.file_digest(file, "sha256").hexdigest()
@@ -183,10 +156,13 @@ _FIRST = ("log", "status")
 _LAST = ("remarks", "seconds", "error", "report", "key")
 
 
-def write_tables(out: Path, rows: Sequence[Row]) -> None:
+_TEXTS = ("error", "report", "key")
+
+
+def _write_tables(out: Path, rows: Sequence[Row]) -> None:
     """Write `table.csv`, and `table.parquet` where pyarrow is installed."""
-    flat = [flattened(row) for row in rows]
-    names = columns(flat)
+    flat = [_flattened(row) for row in rows]
+    names = _columns(flat)
 
     def cell(value: object) -> object:
         """What a spreadsheet would take for a formula becomes a text."""
@@ -206,18 +182,18 @@ def write_tables(out: Path, rows: Sequence[Row]) -> None:
 
     def column(name: str) -> pa.Array:
         values = [row.get(name) for row in flat]
-        if name not in (*_FIRST, "error", "report", "key"):
+        if name not in (*_FIRST, *_TEXTS):
             numbers = [float(x) if isinstance(x, int | float) else None for x in values]
             return pa.array(numbers, pa.float64())
-        encoded = [x if x is None else str(x).encode("utf-8", "replace") for x in values]
-        return pa.array([x if x is None else x.decode() for x in encoded], pa.string())
+        texts = [x if x is None else str(x).encode("utf-8", "replace").decode() for x in values]
+        return pa.array(texts, pa.string())
 
     buffer = io.BytesIO()
     pq.write_table(pa.table({name: column(name) for name in names}), buffer)
     write_file(out / "table.parquet", buffer.getvalue())
 
 
-def flattened(row: Row) -> Row:
+def _flattened(row: Row) -> Row:
     """One column for the value of each parameter and one for its standard error."""
     flat = {name: row.get(name) for name in (*_FIRST, *_LAST)}
     flat["remarks"] = len(row.get("remarks", ()))
@@ -227,7 +203,7 @@ def flattened(row: Row) -> Row:
     return flat
 
 
-def columns(flat: Sequence[Row]) -> list[str]:
+def _columns(flat: Sequence[Row]) -> list[str]:
     """The names of all parameters, between what identifies a log and what is said of it."""
     names = dict.fromkeys(name for row in flat for name in row)
     return [*_FIRST, *(n for n in names if n not in (*_FIRST, *_LAST)), *_LAST]
@@ -236,7 +212,7 @@ def columns(flat: Sequence[Row]) -> list[str]:
 _STATES = ("failed", "not identifiable", "identified")  # what needs a look comes first
 
 
-def write_summary(out: Path, rows: Sequence[Row], *, title: str) -> Path:
+def _write_summary(out: Path, rows: Sequence[Row], *, title: str) -> None:
     """Write `summary.html`: the state of each log, with a link to its report."""
     from jaxquad.report import Cell, render_page, Table
 
@@ -246,26 +222,23 @@ def write_summary(out: Path, rows: Sequence[Row], *, title: str) -> Path:
         return f"{value:.5g}" if isinstance(value, int | float) else str(value)
 
     counts = Counter(row["status"] for row in rows)
+    states = [state for state in (*_STATES, *sorted({*counts} - {*_STATES})) if counts[state]]
     parts = []
-    states = [*_STATES, *sorted(set(counts) - set(_STATES))]
-    for state in (state for state in states if counts[state]):
-        flat = [flattened(row) for row in rows if row["status"] == state]
-        numbers = [n for n in columns(flat) if n not in (*_FIRST, "error", "report", "key")]
-        failed = state == "failed"
-        heads = ["log", "error", "seconds"] if failed else ["log", *numbers]
-        body = [
-            [
-                Cell(str(row["log"]), link=quote(row["report"] or "")),
-                *(cell(row.get(name)) for name in heads[1:]),
-            ]
-            for row in flat
-        ]
+    for state in states:
+        flat = [_flattened(row) for row in rows if row["status"] == state]
+        heads = ["log", *(n for n in _columns(flat) if n not in (*_FIRST, *_TEXTS))]
+        if failed := state == "failed":
+            heads = ["log", "error", "seconds"]
+        body = []
+        for row in flat:
+            link = Cell(str(row["log"]), link=quote(row["report"] or ""))
+            body.append([link, *(cell(row.get(name)) for name in heads[1:])])
         table = Table(state.capitalize(), heads, body, texts=1 + failed)
-        part = {"key": state.replace(" ", "-"), "title": state.capitalize(), "table": table}
-        parts.append(part)
-    counted = ", ".join(f"{counts[state]} {state}" for state in states if counts[state])
+        key = state.replace(" ", "-")
+        parts.append({"key": key, "title": state.capitalize(), "table": table})
+    counted = ", ".join(f"{counts[state]} {state}" for state in states)
     text = render_page(
         "summary.html", title=f"{title}: {counted}", folder=title, count=len(rows), counts=counted,
         parts=parts,
     )  # fmt: skip
-    return write_file(out / "summary.html", text)
+    write_file(out / "summary.html", text)

@@ -75,16 +75,16 @@ def identify_log(job: Job) -> Content:
     fit, rows = result.fit, []
     if fit.verdict.fitted:
         numbers = zip(fit.names, fit.values, fit.standard_errors, fit.determined, strict=True)
-        for parameter, value, error, determined in numbers:
-            # A table has no place for a mark: what is not determined has no number in it.
-            pair = (float(value), float(error)) if determined else (None, None)
-            rows.append((parameter, *pair))
-    rows += [(x.name, float(x.value), float(x.standard_error)) for x in result.combinations]
+        # A table has no place for a mark: what is not determined has no number in it.
+        rows += [(name, *(pair if sure else (None, None))) for name, *pair, sure in numbers]
+    rows += [(x.name, x.value, x.standard_error) for x in result.combinations]
+    plain = lambda x: None if x is None else float(x)
     return {
         "status": "identified" if fit.identifiable else "not identifiable",
         "error": "" if fit.identifiable else fit.verdict.summary,
         "parameters": [
-            {"name": name, "value": value, "standard_error": error} for name, value, error in rows
+            {"name": name, "value": plain(value), "standard_error": plain(error)}
+            for name, value, error in rows
         ],
         "remarks": [*warned, *fit.remarks],
         "report": (folder / "report.html").relative_to(job.out).as_posix(),
@@ -92,11 +92,7 @@ def identify_log(job: Job) -> Content:
 
 
 def perform(work: Work, job: Job) -> Content:
-    """Do one job and store its result; an error is a result, too.
-
-    A ValueError says that the log cannot be used, which stays so. Other errors (no memory, no
-    disk, a defect) are not stored: the next run tries again.
-    """
+    """Do one job and store its result; an error is a result, too."""
     earlier = stored_result(job)  # by a process whose answer was lost
     if earlier is not None:
         return earlier
@@ -110,6 +106,7 @@ def perform(work: Work, job: Job) -> Content:
         if not (isinstance(error, ValueError | OSError) and text):
             text = f"{type(error).__name__}: {text}"
         content = failure(text) | seconds()
+        # The log cannot be used, which stays so; after other errors the next run tries again.
         if isinstance(error, ValueError):
             with contextlib.suppress(OSError):
                 store_result(job, content)
@@ -138,10 +135,7 @@ def store_result(job: Job, content: Mapping[str, object]) -> None:
 
 @contextlib.contextmanager
 def locked(out: Path) -> Iterator[None]:
-    """One batch at a time in a folder; a killed one leaves no lock, and its drafts are removed.
-
-    Raises ValueError where another one runs.
-    """
+    """One batch at a time in a folder; a killed one leaves no lock, and its drafts are removed."""
     out.mkdir(parents=True, exist_ok=True)
     with (out / ".lock").open("w") as file:
         try:
@@ -171,10 +165,9 @@ _NARROW = {  # Each process has one core: more threads would only wait for each 
 
 
 class _Worker:
-    def __init__(self, work: Work):
+    def __init__(self, work: Work, timeout: float | None):
+        self.timeout, self.due = math.inf if timeout is None else timeout, math.inf
         self.connection, theirs = _SPAWN.Pipe()
-        self.job: Job | None = None
-        self.due = math.inf  # by time.monotonic
         self.process = _SPAWN.Process(target=_serve, args=(work, theirs), daemon=True)
         missing = {name: text for name, text in _NARROW.items() if name not in os.environ}
         os.environ.update(missing)  # what the user set stays
@@ -185,10 +178,8 @@ class _Worker:
                 os.environ.pop(name, None)
         theirs.close()  # or the end of the process would not show on ours
 
-    def give(self, job: Job, timeout: float | None) -> None:
-        """Hand out the next job, to be done within so many s."""
-        self.job = job
-        self.due = math.inf if timeout is None else time.monotonic() + timeout
+    def give(self, job: Job) -> None:
+        self.job, self.due = job, time.monotonic() + self.timeout
         with contextlib.suppress(OSError):  # A process that died shows when its answer is due.
             self.connection.send(job)
 
@@ -207,14 +198,14 @@ class _Worker:
     def overdue(self) -> bool:
         return time.monotonic() >= self.due and not self.connection.poll()
 
-    def give_up(self, timeout: float) -> Content:
+    def give_up(self) -> Content:
         """Stop a job that takes too long; its failure is kept, or it would take as long again."""
-        assert self.job is not None
         self.stop()
         content = stored_result(self.job)  # It may have come to its end just now.
         if content is None:
-            content = failure(f"it took longer than {timeout:g} s: raise the timeout (--timeout)")
-            content |= {"seconds": float(timeout), "timeout": float(timeout)}
+            limit = float(self.timeout)
+            content = failure(f"it took longer than {limit:g} s: raise the timeout (--timeout)")
+            content |= {"seconds": limit, "timeout": limit}
             with contextlib.suppress(OSError):
                 store_result(self.job, content)
         return content
@@ -236,12 +227,12 @@ def perform_locally(
     busy: dict[Connection, _Worker] = {}
 
     def start(worker: _Worker, job: Job) -> None:
-        worker.give(job, timeout)
+        worker.give(job)
         busy[worker.connection] = worker
 
     try:
         for job in islice(jobs, workers):
-            start(_Worker(work), job)
+            start(_Worker(work, timeout), job)
         while busy:
             due = min(worker.due for worker in busy.values())
             left = None if due == math.inf else max(0.0, due - time.monotonic())
@@ -250,13 +241,12 @@ def perform_locally(
             for connection in [*ready, *late]:
                 worker = busy.pop(connection)  # pyright: ignore[reportArgumentType]
                 done = worker.job
-                assert done is not None
-                content = worker.give_up(timeout or 0) if connection in late else worker.answer()
+                content = worker.give_up() if connection in late else worker.answer()
                 job, ended = next(jobs, None), worker.process.exitcode is not None
                 if job is None or ended:
                     worker.stop()
                 if job is not None:
-                    start(_Worker(work) if ended else worker, job)
+                    start(_Worker(work, timeout) if ended else worker, job)
                 yield done, content
     finally:
         for worker in busy.values():
@@ -301,17 +291,13 @@ _AHEAD = 2  # jobs per thread of the cluster that are handed out at a time
 def perform_on_cluster(
     scheduler: str, jobs: Iterator[Job], work: Work
 ) -> Iterator[tuple[Job, Content]]:
-    """Yield the jobs with their results, as these come in.
-
-    A job whose worker is lost moves to another one; a worker that finds a result on the disk does
-    not make it again. Raises ValueError without dask.distributed, and where no scheduler answers.
-    """
+    """As `perform_locally`. A job whose worker is lost moves to another one; a worker that finds a
+    result on the disk does not make it again."""
     try:
         import distributed
     except ImportError as error:
-        raise ValueError(
-            "a scheduler needs dask.distributed: pip install 'jaxquad[cluster]'"
-        ) from error
+        text = "a scheduler needs dask.distributed: pip install 'jaxquad[cluster]'"
+        raise ValueError(text) from error
     try:
         client = distributed.Client(scheduler, timeout=PATIENCE, set_as_default=False)
     except (OSError, ValueError) as error:

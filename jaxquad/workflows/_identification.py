@@ -4,7 +4,7 @@ import dataclasses
 import functools as ft
 import shlex
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -217,21 +217,21 @@ class Identification:
             except UndeterminedError as error:
                 return marked_text(error)
 
-        first, *others = map(str, self.records)
+        fit, (first, *others) = self.fit, map(str, self.records)
         record = "\n".join([first, *(f"and {text.splitlines()[1].strip()}" for text in others)])
         frf = dataclasses.replace(self.frf, remarks=())  # the fit repeats what concerns it
         parts = [f"{record}\n\n{frf}"]
         parts += [f"\n{self.filters_text}"] if self.filters_text else []
-        parts += [f"\n{self.formula}, {self.method} estimate:\n{self.fit}"]
-        if self.settings.poles is not None and self.fit.verdict.fitted:
-            parts += [text_or_reason(lambda: factors(self.fit))]
+        parts += [f"\n{self.formula}, {self.method} estimate:\n{fit}"]
+        if self.settings.poles is not None and fit.verdict.fitted:
+            parts += [text_or_reason(lambda: factors(fit))]
         if self.settings.reference:
             parts += [f"\n{compare_fits(self.fits, self.sums)}"]
-        elif self.fit.verdict.fitted:
-            shown = [combination.name for combination in self.fit.combinations]
+        elif fit.verdict.fitted:
+            shown = [combination.name for combination in fit.combinations]
             sums = [name for name in self.sums if name not in shown]
             parts += [text_or_reason(ft.partial(self._sum, name)) for name in sums]
-        parts += _on_negative_gain(self.fit, self.frf)
+        parts += _on_negative_gain(fit, self.frf)
         if self.parts:
             parts += [f"\nFits to parts of the band:\n{compare_fits(self.parts, self.sums)}"]
         parts += [f"\n{title}:\n{marked_text(x)}" for title, x in self.supplements.items()]
@@ -244,12 +244,52 @@ class Identification:
         **Returns:** the path of `result.json`.
         """
         announce("figures and report")
-        folder, settings, first = Path(folder or default_folder(self.path)), self.settings, self.fit
+        folder, settings, fit = Path(folder or default_folder(self.path)), self.settings, self.fit
         sources = [*self.paths, *([settings.verify] if settings.verify else [])]
         command = shlex.join(["jaxquad", "identify", *map(str, self.paths), *settings.words()])
         origin = provenance(*sources, command=command)
+        extra = self._content() | {"provenance": origin.content()}
+        if self.flown and self.filters:
+            extra["gyro_filters"] = self.flown.content()
+        extra |= self._content_of_supplements()
+        if fit.verdict.fitted:
+            numbers = vars(fit.model).items()
+            plain = {k: v if isinstance(v, int) else np.asarray(v).tolist() for k, v in numbers}
+            extra["model"] = {"kind": type(fit.model).__name__} | plain
+        path = write_results(folder, fit=fit, frf=self.frf, check=self.check, extra=extra)
+        from jaxquad.report import write_report  # here: with it comes matplotlib
+
+        def title(record: Record) -> str:
+            start = clock_start(record.time)
+            span = f"t = {show_times(record.time[0], record.time[-1], start=start)}"
+            return f"{Path(record.source).name}, {span}" if self.more else span
+
+        write_report(
+            folder / "report.html", fit=fit, frf=self.frf, others=self._other_responses,
+            record={title(record): record for record in self.records},
+            spectrum=self._record_with_throttle(),
+            checks={} if self.check is None else {Path(sources[-1]).name: self.check},
+            derived=self.combinations, provenance=origin, filters=self.filters,
+            law=self._law_if_any(), texts=self.supplements,
+            formula="; ".join(filter(None, (self.formula, self.filters_text))),
+        )  # fmt: skip
+        for earlier in (folder / "verification.png", *folder.glob("record_*.png")):
+            if earlier.name not in self.figure_names:
+                earlier.unlink(missing_ok=True)
+        for name, draw in self.drawings().items():
+            try:
+                draw().figure.savefig(folder / name, dpi=130)
+            except OSError:
+                raise
+            except Exception as error:  # costs no other figure, and leaves no earlier one
+                (folder / name).unlink(missing_ok=True)
+                text = f"{name} could not be drawn: {reason_of(error).marked}"
+                warnings.warn(text, PageWarning, stacklevel=2)
+        return path
+
+    def _content(self) -> dict[str, object]:
         spans = [[float(record.time[0]), float(record.time[-1])] for record in self.records]
-        extra = {
+        return {
             "record": {
                 "file": str(self.path),
                 "more_files": [str(path) for path in self.more],
@@ -259,55 +299,64 @@ class Identification:
                 "sample_rate_hz": self.records[0].sample_rate,
                 "largest_command": self.largest_command,
             },
-            "settings": settings.content(),
+            "settings": self.settings.content(),
             "band_rad_per_s": self.band,
             "band_hz": [omega / (2 * np.pi) for omega in self.band],
-            "used_band_rad_per_s": first.used_band,
+            "used_band_rad_per_s": self.fit.used_band,
             "derived": [combination.content() for combination in self.combinations],
-            "provenance": origin.content(),
         }
-        if self.flown and self.filters:
-            extra["gyro_filters"] = self.flown.content()
-        extra |= _supplements_content(self.bands, self.explanation)
-        if first.verdict.fitted:
-            numbers = vars(first.model).items()
-            plain = {k: v if isinstance(v, int) else np.asarray(v).tolist() for k, v in numbers}
-            extra["model"] = {"kind": type(first.model).__name__} | plain
-        path = write_results(folder, fit=first, frf=self.frf, check=self.check, extra=extra)
-        from jaxquad.report import write_report  # here: with it comes matplotlib
 
-        write_report(
-            folder / "report.html",
-            fit=first,
-            frf=self.frf,
-            others=self._other_responses,
-            record={_record_title(record, self.more): record for record in self.records},
-            spectrum=_record_with_throttle(self),
-            checks={} if self.check is None else {Path(sources[-1]).name: self.check},
-            derived=self.combinations,
-            provenance=origin,
-            filters=self.filters,
-            law=_law_if_any(self),
-            formula="; ".join(filter(None, (self.formula, self.filters_text))),
-            texts=self.supplements,
-        )
-        self._write_figures(folder)
-        return path
+    def _content_of_supplements(self) -> dict[str, object]:
+        content: dict[str, object] = {}
+        if self.bands is not None:
+            halves = {"lower": self.bands.lower, "upper": self.bands.upper}
+            rows = lambda fit: [
+                {"name": name, "value": value, "interval_95": fit.interval(name)}
+                | {"determined": bool(determined)}
+                for name, value, determined in zip(
+                    fit.names, fit.values, fit.determined, strict=False
+                )
+                if fit.verdict.fitted
+            ]
+            content["half_bands"] = {"split_rad_per_s": self.bands.split} | {
+                name: None if half is None else rows(half) for name, half in halves.items()
+            }
+        if self.explanation is not None:
+            tried = [
+                {"term": x.title, "factor": x.formula, "bic_lower_by": x.gain}
+                for x in self.explanation.candidates
+            ]
+            content["explanation"] = {"summary": self.explanation.summary, "tried": tried}
+        return content
 
-    def _write_figures(self, folder: Path) -> None:
-        """Those that can be drawn; a `PageWarning` for each other one, of which no file is left."""
-        for earlier in (folder / "verification.png", *folder.glob("record_*.png")):
-            if earlier.name not in self.figure_names:
-                earlier.unlink(missing_ok=True)
-        for name, draw in self.drawings().items():
-            try:
-                draw().figure.savefig(folder / name, dpi=130)
-            except OSError:
-                raise
-            except Exception as error:
-                (folder / name).unlink(missing_ok=True)
-                text = f"{name} could not be drawn: {reason_of(error).marked}"
-                warnings.warn(text, PageWarning, stacklevel=3)
+    def _record_with_throttle(self) -> Record | None:
+        """The first record with the throttle that the log's proposal names; None without one."""
+        proposal, first = self.proposal, self.records[0]
+        if proposal is None or not proposal.setup.throttle:
+            return None
+        options = proposal.options_with_throttle
+        options |= {"start": float(first.time[0]), "stop": float(first.time[-1])}
+        options |= {"sample_rate": first.sample_rate, "max_gap": self.settings.max_gap}
+        try:
+            with warnings.catch_warnings():  # the record has said what was repaired
+                warnings.simplefilter("ignore", RecordWarning)
+                return read(self.path, **options)
+        except RecordError as error:
+            announce(f"no spectrum over the throttle: {error}")
+            return None
+
+    def _law_if_any(self) -> LawLoop | None:
+        if self.flown is None:
+            return None
+        from jaxquad.autopilot import loop_of_law
+
+        try:
+            [unit] = self.records[0].output_units
+            return loop_of_law(self.flown, self.fit, self.frf, self.filters, unit)
+        except Exception as error:  # the record shows its loop without the law, too
+            text = f"the loop by its law is missing: {reason_of(error).marked}"
+            warnings.warn(text, PageWarning, stacklevel=2)
+            return None
 
 
 def total_delay(model: Model) -> Float[Array, ""]:
@@ -341,70 +390,4 @@ def _on_negative_gain(fit: Fit, frf: FrequencyResponse) -> list[str]:
         f"the gain is negative: when {source} rises, {output} falls. If it should rise, check the "
         f"signs of both channels and of the axis; jaxquad tune needs a positive gain "
         "(--input NAME=-CHANNEL)"
-    ]
-
-
-def _record_title(record: Record, more: Sequence[Path]) -> str:
-    start = clock_start(record.time)
-    span = f"t = {show_times(record.time[0], record.time[-1], start=start)}"
-    return f"{Path(record.source).name}, {span}" if more else span
-
-
-def _law_if_any(result: Identification) -> LawLoop | None:
-    if result.flown is None:
-        return None
-    from jaxquad.autopilot import loop_of_law
-
-    try:
-        [unit] = result.records[0].output_units
-        return loop_of_law(result.flown, result.fit, result.frf, result.filters, unit)
-    except Exception as error:  # the record shows its loop without the law, too
-        text = f"the loop by its law is missing: {reason_of(error).marked}"
-        warnings.warn(text, PageWarning, stacklevel=2)
-        return None
-
-
-def _record_with_throttle(result: Identification) -> Record | None:
-    """The first record with the throttle that the log's proposal names; None without one."""
-    proposal, first = result.proposal, result.records[0]
-    if proposal is None or not proposal.setup.throttle:
-        return None
-    options = proposal.options_with_throttle
-    options |= {"start": float(first.time[0]), "stop": float(first.time[-1])}
-    options |= {"sample_rate": first.sample_rate, "max_gap": result.settings.max_gap}
-    try:
-        with warnings.catch_warnings():  # the record has said what was repaired
-            warnings.simplefilter("ignore", RecordWarning)
-            return read(result.path, **options)
-    except RecordError as error:
-        announce(f"no spectrum over the throttle: {error}")
-        return None
-
-
-def _supplements_content(bands: Bands | None, explanation: Explanation | None) -> dict[str, object]:
-    """The halves of the band, and what explains the misfit."""
-    content: dict[str, object] = {}
-    if bands is not None:
-        halves = {"lower": bands.lower, "upper": bands.upper}
-        content["half_bands"] = {"split_rad_per_s": bands.split} | {
-            name: None if half is None else _intervals(half) for name, half in halves.items()
-        }
-    if explanation is not None:
-        tried = [
-            {"term": x.title, "factor": x.formula, "bic_lower_by": x.gain}
-            for x in explanation.candidates
-        ]
-        content["explanation"] = {"summary": explanation.summary, "tried": tried}
-    return content
-
-
-def _intervals(fit: Fit) -> list[dict[str, object]]:
-    return [
-        {
-            "name": name,
-            "value": fit.values[k],
-            "interval_95": fit.interval(name),
-            "determined": bool(fit.determined[k]),
-        }
-        for k, name in enumerate(fit.names if fit.verdict.fitted else ())
     ]

@@ -3,7 +3,7 @@
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple, TYPE_CHECKING, TypeVar
+from typing import TypeVar
 
 import numpy as np
 
@@ -40,15 +40,11 @@ from jaxquad.spectra import (
     Welch,
 )
 
-from ._command_line import in_options
 from ._identification import EXPLAINED, HALVES, Identification
 from ._log import mix_of, open_again, open_logs, OpenedLogs, read_records
 from ._result_file import load_result, StoredResult
-from ._settings import IdentifySettings
+from ._settings import IdentifySettings, in_options
 
-
-if TYPE_CHECKING:
-    from jaxquad.autopilot import FlownLaw
 
 T = TypeVar("T")
 _COSTS = {"ml": MaximumLikelihood(), "coherence": CoherenceWeighted()}
@@ -61,11 +57,9 @@ _EXCITE = "excite the axis more, over a wider band (jaxquad design sweep), or re
 
 
 def identify(
-    path: str | Path | Sequence[str | Path],
-    settings: IdentifySettings | None = None,
-    *,
+    path: str | Path | Sequence[str | Path], settings: IdentifySettings | None = None, *,
     proposal: Proposal | None = None,
-) -> Identification:
+) -> Identification:  # fmt: skip
     """Identify one log, or several together, as `jaxquad identify` does.
 
     The frequency response is estimated with the delay taken out that a fit to a quick one has
@@ -121,12 +115,23 @@ def identify_opened(opened: OpenedLogs) -> Identification:
 
     - `opened`: what `open_logs`, or `open_again` of a stored result, returned.
     """
-    paths, settings, proposal, records = opened
-    flown = _flown_law(opened)
+    settings, flown, check, failures = opened.settings, None, None, {}
+    [outputs] = mix_of(settings.output).values() or [{}]
+    axes = [axis for name in outputs if (axis := axis_of_rate(name)) is not None]
+    if len(outputs) == 1 and axes:  # the rate that an autopilot has logged
+        from jaxquad.autopilot import flown_law  # here: with it come the laws of all firmwares
+
+        [rate], [axis], [command] = outputs, axes, mix_of(settings.input).values()
+        flown = flown_law(opened.paths, rate, axis, command, opened.proposal, settings)
     filters = () if flown is None or settings.keep_gyro_filters else flown.filters
-    estimate = _estimate(opened, filters, vehicle=flown is not None, compare=True)
-    method, frf, fit, parts, delay = estimate
-    responses, fits, failures = {method: frf}, {method: fit}, {}
+    result, delay = _estimate(opened, filters, vehicle=flown is not None, compare=True)
+    fit, responses, fits = result.fit, dict(result.responses), dict(result.fits)
+    if settings.verify is not None and fit.verdict.fitted:
+        other = dataclasses.replace(
+            settings, start=settings.verify_start, stop=settings.verify_stop, segments=(),
+            reference=None,
+        )  # fmt: skip
+        check = verify(fit, behind_filters(_longest(Path(settings.verify), other), filters))
 
     def attempt(title: str, compute: Callable[[], T]) -> T | None:
         try:
@@ -134,7 +139,10 @@ def identify_opened(opened: OpenedLogs) -> Identification:
         except Exception as error:
             failures[title] = reason_of(error)
 
-    check = _verified(fit, settings, filters)
+    def fit_direct() -> tuple[FrequencyResponse, Fit]:
+        frf = _respond(opened, "direct", filters, delay)
+        return frf, finish_fit(_fit_response(frf, settings), settings, opened.records[0])
+
     bands = explanation = None
     if fit.verdict.fitted and fit.verdict.kind != "no minimum":
         bands = attempt(HALVES, fit.bands)
@@ -142,39 +150,19 @@ def identify_opened(opened: OpenedLogs) -> Identification:
             explanation = attempt(EXPLAINED, fit.explain)
     if settings.reference:
         announce("fit to the direct response")
-        direct = attempt("The direct estimate", lambda: _fit_direct(opened, filters, delay))
-        if direct is not None:
+        if (direct := attempt("The direct estimate", fit_direct)) is not None:
             responses["direct"], fits["direct"] = direct
-    return Identification(
-        paths[0], settings, records, responses, fits, parts, proposal, paths[1:], flown, check,
-        bands, explanation, failures,
+    return dataclasses.replace(
+        result, responses=responses, fits=fits, flown=flown, check=check, bands=bands,
+        explanation=explanation, failures=failures,
     )  # fmt: skip
 
 
-def _flown_law(opened: OpenedLogs) -> "FlownLaw | None":
-    """The gyro's filters and the law of an autopilot's log; None for any other output."""
-    paths, settings, proposal, _ = opened
-    [outputs] = mix_of(settings.output).values() or [{}]
-    axes = [axis for name in outputs if (axis := axis_of_rate(name)) is not None]
-    if len(outputs) != 1 or not axes:
-        return None
-    from jaxquad.autopilot import flown_law  # here: with it come the laws of all firmwares
-
-    [rate], [axis], [command] = outputs, axes, mix_of(settings.input).values()
-    return flown_law(paths, rate, axis, command, proposal, settings)
-
-
 def identify_fit(opened: OpenedLogs) -> Identification:
-    """The estimate to trust and its fit alone, which are what a design needs.
-
-    The gyro's filters are kept in the model: a loop is closed on the rate behind them.
-
-    **Arguments:**
-
-    - `opened`: what `open_logs`, or `open_again` of a stored result, returned.
-    """
+    """The estimate to trust and its fit alone, as a design needs them: the loop is closed on the
+    rate behind the gyro's filters, which stay in the model."""
     settings = dataclasses.replace(opened.settings, keep_gyro_filters=True)
-    return _of_estimate(opened._replace(settings=settings))
+    return _estimate(opened._replace(settings=settings))[0]
 
 
 def identify_plant(
@@ -182,101 +170,70 @@ def identify_plant(
 ) -> Identification:
     """Likewise, up to what the `filters` of the output were given; its remedies are flights."""
     opened = open_logs(path, settings, proposal)
-    return _of_estimate(opened, filters, vehicle=True, remedies=[_EXCITE])
-
-
-def _of_estimate(
-    opened: OpenedLogs, filters: Sequence[KnownFilter] = (), *, vehicle: bool = False,
-    remedies: Sequence[str] | None = None,
-) -> Identification:  # fmt: skip
-    method, frf, fit, parts, _ = _estimate(opened, filters, vehicle=vehicle, remedies=remedies)
-    paths, settings, proposal, records = opened
-    responses, fits = {method: frf}, {method: fit}
-    return Identification(paths[0], settings, records, responses, fits, parts, proposal, paths[1:])
-
-
-class _Estimate(NamedTuple):
-    """The response to trust and the fit to it; `delay`, in s, was taken out of the response."""
-
-    method: str
-    frf: FrequencyResponse
-    fit: Fit
-    parts: Mapping[str, Fit | None]
-    delay: float
+    return _estimate(opened, filters, vehicle=True, remedies=[_EXCITE])[0]
 
 
 def _estimate(
-    opened: OpenedLogs,
-    filters: Sequence[KnownFilter],
-    *,
-    vehicle: bool,
-    compare: bool = False,
-    remedies: Sequence[str] | None = None,
-) -> _Estimate:
-    """The estimate to trust, its fit, and those to parts of the band where the misfit is large.
+    opened: OpenedLogs, filters: Sequence[KnownFilter] = (), *, vehicle: bool = False,
+    compare: bool = False, remedies: Sequence[str] | None = None,
+) -> tuple[Identification, float]:  # fmt: skip
+    """The estimate to trust with its fit, and the delay in s that was taken out of it.
 
-    Taken out of the response is the delay that a fit to a quick one finds; where the fit to the
-    response itself finds another, it is estimated again. Known `filters` are divided out. The rate
-    of a `vehicle` may be damped by the air. `compare` says that the direct estimate comes later.
+    That delay is what a fit to a quick response finds; where the fit to the response itself finds
+    another, it is estimated again. Known `filters` are divided out. The rate of a `vehicle` may be
+    damped by the air. `compare` says that the direct estimate comes later.
     """
-    settings, records = opened.settings, opened.records
+    paths, settings, proposal, records = opened
     method = "joint" if settings.reference else "direct"
-    said = f"{method} response"
-    if compare and settings.reference:
-        said = "joint and direct responses"
+    compared = compare and settings.reference
+    said = "joint and direct responses" if compared else f"{method} response"
     announce(f"quick {method} response, for the delay")
-    quick = _respond(records, method, settings, filters, quick=True)
+    quick = _respond(opened, method, filters, quick=True)
     # To find the remarks takes as long as the fit.
     first = _fit_response(dataclasses.replace(quick, remarks=()), settings)
     delay = _delay_of(first, records)
     announce(f"{said}, {delay:.4g} s of delay taken out" if delay else said)
-    frf = _respond(records, method, settings, filters, delay)
+    frf = _respond(opened, method, filters, delay)
     announce(f"fit to the {method} response")
     fit = _fit_response(frf, settings)
     other = _delay_of(fit, records)
     if other and abs(other - delay) > _NEAR * records[0].dt:
         delay = other
         announce(f"{said}, {delay:.4g} s of delay taken out")
-        frf = _respond(records, method, settings, filters, delay)
+        frf = _respond(opened, method, filters, delay)
         fit = _fit_response(frf, settings)
     if vehicle and isinstance(fit.model, LaggedIntegrator) and settings.integrators:
         fit = fit_damped(fit)
     announce("fits to parts of the band")
-    span, parts = _fit_parts(fit, frf, settings)
-    changes = [_gain_change(where, part, fit) for where, part in parts.items()]
-    fit = finish_fit(fit, settings, records[0], [*filter(None, changes)], remedies)
-    return _Estimate(method, frf, fit, {span: fit} | parts if parts else {}, delay)
-
-
-def _fit_direct(
-    opened: OpenedLogs, filters: Sequence[KnownFilter], delay: float
-) -> tuple[FrequencyResponse, Fit]:
-    settings, records = opened.settings, opened.records
-    frf = _respond(records, "direct", settings, filters, delay)
-    return frf, finish_fit(_fit_response(frf, settings), settings, records[0])
+    span, parts, changes = _fit_parts(fit, frf, settings)
+    fit = finish_fit(fit, settings, records[0], changes, remedies)
+    parts = {span: fit} | parts if parts else {}
+    responses, fits, more = {method: frf}, {method: fit}, paths[1:]
+    result = Identification(paths[0], settings, records, responses, fits, parts, proposal, more)
+    return result, delay
 
 
 def _respond(
-    records: tuple[Record, ...], method: str, settings: IdentifySettings,
-    filters: Sequence[KnownFilter], delay: float = 0.0, *, quick: bool = False,
+    opened: OpenedLogs, method: str, filters: Sequence[KnownFilter], delay: float = 0.0, *,
+    quick: bool = False,
 ) -> FrequencyResponse:  # fmt: skip
     """The response by a method, `delay` (s) and `filters` of the output taken out."""
+    settings = opened.settings
     shape = {"integrators": settings.integrators, "delay": delay}
     if settings.window is not None or settings.estimator == "welch":
         estimator = Welch(settings.window, **shape)
     elif settings.estimator == "composite":
         estimator = Composite(**shape)
-    elif quick:
-        estimator = LocalPolynomial(**shape, global_order=0)
     else:
-        estimator = LocalPolynomial(**shape)
+        estimator = LocalPolynomial(**shape, **({"global_order": 0} if quick else {}))
     if method == "joint":
         estimator = JointInputOutput(estimator)
     band = settings.band_rad
     if settings.band is not None:
         band = 2 * np.pi * settings.band[0], 2 * np.pi * settings.band[1]
     omega = None if band is None else np.geomspace(*band, _POINTS)
-    return without_filters(frequency_response(list(records), omega, estimator=estimator), filters)
+    frf = frequency_response(list(opened.records), omega, estimator=estimator)
+    return without_filters(frf, filters)
 
 
 def _delay_of(fit: Fit, records: tuple[Record, ...]) -> float:
@@ -309,62 +266,50 @@ def _fit_response(frf: FrequencyResponse, settings: IdentifySettings) -> Fit:
 
 def _fit_parts(
     full: Fit, frf: FrequencyResponse, settings: IdentifySettings
-) -> tuple[str, dict[str, Fit | None]]:
-    """The band in words, and fits to its upper and lower two thirds where the misfit is large.
+) -> tuple[str, dict[str, Fit | None], list[str]]:
+    """The band in words, fits to its upper and lower two thirds, and where the gain is another.
 
-    There are none for a misfit below three times the noise, for other models than the lagged
-    integrator, and for a response that feedback dominates or whose phase rises: no part of it
-    would be better. None for a part in which the solver diverged.
+    Nothing for a misfit below three times the noise, for other models than the lagged integrator,
+    and for a response that feedback dominates or whose phase rises: no part of it would be better.
     """
     small = not full.chi_squared >= _MISFIT**2 or not isinstance(full.model, LaggedIntegrator)
     no_plant = any(remark.kind in (DOMINATED, EARLY) for remark in frf.remarks)
     if not full.verdict.fitted or small or no_plant:
-        return "", {}
-
-    def fit_part(band: tuple[float, float]) -> Fit | None:
-        try:  # from where the fit stopped
-            return fit(full.model, frf, free=full.names, cost=_COSTS[settings.cost], band=band)
-        except ValueError:
-            return None
-
+        return "", {}, []
     hertz = lambda omega: f"{omega / (2 * np.pi):.3g} Hz"
     used = np.asarray(frf.omega)[usable(frf, None, 0.6)[:, 0, 0]]
     low, first, second, high = np.geomspace(used[0], used[-1], 4).tolist()
     span = f"{low:.3g} .. {high:.3g} rad/s ({low / (2 * np.pi):.3g} .. {hertz(high)})"
-    return span, {
-        f"above {first:.3g} rad/s ({hertz(first)})": fit_part((first, high)),
-        f"below {second:.3g} rad/s ({hertz(second)})": fit_part((low, second)),
+    bands = {
+        f"above {first:.3g} rad/s ({hertz(first)})": (first, high),
+        f"below {second:.3g} rad/s ({hertz(second)})": (low, second),
     }
-
-
-def _gain_change(where: str, part: Fit | None, full: Fit) -> str:
-    """A remark on a part of the band in which the gain is another one; empty where it is not."""
+    parts, changes, cost = dict[str, Fit | None](), [], _COSTS[settings.cost]
     sure = full.determined[0] or full.verdict.kind == "no model"
-    if part is None or not (part.determined[0] and sure):
-        return ""
-    before, after = full.values[0], part.values[0]
-    if not abs(after - before) > max(_CHANGE * abs(before), 2 * part.standard_errors[0]):
-        return ""
-    ratio, ratio_before = part.chi_squared**0.5, full.chi_squared**0.5
-    return (
-        f"{where} the gain is {after:.4g} instead of {before:.4g}, with a misfit of {ratio:.1f} "
-        f"instead of {ratio_before:.1f}: the model does not hold over the whole band. Fit the part "
-        "where it does (--band, --band-rad), or a model of higher order (--poles)"
-    )
+    for where, band in bands.items():
+        try:  # from where the fit stopped
+            part = fit(full.model, frf, free=full.names, cost=cost, band=band)
+        except ValueError:  # the solver diverged
+            parts[where] = None
+            continue
+        parts[where], before, after = part, full.values[0], part.values[0]
+        least = max(_CHANGE * abs(before), 2 * part.standard_errors[0])
+        if part.determined[0] and sure and abs(after - before) > least:
+            changes.append(
+                f"{where} the gain is {after:.4g} instead of {before:.4g}, with a misfit of "
+                f"{part.chi_squared**0.5:.1f} instead of {full.chi_squared**0.5:.1f}: the model "
+                "does not hold over the whole band. Fit the part where it does (--band, "
+                "--band-rad), or a model of higher order (--poles)"
+            )
+    return span, parts, changes
 
 
 def finish_fit(
-    fit: Fit,
-    settings: IdentifySettings,
-    record: Record,
-    further: Sequence[str] = (),
+    fit: Fit, settings: IdentifySettings, record: Record, further: Sequence[str] = (),
     remedies: Sequence[str] | None = None,
-) -> Fit:
-    """The fit in the words of the command line, with the `further` remarks and with units.
-
-    The `remedies` are by default options of `jaxquad identify`. In units, a channel without one
-    stands for itself.
-    """
+) -> Fit:  # fmt: skip
+    """The fit in the words of the command line, with the `further` remarks and with units, in which
+    a channel without one stands for itself. `remedies` are by default options."""
     verdict, units = fit.verdict, fit.parameter_units
     if not verdict.identifiable:
         remedies = _options_for(fit, settings) if remedies is None else remedies
@@ -411,21 +356,8 @@ def _options_for(fit: Fit, settings: IdentifySettings) -> list[str]:
     return [excite]
 
 
-def _verified(
-    fit: Fit, settings: IdentifySettings, filters: Sequence[KnownFilter]
-) -> Verification | None:
-    """The second record simulated, within the band of the points that the fit used.
-
-    Where gaps cut it into several, it is the longest of them.
-    """
-    if settings.verify is None or not fit.verdict.fitted:
-        return None
-    part = {"start": settings.verify_start, "stop": settings.verify_stop, "segments": ()}
-    other = dataclasses.replace(settings, **part, reference=None)
-    return verify(fit, behind_filters(_longest(Path(settings.verify), other), filters))
-
-
 def _longest(path: Path, settings: IdentifySettings) -> Record:
+    """Of the records into which gaps cut it."""
     return max(read_records(path, settings), key=lambda record: record.samples)
 
 

@@ -1,13 +1,15 @@
-"""What an identification reads: the channels that a log proposes, and its records."""
+"""What an identification reads: the channels that a log proposes, its records, a demo's log."""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from jaxquad._core import announce
+from jaxquad._core import announce, write_file
+from jaxquad.datasets import FILES, locate
+from jaxquad.excitation import sweep
 from jaxquad.records import (
     Mix,
     parse_mix,
@@ -31,8 +33,10 @@ def propose_settings(
 ) -> tuple[IdentifySettings, Proposal | None]:
     """Settings with input and output, from the log's proposal where they are not given.
 
-    What the settings say stays. Raises what `jaxquad.propose` raises, and SettingsError where
-    `several` logs are to have one input and output.
+    What the settings say stays.
+
+    **Raises:** what `jaxquad.propose` raises, and SettingsError where `several` logs are to have
+    one input and output.
     """
     if settings.input is not None:
         return settings, None
@@ -41,12 +45,12 @@ def propose_settings(
             f"several logs need `input` and `output`: run jaxquad identify {path} alone, and give "
             "what it proposes"
         )
-    start, stop, factor = settings.start, settings.stop, settings.time_factor or 1.0
+    ends, factor = (settings.start, settings.stop), settings.time_factor or 1.0
     if settings.segments:
-        start = min(first for first, _ in settings.segments)
-        stop = max(last for _, last in settings.segments)
+        starts, stops = zip(*settings.segments, strict=True)
+        ends = min(starts), max(stops)
     # The log itself is in the time of its stamps.
-    start, stop = (None if end is None else end / factor for end in (start, stop))
+    start, stop = (None if end is None else end / factor for end in ends)
     proposal = propose(
         path, axis=settings.axis, chirp=settings.chirp, flight=settings.flight, start=start,
         stop=stop,
@@ -126,9 +130,8 @@ def open_again(result: str | Path | StoredResult, *, log: str | Path | None = No
         try:
             digest = sha256_of(file)
         except FileNotFoundError as error:
-            raise ValueError(
-                f"{file}: the log is gone: give the place that it was moved to (--log)"
-            ) from error
+            text = f"{file}: the log is gone: give the place that it was moved to (--log)"
+            raise ValueError(text) from error
         if digest != identified:
             raise ValueError(
                 f"{file}: this is not the log that was identified (SHA-256 {digest[:12]}... "
@@ -166,23 +169,67 @@ def read_records(
     names = {*inputs, *outputs, *references}
     segments: list[Segment] = list(settings.segments) or [(settings.start, settings.stop)]
     records = read_segments(
-        path,
-        segments,
-        inputs=inputs,
-        outputs=outputs,
-        references=references,
-        sample_rate=settings.rate,
-        time=settings.time,
-        time_unit=settings.time_unit,
-        dt=settings.dt,
-        time_factor=settings.time_factor,
+        path, segments, inputs=inputs, outputs=outputs, references=references,
+        sample_rate=settings.rate, time=settings.time, time_unit=settings.time_unit,
+        dt=settings.dt, time_factor=settings.time_factor,
         units={name: unit for name, unit in settings.units.items() if name in names},
-        max_gap=settings.max_gap,
-        valid=settings.valid,
-        hold=settings.hold,
-    )
+        max_gap=settings.max_gap, valid=settings.valid, hold=settings.hold,
+    )  # fmt: skip
     return tuple(records)
 
 
 def mix_of(text: str | None) -> Mix:
     return {} if text is None else parse_mix(text)
+
+
+_RATE, _GAIN, _LAG, _DELAY = 250.0, 280.0, 0.02, 0.008  # Hz, rad/s^2 per unit of M, s, s
+_FEEDBACK = 0.02  # of M per rad/s
+_GUST, _CORNER, _NOISE = 2.0, 3.0, 0.01  # rad/s^2, rad/s, rad/s
+DEMO_TRUTH: Mapping[str, float] = {"gain": _GAIN, "lag": _LAG, "delay": _DELAY}
+DEMO = IdentifySettings(
+    input="M", output="q", reference="x0", units={"q": "rad/s"}, band=(0.5, 12.0), hold="dt"
+)
+
+
+def write_demo_log(path: str | Path, seed: int = 0) -> Path:
+    """Write time, reference x0, command M and rate q as CSV; the same for the same seed.
+
+    An axis under rate feedback, in gusts, is excited by a sweep of its command. `DEMO` holds the
+    settings to identify it with, `DEMO_TRUTH` the true parameters.
+    """
+    low, high = 2 * np.pi * 0.4, 2 * np.pi * 15
+    signal = sweep(low, high, duration=40, sample_rate=_RATE, amplitude=0.06)
+    # M = x0 - feedback q, held for a sample; q' = gain M(t - delay) behind a lag, and gusts.
+    random, samples = np.random.default_rng(seed), signal.signal.size
+    noise, shocks = random.standard_normal((2, samples))
+    dt, late = 1 / _RATE, round(_DELAY * _RATE)
+    stay, decay = np.exp(-dt / _LAG), np.exp(-_CORNER * dt)
+    command, measured = np.zeros((2, samples))
+    rate = moment = gust = 0.0
+    for k in range(samples):
+        measured[k] = rate + _NOISE * noise[k]
+        command[k] = signal.signal[k] - _FEEDBACK * measured[k]
+        delayed = command[k - late] if k >= late else 0.0
+        # The lag's exact mean over the sample, in which its input is constant.
+        mean = delayed + (moment - delayed) * (1 - stay) * _LAG / dt
+        rate += dt * (_GAIN * mean + gust)
+        moment = delayed + (moment - delayed) * stay
+        gust = decay * gust + _GUST * np.sqrt(1 - decay**2) * shocks[k]
+    columns = (signal.time, signal.signal, command, measured)
+    rows = ("{:.6f},{:.8g},{:.8g},{:.8g}\n".format(*row) for row in zip(*columns, strict=True))
+    return write_file(Path(path), f"time,x0,M,q\n{''.join(rows)}")
+
+
+def find_demo_flight() -> tuple[Path, IdentifySettings]:
+    """The measured flight of `jaxquad demo --flight`, and the settings to identify it with.
+
+    **Raises:**
+
+    - `ReadError`: it is neither on this machine nor can it be downloaded.
+    """
+    path = locate(FILES["antx_pitch prbs"])
+    field = ".value" if path.suffix == ".mat" else ""  # its publisher's file has structs
+    return path, IdentifySettings(
+        input=f"M{field}", output=f"q{field}", reference=f"x0{field}",
+        units={f"q{field}": "rad/s"}, rate=250.0, start=50.0, stop=76.0, band=(0.7, 12.0),
+    )  # fmt: skip

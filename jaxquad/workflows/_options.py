@@ -2,9 +2,12 @@
 
 import dataclasses
 import difflib
+import functools as ft
 import math
+import re
 import tomllib
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from inspect import cleandoc
 from pathlib import Path
 from typing import Any, NamedTuple, TypeGuard, TypeVar
 
@@ -21,17 +24,13 @@ class SettingsError(ValueError):
 
 @dataclasses.dataclass(frozen=True)
 class Kind:
-    """What a setting holds: `convert` takes what Python, TOML, JSON or a shell give.
+    """What a setting holds, as Python, TOML, JSON or a shell give it."""
 
-    `convert` raises ValueError for other values. A shell gives `words` words, each read by `read`
-    and written by `write`, and may repeat them if `repeated`.
-    """
-
-    convert: Callable[[object], Value]
-    read: Callable[[str], object] = str
+    convert: Callable[[object], Value]  # raises ValueError for other values
+    read: Callable[[str], object] = str  # one word of a shell
     write: Callable[[Value], str] = str
     words: int = 1
-    repeated: bool = False
+    repeated: bool = False  # whether a shell may say it several times
     metavar: str | tuple[str, ...] | None = None
     choices: tuple[str, ...] | None = None
 
@@ -45,13 +44,6 @@ class Option(NamedTuple):
     flag: str
 
 
-def option_field(group: str, kind: Kind, default: Value, help: str, flag: str = "") -> Value:
-    metadata = {"option": Option(kind, help, group, flag)}
-    if isinstance(default, dict):
-        return dataclasses.field(default_factory=default.copy, metadata=metadata)
-    return dataclasses.field(default=default, metadata=metadata)
-
-
 _REQUIRED = dataclasses.MISSING
 REPLACED: Mapping[str, Sequence[str]] = {  # the keys that a key takes the place of
     "segments": ("start", "stop"),
@@ -63,25 +55,35 @@ REPLACED: Mapping[str, Sequence[str]] = {  # the keys that a key takes the place
 
 
 S = TypeVar("S", bound="Settings")
+# Of a docstring: the title of a group, or a setting with its flag, if that has another name.
+_ITEM = r"^(?:\*\*(.+):\*\*$|- `(\w+)`(?: \(`(--.+)`\))?: (.+(?:\n  \S.*)*))"
 
 
 class Settings:
-    """Frozen dataclasses whose fields are declared by `option_field`, which says what they take."""
+    """Frozen dataclasses whose fields are annotated with a `Kind`, and explained one by one."""
 
     __no_type_check__ = True  # in tests: fields are converted, such as a list to a tuple
 
     @classmethod
-    def options(cls) -> dict[str, Option]:
-        """How each setting is said, by its key."""
-        fields = dataclasses.fields(cls)  # pyright: ignore[reportArgumentType]
-        options = {x.name: x.metadata["option"] for x in fields if "option" in x.metadata}
-        flags = {key: x.flag or f"--{key.replace('_', '-')}" for key, x in options.items()}
-        return {key: option._replace(flag=flags[key]) for key, option in options.items()}
+    @ft.cache
+    def options(cls) -> Mapping[str, Option]:
+        """How each setting is said, by its key, with the texts of the class's docstring."""
+        texts, group = {}, ""
+        for title, key, flag, text in re.findall(_ITEM, cleandoc(cls.__doc__ or ""), re.M):
+            group = "" if title == "Arguments" else title.lower() or group
+            texts[key] = flag, " ".join(text.split()), group
+        options = {}
+        for one in dataclasses.fields(cls):  # pyright: ignore[reportArgumentType]
+            if hasattr(one.type, "__metadata__"):
+                flag, text, group = texts.get(one.name, ("", "", ""))
+                flag = flag or f"--{one.name.replace('_', '-')}"
+                options[one.name] = Option(one.type.__metadata__[0], text, group, flag)
+        return options
 
     @classmethod
     def defaults(cls) -> dict[str, Value]:
         fields = dataclasses.fields(cls)  # pyright: ignore[reportArgumentType]
-        return {f.name: {} if f.default is _REQUIRED else f.default for f in fields}
+        return {x.name: {} if x.default is _REQUIRED else x.default for x in fields}
 
     @classmethod
     def from_mapping(cls: type[S], content: Mapping[str, object], where: str = "") -> S:
@@ -214,13 +216,8 @@ def _one_of(*choices: str) -> Kind:
 
 
 def _is_number(value: object) -> TypeGuard[float | int]:
-    if not isinstance(value, int | float) or isinstance(value, bool):
-        return False
-    return math.isfinite(value)
-
-
-def _is_whole(value: object, least: int) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool) and value >= least
+    is_real = isinstance(value, int | float) and not isinstance(value, bool)
+    return is_real and math.isfinite(value)
 
 
 def _is_list(value: object) -> TypeGuard[Sequence[Any]]:
@@ -237,7 +234,10 @@ _hold = _require(
     lambda value: value if value == "dt" else float(value),
 )
 _count, _size = (
-    _require(lambda x, least=least: _is_whole(x, least), f"give a whole number of at least {least}")
+    _require(
+        lambda x, least=least: isinstance(x, int) and not isinstance(x, bool) and x >= least,
+        f"give a whole number of at least {least}",
+    )
     for least in (0, 1)
 )
 
@@ -321,11 +321,7 @@ def _ranges(value: object) -> dict[str, Pair]:
 
 def _patterns(value: object) -> tuple[str, ...]:
     patterns = (value,) if isinstance(value, str) else value
-    if (
-        not _is_list(patterns)
-        or not patterns
-        or not all(x and isinstance(x, str) for x in patterns)
-    ):
+    if not (_is_list(patterns) and patterns and all(x and isinstance(x, str) for x in patterns)):
         raise ValueError('give a file pattern or a list of them, such as "**/*.ulg"')
     if any(pattern.startswith("/") for pattern in patterns):
         raise ValueError("give patterns relative to the folder of the logs, without a / in front")

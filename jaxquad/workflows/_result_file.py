@@ -38,14 +38,18 @@ class StoredResult(NamedTuple):
         return [self.log, *self.more]
 
     @property
+    def _fit(self) -> Mapping[str, Any]:
+        return _part(self.content, "fit")
+
+    @property
     def summary(self) -> str:
         """What the result says of its identifiability, in one line."""
-        return str(_part(_part(self.content, "fit"), "verdict").get("summary", ""))
+        return str(_part(self._fit, "verdict").get("summary", ""))
 
     @property
     def identifiable(self) -> bool:
         """Whether the record determines every parameter."""
-        return _part(self.content, "fit").get("identifiable") is True
+        return self._fit.get("identifiable") is True
 
     @property
     def used_band(self) -> tuple[float, float]:
@@ -75,7 +79,7 @@ class StoredResult(NamedTuple):
 
     @property
     def _parameters(self) -> dict[str, dict[str, Any]]:
-        rows = _part(self.content, "fit").get("parameters")
+        rows = self._fit.get("parameters")
         return {row["name"]: row for row in rows} if isinstance(rows, list) else {}
 
     @property
@@ -85,34 +89,29 @@ class StoredResult(NamedTuple):
 
         from jaxquad.spectra import FrequencyResponse, independent_errors
 
-        content: Mapping[str, Any] = _part(self.content, "response")
+        content = _part(self.content, "response")
         array = lambda name: np.array(content[name], float)  # null becomes nan
         omega, error = array("omega_rad_per_s"), array("random_error")
         size, coherence = 10 ** (array("magnitude_db") / 20), array("coherence")
         response = size * np.exp(1j * np.radians(array("phase_deg")))
         error = np.where(np.isfinite(error), error, np.inf)
         return FrequencyResponse(
-            omega=jnp.asarray(omega),
-            response=jnp.asarray(response),
-            coherence=jnp.asarray(coherence),
-            random_error=jnp.asarray(error),
+            omega=jnp.asarray(omega), response=jnp.asarray(response),
+            coherence=jnp.asarray(coherence), random_error=jnp.asarray(error),
             errors=independent_errors(omega, 2 * (error * size) ** 2),
             direct_coherence=jnp.asarray(coherence),
-            multiple_coherence=jnp.asarray(np.max(coherence, axis=2)),
-            method=content["method"],
-            input_names=tuple(content["inputs"]),
-            output_names=tuple(content["outputs"]),
+            multiple_coherence=jnp.asarray(np.max(coherence, axis=2)), method=content["method"],
+            input_names=tuple(content["inputs"]), output_names=tuple(content["outputs"]),
             input_units=tuple(content.get("input_units", ())),
             output_units=tuple(content.get("output_units", ())),
-        )
+        )  # fmt: skip
 
     def require_radians(self) -> None:
         """As the function of this name, for the output by the stored settings and response."""
         response = _part(self.content, "response")
-        stored = (response.get("outputs"), response.get("output_units"))
-        names, units = (texts if isinstance(texts, list) else [] for texts in stored)
+        names, units = response.get("outputs", ()), response.get("output_units", ())
         for name, unit in zip(names, units, strict=False):  # an earlier version stored no units
-            require_radians(str(name), dict(self.settings.units).get(str(name), str(unit)))
+            require_radians(name, self.settings.units.get(name, unit))
 
     @property
     def tuned(self) -> "StoredTuning | None":
@@ -140,7 +139,7 @@ class StoredResult(NamedTuple):
     @property
     def doubts(self) -> tuple[str, ...]:
         """The verdict and the remarks of a result that is not identifiable."""
-        remarks = _part(self.content, "fit").get("remarks")
+        remarks = self._fit.get("remarks")
         if self.identifiable or not isinstance(remarks, list):
             return ()
         return self.summary, *map(str, remarks)
@@ -193,7 +192,7 @@ class StoredTuning(NamedTuple):
 
         from jaxquad.control import certainty_equivalence, LADRC, ScheduledLADRC
 
-        content: Mapping[str, Any] = _part(self.content, "controller")
+        content = _part(self.content, "controller")
         numbers, dt = content["numbers"], float(content["dt"])
         start = LADRC(1.0, 3.0, 1.0, limit=1.0, dt=dt)
         template = ScheduledLADRC(start, certainty_equivalence(1.0, 1.0))
@@ -251,7 +250,7 @@ def load_tuning(path: str | Path) -> StoredTuning:
         ) from error
 
 
-def _part(content: Mapping[str, object], key: str) -> Mapping[str, object]:
+def _part(content: Mapping[str, object], key: str) -> Mapping[str, Any]:
     part = content.get(key)
     return part if isinstance(part, dict) else {}
 

@@ -1,16 +1,17 @@
-"""Settings of the workflows: the same in Python, on the command line, in TOML and in results."""
+"""Settings of the workflows: the same in Python, in TOML, in results, and in a shell's words."""
 
 import dataclasses
-import functools as ft
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import field
 from fnmatch import fnmatchcase
-from typing import Literal, NamedTuple
+from typing import Annotated, Literal, NamedTuple
+
+from jaxquad._core import marked_text, Message
 
 from . import _options as kinds
 from ._options import (
     check_keys,
     convert,
-    option_field,
     Pair,
     REPLACED,
     S,
@@ -22,20 +23,8 @@ from ._options import (
 )
 
 
-_MISSING = dataclasses.MISSING
 # In the order in which help shows them.
 GROUPS = ("the record", "the estimate", "the model", "a second record")
-_record, _estimate, _model, _check = (ft.partial(option_field, group) for group in GROUPS)
-_which_chirp = ft.partial(
-    _record, kinds.SIZE, None,
-    "the number of the one to use of the chirps that a log's proposal lists; by default the "
-    "longest, with all others on its axis at its place",
-)  # fmt: skip
-_which_flight = ft.partial(
-    _record, kinds.SIZE, None,
-    "the number of the flight in a file with several; by default the longest with a chirp, "
-    "else the longest with sticks that move",
-)  # fmt: skip
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -44,6 +33,64 @@ class IdentifySettings(Settings):
 
     The keyword arguments are the keys of the TOML file; `jaxquad identify --help` lists them as
     options. Without `input` and `output`, an autopilot's log proposes them.
+
+    **The record:**
+
+    - `input`: a channel, or a weighted sum NAME=-a+b+0.5*c, also with powers: NAME=0.1*a^2; by
+      default the log of a known autopilot proposes input and output
+    - `output`: likewise
+    - `reference`: an external signal that no feedback computes; with it, the joint input-output
+      estimate is made beside the direct one
+    - `axis`: the axis to propose input and output for
+    - `chirp`: the number of the one to use of the chirps that a log's proposal lists; by default
+      the longest, with all others on its axis at its place
+    - `flight`: the number of the flight in a file with several; by default the longest with a
+      chirp, else the longest with sticks that move
+    - `units` (`--unit`): the unit of a channel, such as q=rad/s; may be repeated
+    - `time`: the channel that holds the time, or the two with seconds and nanoseconds: sec+nanosec
+    - `time_unit`: its unit
+    - `dt`: the sampling interval of a table without time, whose rows are equally spaced
+    - `time_factor`: of the time stamps, where their clock runs slow or fast: 1.0119 (85/84) for a
+      Crazyflie's micro-SD log with firmware before August 2026
+    - `rate`: resample to this rate; by default the slowest channel's own
+    - `hold`: for how long the plant's input keeps each value: the loop's period for a command (dt:
+      a sample), 0 for a quantity that was measured; by default what an autopilot's log says
+    - `valid`: lowest and highest value of a channel that can be true, such as gyro.x=-20:20: others
+      count as missing, and are interpolated; may be repeated
+    - `max_gap`: the longest gap, and the longest run of missing values, that is interpolated
+    - `start`: first time to use, in the file's time
+    - `stop`: last time to use
+    - `segments` (`--segment`): instead of start and stop; repeat it to analyse several parts
+      together
+
+    **The model:**
+
+    - `integrators`: n in K e^(-delay s) / (s^n (lag s + 1)): 1 from a moment to a rate, 2 to an
+      angle; 1 by default
+    - `lag` (`--no-lag`): fit a model without the lag
+    - `delay` (`--no-delay`): fit a model without the delay
+    - `poles`: fit a transfer function with this many poles beside the integrators, instead of gain
+      and lag
+    - `zeros`: number of zeros, with --poles; 0 by default
+    - `keep_gyro_filters`: leave the gyro's filters in the model; by default those in front of an
+      autopilot's logged rate are divided out, where the log has their parameters
+
+    **The estimate:**
+
+    - `band`: fit between these frequencies, in Hz (6.28 rad/s); by default what the record resolves
+    - `band_rad`: the same in rad/s (0.159 Hz)
+    - `estimator`: of the frequency response: local polynomials, composite windows, or windows of
+      one length; local by default
+    - `window`: length of welch's window, which it selects; a fifth of the record by default
+    - `cost`: maximum likelihood, or CIFER's coherence-weighted cost, Eq. (14); ml by default
+    - `explain`: where the misfit exceeds 1.5 random errors, fit again with one more pole, zero,
+      pair, or damping, and say which of them explains it
+
+    **A second record:**
+
+    - `verify`: simulate the model on this record, which has the same channels
+    - `verify_start`: first time of that record to use
+    - `verify_stop`: last time of that record to use
 
     **Raises:** `SettingsError` (a ValueError) for values that cannot be, and for settings that
     exclude each other.
@@ -57,133 +104,46 @@ class IdentifySettings(Settings):
         ```
     """
 
-    input: str | None = _record(
-        kinds.MIX,
-        None,
-        "a channel, or a weighted sum NAME=-a+b+0.5*c, also with powers: NAME=0.1*a^2; "
-        "by default the log of a known autopilot proposes input and output",
-    )
-    output: str | None = _record(kinds.MIX, None, "likewise")
-    reference: str | None = _record(
-        kinds.MIX,
-        None,
-        "an external signal that no feedback computes; with it, the joint input-output "
-        "estimate is made beside the direct one",
-    )
-    axis: str | None = _record(kinds.AXIS, None, "the axis to propose input and output for")
-    chirp: int | None = _which_chirp()
-    flight: int | None = _which_flight()
-    units: Mapping[str, str] = _record(
-        kinds.UNITS, {}, "the unit of a channel, such as q=rad/s; may be repeated", flag="--unit"
-    )
-    time: str | None = _record(
-        kinds.TEXT,
-        None,
-        "the channel that holds the time, or the two with seconds and nanoseconds: sec+nanosec",
-    )
-    time_unit: Literal["s", "ms", "us", "ns"] | None = _record(kinds.TIME_UNIT, None, "its unit")
-    dt: float | None = _record(
-        kinds.DURATION,
-        None,
-        "the sampling interval of a table without time, whose rows are equally spaced",
-    )
-    time_factor: float | None = _record(
-        kinds.POSITIVE,
-        None,
-        "of the time stamps, where their clock runs slow or fast: 1.0119 (85/84) for a Crazyflie's "
-        "micro-SD log with firmware before August 2026",
-    )
-    rate: float | None = _record(
-        kinds.HERTZ, None, "resample to this rate; by default the slowest channel's own"
-    )
-    hold: float | Literal["dt"] | None = _record(
-        kinds.HOLD,
-        None,
-        "for how long the plant's input keeps each value: the loop's period for a command (dt: a "
-        "sample), 0 for a quantity that was measured; by default what an autopilot's log says",
-    )
-    valid: Mapping[str, Pair] = _record(
-        kinds.RANGES,
-        {},
-        "lowest and highest value of a channel that can be true, such as gyro.x=-20:20: others "
-        "count as missing, and are interpolated; may be repeated",
-    )
-    max_gap: float | None = _record(
-        kinds.DURATION,
-        None,
-        "the longest gap, and the longest run of missing values, that is interpolated",
-    )
-    start: float | None = _record(kinds.TIME, None, "first time to use, in the file's time")
-    stop: float | None = _record(kinds.TIME, None, "last time to use")
-    segments: Sequence[Pair] = _record(
-        kinds.SEGMENTS,
-        (),
-        "instead of start and stop; repeat it to analyse several parts together",
-        flag="--segment",
-    )
-    integrators: int = _model(
-        kinds.COUNT,
-        1,
-        "n in K e^(-delay s) / (s^n (lag s + 1)): 1 from a moment to a rate, 2 to an "
-        "angle; 1 by default",
-    )
-    lag: bool = _model(kinds.SWITCH, True, "fit a model without the lag", flag="--no-lag")
-    delay: bool = _model(kinds.SWITCH, True, "fit a model without the delay", flag="--no-delay")
-    poles: int | None = _model(
-        kinds.COUNT,
-        None,
-        "fit a transfer function with this many poles beside the integrators, "
-        "instead of gain and lag",
-    )
-    zeros: int = _model(kinds.COUNT, 0, "number of zeros, with --poles; 0 by default")
-    keep_gyro_filters: bool = _model(
-        kinds.SWITCH,
-        False,
-        "leave the gyro's filters in the model; by default those in front of an autopilot's logged "
-        "rate are divided out, where the log has their parameters",
-    )
-    band: Pair | None = _estimate(
-        kinds.BAND,
-        None,
-        "fit between these frequencies, in Hz (6.28 rad/s); by default what the record resolves",
-    )
-    band_rad: Pair | None = _estimate(kinds.BAND, None, "the same in rad/s (0.159 Hz)")
-    estimator: str = _estimate(
-        kinds.ESTIMATOR,
-        "local",
-        "of the frequency response: local "
-        "polynomials, composite windows, or windows of one length; local by default",
-    )
-    window: float | None = _estimate(
-        kinds.DURATION,
-        None,
-        "length of welch's window, which it selects; a fifth of the record by default",
-    )
-    cost: str = _estimate(
-        kinds.COST,
-        "ml",
-        "maximum likelihood, or CIFER's coherence-weighted cost, Eq. (14); ml by default",
-    )
-    explain: bool = _estimate(
-        kinds.SWITCH,
-        False,
-        "where the misfit exceeds 1.5 random errors, fit again with one more pole, zero, pair, "
-        "or damping, and say which of them explains it",
-        flag="--explain",
-    )
-    verify: str | None = _check(
-        kinds.FILE, None, "simulate the model on this record, which has the same channels"
-    )
-    verify_start: float | None = _check(kinds.TIME, None, "first time of that record to use")
-    verify_stop: float | None = _check(kinds.TIME, None, "last time of that record to use")
+    input: Annotated[str | None, kinds.MIX] = None
+    output: Annotated[str | None, kinds.MIX] = None
+    reference: Annotated[str | None, kinds.MIX] = None
+    axis: Annotated[str | None, kinds.AXIS] = None
+    chirp: Annotated[int | None, kinds.SIZE] = None
+    flight: Annotated[int | None, kinds.SIZE] = None
+    units: Annotated[Mapping[str, str], kinds.UNITS] = field(default_factory=dict)
+    time: Annotated[str | None, kinds.TEXT] = None
+    time_unit: Annotated[Literal["s", "ms", "us", "ns"] | None, kinds.TIME_UNIT] = None
+    dt: Annotated[float | None, kinds.DURATION] = None
+    time_factor: Annotated[float | None, kinds.POSITIVE] = None
+    rate: Annotated[float | None, kinds.HERTZ] = None
+    hold: Annotated[float | Literal["dt"] | None, kinds.HOLD] = None
+    valid: Annotated[Mapping[str, Pair], kinds.RANGES] = field(default_factory=dict)
+    max_gap: Annotated[float | None, kinds.DURATION] = None
+    start: Annotated[float | None, kinds.TIME] = None
+    stop: Annotated[float | None, kinds.TIME] = None
+    segments: Annotated[Sequence[Pair], kinds.SEGMENTS] = ()
+    integrators: Annotated[int, kinds.COUNT] = 1
+    lag: Annotated[bool, kinds.SWITCH] = True
+    delay: Annotated[bool, kinds.SWITCH] = True
+    poles: Annotated[int | None, kinds.COUNT] = None
+    zeros: Annotated[int, kinds.COUNT] = 0
+    keep_gyro_filters: Annotated[bool, kinds.SWITCH] = False
+    band: Annotated[Pair | None, kinds.BAND] = None
+    band_rad: Annotated[Pair | None, kinds.BAND] = None
+    estimator: Annotated[str, kinds.ESTIMATOR] = "local"
+    window: Annotated[float | None, kinds.DURATION] = None
+    cost: Annotated[str, kinds.COST] = "ml"
+    explain: Annotated[bool, kinds.SWITCH] = False
+    verify: Annotated[str | None, kinds.FILE] = None
+    verify_start: Annotated[float | None, kinds.TIME] = None
+    verify_stop: Annotated[float | None, kinds.TIME] = None
 
     def clashes(self) -> Iterator[str]:
         if (self.input is None) != (self.output is None):
             yield "`input` and `output` belong together: give both, or none to have them proposed"
-        if self.input is not None and self.axis is not None:
-            yield "`axis` is for a proposal: leave it out, or leave `input` and `output` out"
-        if self.input is not None and self.chirp is not None:
-            yield "`chirp` is for a proposal: leave it out, or leave `input` and `output` out"
+        for key in ("axis", "chirp"):
+            if self.input is not None and vars(self)[key] is not None:
+                yield f"`{key}` is for a proposal: leave it out, or leave `input` and `output` out"
         if self.input is not None and self.flight is not None:
             yield (
                 "`flight` is for a proposal: name the channels of that flight (log2.axisSum[0]), "
@@ -211,13 +171,6 @@ class IdentifySettings(Settings):
             yield "`verify_start` and `verify_stop` are for a second record: name it by `verify`"
 
 
-_vehicle = ft.partial(option_field, "the vehicle")
-_flight = ft.partial(option_field, "the simulated flight")
-_controller = ft.partial(option_field, "the controller")
-_plants = ft.partial(option_field, "the plants")
-_law, _kept = ft.partial(option_field, "the law"), ft.partial(option_field, "what is kept")
-
-
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class TuneSettings(Settings):
     """How a controller is tuned on an identified axis: what the record does not tell.
@@ -225,52 +178,53 @@ class TuneSettings(Settings):
     The keyword arguments are the keys of the TOML file; `jaxquad tune --help` lists them as
     options.
 
+    **The vehicle:**
+
+    - `inertia`: nominal inertia of the axis, in kg m^2; required
+    - `limit`: largest command, to either side, in its unit; required
+    - `spread`: range of the true inertia, as factors of the nominal one; 0.5 3 by default
+    - `inertia_error`: relative standard error of the inertia that the controller's gains are
+      scheduled with; 0.1 by default
+    - `noise`: standard deviation of the measured angle; 0.02 by default
+
+    **The simulated flight:**
+
+    - `step`: step of the reference; 4 by default
+    - `disturbance`: torque pulse; by default a tenth of the torque at the limit
+    - `duration`: of one flight; 4 by default
+
+    **The controller:**
+
+    - `dt`: sampling interval of the controller; by default that of the record
+    - `sensitivity`: upper limit of the peak of |S|; 3.6 by default
+    - `wo`: hold the observer's bandwidth at this value in rad/s, for instance where the identified
+      band ends; by default it is tuned
+    - `name`: prefix of the functions in the C header; attitude by default
+
+    **The plants:**
+
+    - `members`: number of plants to tune on; 64 by default
+    - `fresh`: number of new plants to certify on; 256 by default
+    - `seed`: of the random draws; 0 by default
+
     **Raises:** `SettingsError` (a ValueError) for values that cannot be.
     """
 
-    inertia: float = _vehicle(
-        kinds.INERTIA, _MISSING, "nominal inertia of the axis, in kg m^2; required"
-    )
-    limit: float = _vehicle(
-        kinds.POSITIVE, _MISSING, "largest command, to either side, in its unit; required"
-    )
-    spread: Pair = _vehicle(
-        kinds.BAND,
-        (0.5, 3.0),
-        "range of the true inertia, as factors of the nominal one; 0.5 3 by default",
-    )
-    inertia_error: float = _vehicle(
-        kinds.NOT_NEGATIVE,
-        0.1,
-        "relative standard error of the inertia that the controller's gains "
-        "are scheduled with; 0.1 by default",
-    )
-    noise: float = _vehicle(
-        kinds.DEVIATION, 0.02, "standard deviation of the measured angle; 0.02 by default"
-    )
-    step: float = _flight(kinds.DEGREES, 4.0, "step of the reference; 4 by default")
-    disturbance: float | None = _flight(
-        kinds.TORQUE, None, "torque pulse; by default a tenth of the torque at the limit"
-    )
-    duration: float = _flight(kinds.DURATION, 4.0, "of one flight; 4 by default")
-    dt: float | None = _controller(
-        kinds.DURATION, None, "sampling interval of the controller; by default that of the record"
-    )
-    sensitivity: float = _controller(
-        kinds.POSITIVE, 3.6, "upper limit of the peak of |S|; 3.6 by default"
-    )
-    wo: float | None = _controller(
-        kinds.POSITIVE,
-        None,
-        "hold the observer's bandwidth at this value in rad/s, for instance where the "
-        "identified band ends; by default it is tuned",
-    )
-    name: str = _controller(
-        kinds.TEXT, "attitude", "prefix of the functions in the C header; attitude by default"
-    )
-    members: int = _plants(kinds.SIZE, 64, "number of plants to tune on; 64 by default")
-    fresh: int = _plants(kinds.SIZE, 256, "number of new plants to certify on; 256 by default")
-    seed: int = _plants(kinds.COUNT, 0, "of the random draws; 0 by default")
+    inertia: Annotated[float, kinds.INERTIA]
+    limit: Annotated[float, kinds.POSITIVE]
+    spread: Annotated[Pair, kinds.BAND] = (0.5, 3.0)
+    inertia_error: Annotated[float, kinds.NOT_NEGATIVE] = 0.1
+    noise: Annotated[float, kinds.DEVIATION] = 0.02
+    step: Annotated[float, kinds.DEGREES] = 4.0
+    disturbance: Annotated[float | None, kinds.TORQUE] = None
+    duration: Annotated[float, kinds.DURATION] = 4.0
+    dt: Annotated[float | None, kinds.DURATION] = None
+    sensitivity: Annotated[float, kinds.POSITIVE] = 3.6
+    wo: Annotated[float | None, kinds.POSITIVE] = None
+    name: Annotated[str, kinds.TEXT] = "attitude"
+    members: Annotated[int, kinds.SIZE] = 64
+    fresh: Annotated[int, kinds.SIZE] = 256
+    seed: Annotated[int, kinds.COUNT] = 0
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -280,65 +234,60 @@ class AutopilotSettings(Settings):
     The keyword arguments are the keys of the TOML file; `jaxquad autopilot --help` lists them as
     options. Input, output and reference are those that the log proposes.
 
+    **The record:**
+
+    - `axis`: the axis to tune; all by default, with one file of parameters
+    - `chirp`: the number of the one to use of the chirps that a log's proposal lists; by default
+      the longest, with all others on its axis at its place
+    - `flight`: the number of the flight in a file with several; by default the longest with a
+      chirp, else the longest with sticks that move
+    - `start`: first time to use, in the file's time
+    - `stop`: last time to use
+    - `band`: fit between these frequencies, in Hz; by default what the record resolves
+    - `throttle`: of 1, at which Betaflight's dynamic filters and TPA are taken; by default the
+      log's median, 0.3 where it does not hold the throttle
+
+    **The law:**
+
+    - `law`: the law to tune: adrc is that of Betaflight's pull request 15400; by default what flew
+    - `hover`: adrc_hover_throttle, of 1; by default that of the ADRC that flew, else the lowest
+      level of throttle that was flown
+
+    **What is kept:**
+
+    - `sensitivity`: upper limit of the peak of |S|; 1.8 by default
+    - `resonance`: upper limit of the peak of the response from set-point to rate; 1.4 by default
+    - `noise`: the most that the command's noise may grow, as a factor; 1.5 by default
+    - `change`: factor within which each gain and cutoff, or wc, wo and b0, stays of what flew; 3 by
+      default
+    - `keep_filters`: leave the filters as they flew, and tune gains alone
+
+    **The plants:**
+
+    - `members`: number of plants to tune on; 32 by default
+    - `fresh`: number of new plants to certify on; 256 by default
+    - `seed`: of the random draws; 0 by default
+
     **Raises:** `SettingsError` (a ValueError) for values that cannot be.
     """
 
-    axis: str = _record(
-        kinds.ONE_OR_ALL_AXES,
-        "all",
-        "the axis to tune; all by default, with one file of parameters",
-    )
-    chirp: int | None = _which_chirp()
-    flight: int | None = _which_flight()
-    start: float | None = _record(kinds.TIME, None, "first time to use, in the file's time")
-    stop: float | None = _record(kinds.TIME, None, "last time to use")
-    band: Pair | None = _record(
-        kinds.BAND,
-        None,
-        "fit between these frequencies, in Hz; by default what the record resolves",
-    )
-    throttle: float | None = _record(
-        kinds.POSITIVE,
-        None,
-        "of 1, at which Betaflight's dynamic filters and TPA are taken; by default the log's "
-        "median, 0.3 where it does not hold the throttle",
-    )
-    law: Literal["pid", "adrc"] | None = _law(
-        kinds.LAW,
-        None,
-        "the law to tune: adrc is that of Betaflight's pull request 15400; by default what flew",
-    )
-    hover: float | None = _law(
-        kinds.POSITIVE,
-        None,
-        "adrc_hover_throttle, of 1; by default that of the ADRC that flew, else the lowest level "
-        "of throttle that was flown",
-    )
-    sensitivity: float = _kept(
-        kinds.POSITIVE, 1.8, "upper limit of the peak of |S|; 1.8 by default"
-    )
-    resonance: float = _kept(
-        kinds.POSITIVE,
-        1.4,
-        "upper limit of the peak of the response from set-point to rate; 1.4 by default",
-    )
-    noise: float = _kept(
-        kinds.POSITIVE,
-        1.5,
-        "the most that the command's noise may grow, as a factor; 1.5 by default",
-    )
-    change: float = _kept(
-        kinds.POSITIVE,
-        3.0,
-        "factor within which each gain and cutoff, or wc, wo and b0, stays of what flew; 3 by "
-        "default",
-    )
-    keep_filters: bool = _kept(
-        kinds.SWITCH, False, "leave the filters as they flew, and tune gains alone"
-    )
-    members: int = _plants(kinds.SIZE, 32, "number of plants to tune on; 32 by default")
-    fresh: int = _plants(kinds.SIZE, 256, "number of new plants to certify on; 256 by default")
-    seed: int = _plants(kinds.COUNT, 0, "of the random draws; 0 by default")
+    axis: Annotated[str, kinds.ONE_OR_ALL_AXES] = "all"
+    chirp: Annotated[int | None, kinds.SIZE] = None
+    flight: Annotated[int | None, kinds.SIZE] = None
+    start: Annotated[float | None, kinds.TIME] = None
+    stop: Annotated[float | None, kinds.TIME] = None
+    band: Annotated[Pair | None, kinds.BAND] = None
+    throttle: Annotated[float | None, kinds.POSITIVE] = None
+    law: Annotated[Literal["pid", "adrc"] | None, kinds.LAW] = None
+    hover: Annotated[float | None, kinds.POSITIVE] = None
+    sensitivity: Annotated[float, kinds.POSITIVE] = 1.8
+    resonance: Annotated[float, kinds.POSITIVE] = 1.4
+    noise: Annotated[float, kinds.POSITIVE] = 1.5
+    change: Annotated[float, kinds.POSITIVE] = 3.0
+    keep_filters: Annotated[bool, kinds.SWITCH] = False
+    members: Annotated[int, kinds.SIZE] = 32
+    fresh: Annotated[int, kinds.SIZE] = 256
+    seed: Annotated[int, kinds.COUNT] = 0
 
     def clashes(self) -> Iterator[str]:
         if self.throttle is not None and self.throttle > 1:
@@ -364,7 +313,6 @@ class Override(NamedTuple):
 
 _ONE_LOG = ("verify", "verify_start", "verify_stop")
 _LOG_KEYS = tuple(key for key in IdentifySettings.options() if key not in _ONE_LOG)
-_batch = ft.partial(option_field, "")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -373,6 +321,14 @@ class BatchSettings(Settings):
 
     In TOML the keys of `identify` stand beside the others, and each override is a table
     `[[override]]` with `logs` and the keys that it changes.
+
+    **Arguments:**
+
+    - `logs`: file patterns below the folder; by default every file but hidden ones
+    - `timeout`: limit for one log, which has failed if it takes longer; 1800 by default, none with
+      a scheduler
+    - `workers`: processes of this machine; by default one for each core
+    - `scheduler`: of a Dask cluster that sees the same files, such as tcp://10.0.0.1:8786
 
     **Raises:** `SettingsError` (a ValueError) for values that cannot be.
 
@@ -387,25 +343,10 @@ class BatchSettings(Settings):
         ```
     """
 
-    logs: str | Sequence[str] = _batch(
-        kinds.PATTERNS,
-        ("**/*",),
-        "file patterns below the folder; by default every file but hidden ones",
-    )
-    timeout: float | None = _batch(
-        kinds.DURATION,
-        None,
-        "limit for one log, which has failed if it takes longer; 1800 by default, "
-        "none with a scheduler",
-    )
-    workers: int | None = _batch(
-        kinds.SIZE, None, "processes of this machine; by default one for each core"
-    )
-    scheduler: str | None = _batch(
-        kinds.ADDRESS,
-        None,
-        "of a Dask cluster that sees the same files, such as tcp://10.0.0.1:8786",
-    )
+    logs: Annotated[str | Sequence[str], kinds.PATTERNS] = ("**/*",)
+    timeout: Annotated[float | None, kinds.DURATION] = None
+    workers: Annotated[int | None, kinds.SIZE] = None
+    scheduler: Annotated[str | None, kinds.ADDRESS] = None
     identify: IdentifySettings | Mapping[str, object] = dataclasses.field(default_factory=dict)
     overrides: Sequence[Override] = ()
 
@@ -476,3 +417,65 @@ def _checked(content: Mapping[str, object]) -> dict[str, object]:
         if clash is not None:
             raise SettingsError(f"`{key}` and `{clash}` are both given: keep one")
     return values
+
+
+# The command line's words: `max_gap=` is an argument, `jq.verify` a function, and someone who typed
+# `jaxquad identify` needs the option, `--max-gap`, or the command, `jaxquad verify`.
+_FLAGS = {
+    key: option.flag
+    for settings in (BatchSettings, AutopilotSettings, TuneSettings, IdentifySettings)
+    for key, option in settings.options().items()
+}
+_ARGUMENTS = _FLAGS | {  # those of `read`, `frequency_response` and `fit`, whose names differ
+    "inputs": "--input",
+    "outputs": "--output",
+    "references": "--reference",
+    "sample_rate": "--rate",
+    "window_length": "--window",
+    "band": "--band-rad",  # of a fit, in rad/s
+}
+_WORDS = {  # of a message, by what stands in its guillemets
+    "name inputs, outputs and references yourself": "name them (--input, --output, --reference)",
+    "pick channels with jq.records.select": "name one channel each with --input and --output",
+    "select other channels with jq.records.select, or ": "",
+    " with jq.records.select": "",
+    ", jq.records.channels": "",
+    ", or build a jq.Record from its arrays": "",
+    " in jq.read, or cut the arrays": "",
+    " (jq.Record, jq.read)": "",
+    "jq.spectra.LocalPolynomial()": "--estimator local",
+    " (estimator=jq.spectra.LocalPolynomial())": " (without --reference)",
+    "joint estimate": " (--reference)",
+    ", or give the frequencies (omega=)": "",
+    ", or raise global_order": "",
+    "wider": "",
+    "start from other values": "choose another band (--band)",
+    "start from other values, or leave solver= at its default":
+        "choose another band (--band) or a simpler model (--no-lag, --no-delay, fewer --poles)",
+    "try other starting values": "try another band (--band), or jaxquad identify --no-lag",
+    ", or give starts=20": "",
+    "sign": " (--no-lag, --no-delay)",
+    "other sign": ". A lag and a delay cannot be negative: the model",
+    " (leave it out of free=)": "",
+    "fit with a jq.identify.Prior or a second record, or ask for a determined combination":
+        "fit without one of them (--no-lag, --no-delay), or fly again with more excitation",
+    "Fit.explain()": "--explain",
+    "jq.verify": "jaxquad verify",
+    "jq.sweep": "jaxquad design sweep",
+}  # fmt: skip
+
+
+def in_options(text: str | BaseException) -> Message:
+    """A message with options in place of Python's words, and of keys of settings in backticks."""
+
+    def word(term: str) -> str:
+        key, _, python = term.rpartition("|")
+        key = key or python
+        name, _, value = key.partition("=")
+        flag = _ARGUMENTS.get(name)
+        return _WORDS.get(key, python if flag is None else f"{flag} {value}".rstrip())
+
+    marked = marked_text(text)
+    for key, flag in _FLAGS.items():
+        marked = marked.replace(f"`{key}`", flag)
+    return Message(marked, text.kind if isinstance(text, Message) else "").in_words(word)

@@ -94,15 +94,9 @@ class Tuning:
         from jaxquad.report import write_report  # here: with them comes matplotlib
 
         write_report(
-            folder / "report.html",
-            fit=axis.fit,
-            frf=axis.frf,
-            record=axis.records[0],
-            tuned=tuned,
-            flights=flights,
-            provenance=origin,
-            formula=axis.formula,
-        )
+            folder / "report.html", fit=axis.fit, frf=axis.frf, record=axis.records[0],
+            tuned=tuned, flights=flights, provenance=origin, formula=axis.formula,
+        )  # fmt: skip
         with headless():
             figures = {"convergence.png": convergence_figure(tuned.history)}
             if tuned.certificate is not None:
@@ -118,12 +112,9 @@ class Tuning:
 
 
 def tune(
-    result: str | Path | StoredResult | Identification,
-    settings: TuneSettings,
-    *,
-    log: str | Path | None = None,
-    progress: bool | None = None,
-) -> Tuning:
+    result: str | Path | StoredResult | Identification, settings: TuneSettings, *,
+    log: str | Path | None = None, progress: bool | None = None,
+) -> Tuning:  # fmt: skip
     """Tune and certify a controller for the angle of an identified axis, as `jaxquad tune` does.
 
     A scheduled LADRC is tuned on plants that are drawn from everything the record leaves
@@ -184,39 +175,27 @@ def tune(
         delay=posterior.delay,
     )  # fmt: skip
     announce(f"tuning on {settings.members} plants, then certifying on {settings.fresh}")
-    flight, objective = _flight(gain, dt, settings)
-    tuned = tune_controller(
-        loop,
-        ensemble,
-        flight,
-        objective=objective,
-        limits=(Limit("sensitivity_peak", at_most=settings.sensitivity),),
-        free=None if settings.wo is None else ["ladrc.wc", "map.values"],
-        members=settings.members,
-        fresh=settings.fresh,
-        peers={KNOWN_INERTIA: peers(plant, dt=dt)[KNOWN_INERTIA]},
-        key=jax.random.key(settings.seed),
-        progress=progress,
-    )
-    return Tuning(axis, settings, tuned, loop, ensemble, flight)
-
-
-def _flight(gain: float, dt: float, settings: TuneSettings) -> tuple[Scenario, Objective]:
-    """A step, a torque pulse and a step back, and what they cost."""
+    # A step, a torque pulse and a step back, and what they cost.
     pulse, back = _PULSE * settings.duration, _BACK * settings.duration
     angle, torque = np.radians(settings.step), settings.disturbance
     torque = 0.1 * gain * settings.limit if torque is None else torque
     flight = scenario(
-        duration=settings.duration,
-        dt=dt,
-        axes=1,
-        reference=Step(angle) + Step(-angle, at=back),
+        duration=settings.duration, dt=dt, axes=1, reference=Step(angle) + Step(-angle, at=back),
         disturbance=Pulse(torque, width=_WIDTH * settings.duration, at=pulse),
-    )
+    )  # fmt: skip
     # That of docs/tuning.md, whose knee of 20 V^2/s belongs to a limit of 10 V.
     penalties = (
         Penalty("activity_rate", knee=_ACTIVITY * settings.limit**2, weight=2.0),
         Penalty("sensitivity_peak", knee=2.0, weight=3.0),
         Penalty("abscissa", knee=-0.5, weight=5.0),
     )
-    return flight, Objective(penalties=penalties, events=(0.0, pulse, back), load_start=pulse)
+    objective = Objective(penalties=penalties, events=(0.0, pulse, back), load_start=pulse)
+    tuned = tune_controller(
+        loop, ensemble, flight, objective=objective,
+        limits=(Limit("sensitivity_peak", at_most=settings.sensitivity),),
+        free=None if settings.wo is None else ["ladrc.wc", "map.values"],
+        members=settings.members, fresh=settings.fresh,
+        peers={KNOWN_INERTIA: peers(plant, dt=dt)[KNOWN_INERTIA]},
+        key=jax.random.key(settings.seed), progress=progress,
+    )  # fmt: skip
+    return Tuning(axis, settings, tuned, loop, ensemble, flight)

@@ -36,6 +36,7 @@ from tuning_case import (  # noqa: E402
 )
 
 import jaxquad as jq  # noqa: E402
+from jaxquad.tuning._tail import take_members  # noqa: E402
 
 
 PEAK, SLICE = 3.6, 2048
@@ -75,7 +76,7 @@ def of_all(z, slices) -> np.ndarray:
     return np.stack([np.asarray(peaks(jnp.asarray(z), COORDINATES, x)) for x in slices])
 
 
-def solve(cost, z, bound: float, slices, others) -> np.ndarray:
+def solve(cost, z, bound: float, drawn, slices, others) -> np.ndarray:
     """SLSQP, until no member of the slices is beyond the bound by more than 0.05 %."""
     known: list[tuple[int, int]] = []
     for _ in range(CYCLES if slices else 3):
@@ -85,15 +86,16 @@ def solve(cost, z, bound: float, slices, others) -> np.ndarray:
             break
         near = sorted(near, key=lambda at: -level[at])[:60]
         known = list(dict.fromkeys([*known, *near]))[-ACTIVE:]
-        z = _minimise(cost, z, np.log(bound), known, put_into(others, slices, known))
+        z = _minimise(cost, z, np.log(bound), known, put_into(others, drawn, known))
     return z
 
 
-def put_into(others, slices, places):
+def put_into(others, drawn, places):
     """The members at the places (slice, member) instead of the first of the others."""
-    for k, (s, member) in enumerate(places):
-        others = others.replaced(np.array([k]), slices[s], np.array([member]))
-    return others
+    worst = take_members(drawn, places)
+    if worst is None:
+        return others
+    return others.replaced(np.arange(len(places)), linear_members(worst))
 
 
 def _minimise(cost, z, bound: float, known, loops) -> np.ndarray:
@@ -154,12 +156,13 @@ def main() -> None:
     rows: dict[str, list[Row]] = {}
     for key in map(jax.random.key, range(count)):
         cost = cost_of(ensemble().draw(START, 64, key))
-        searched = [linear_members(draw(fold(key, 2 + k), SLICE)) for k in range(32)]
+        drawn = [draw(fold(key, 2 + k), SLICE) for k in range(32)]
+        searched = [linear_members(members) for members in drawn]
         others = linear_members(ensemble().draw(START, ACTIVE, fold(key, 1)))
         first = tuned(key)
         ends = {"`jq.tune`": first}
         for name, (bound, slices) in SETTINGS.items():
-            ends[name] = solve(cost, first, bound, searched[:slices], others)
+            ends[name] = solve(cost, first, bound, drawn[:slices], searched[:slices], others)
         for name, z in ends.items():
             rows.setdefault(name, []).append(row_of(z, cost, fresh, test))
             print(name, rows[name][-1], flush=True)

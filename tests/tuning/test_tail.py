@@ -12,20 +12,17 @@ from jaxquad.loops import loop_numbers
 from jaxquad.models import DecoupledAxes
 from jaxquad.simulation import scenario
 from jaxquad.tuning import LBFGS, Limit, Tail, tune
-from jaxquad.tuning._tail import take_members, WorstLoops
+from jaxquad.tuning._tail import take_members
 
 
 pytestmark = pytest.mark.usefixtures("compiled_quickly")
 
 
-def loops(seed, count=6):
-    return linear_members(ensemble().draw(loop(), count, jax.random.key(seed)))
-
-
 def test_the_worst_take_the_places_of_others():
-    mine, first, second = loops(0), loops(1), loops(2)
-    worst = WorstLoops([first, second], [(1, 4), (0, 0), (1, 2)])
-    found = worst.put_into(mine, np.array([5, 1, 0]))
+    drawn = [ensemble().draw(loop(), 6, jax.random.key(seed)) for seed in range(3)]
+    worst = take_members(drawn[1:], [(1, 4), (0, 0), (1, 2)])
+    mine, first, second = map(linear_members, drawn)
+    found = mine.replaced(np.array([5, 1, 0]), linear_members(worst))
     for pick in (lambda x: x.assumed_inertia[0], lambda x: x.axes.lag[0], lambda x: x.delay):
         a, b, c = map(pick, (mine, first, second))
         np.testing.assert_array_equal(pick(found), [c[2], b[0], a[2], a[3], a[4], c[4]])

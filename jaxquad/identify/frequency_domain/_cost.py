@@ -182,7 +182,7 @@ def usable(frf: FrequencyResponse, band: Band, least: float) -> Mask:
     coherent = mean(np.asarray(frf.coherence)) >= least
     sharp = mean(np.fmin(error, 1.0)) <= _LARGEST
 
-    def within(limits: Range | None) -> Bool[np.ndarray, " frequencies"]:
+    def within(limits: Range | None) -> np.ndarray:  # annotations of shapes take time at each call
         low, high = limits or (0.0, np.inf)
         inside = (omega >= low) & (omega <= high)
         if not low < high or not np.any(inside):

@@ -1,32 +1,35 @@
-"""Betaflight, Cleanflight and INAV blackbox logs (.bbl, .bfl), and the tables made of them.
+"""Blackbox logs (.bbl, .bfl) as tables: values from coded frames, and which of them are right.
 
-Source: "Blackbox logging internals" of the Betaflight documentation.
+Source: "Blackbox logging internals" of the Betaflight documentation, field predictors and
+log validation. The documentation gives the straight line (2) with the wrong sign.
 """
 
 import dataclasses
-import re
-from collections.abc import Iterable
-from itertools import islice
 from pathlib import Path
-from typing import NamedTuple, TextIO
+from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int, UInt
+from jaxtyping import Bool, Float, Int, Integer
 
-from .._clock import unwrap
 from .._errors import ReadError
-from .._log import Log, number_in, Table
-from ._betaflight_frames import ADJUSTMENT, Frames, payload
-from ._betaflight_header import Header, headers, MARKER, scaled, with_derived
-from ._betaflight_mixer import with_mixed_axes
-from ._betaflight_predict import (
-    add_constants,
-    add_predictions,
-    constants,
-    elapsed,
-    segments,
-    trusted_rows,
+from .._log import Log, Table
+from ._betaflight_columns import scaled, with_derived, with_mixed_axes
+from ._betaflight_frames import (
+    ADJUSTMENT,
+    Event,
+    Frame,
+    Frames,
+    Header,
+    headers,
+    MARKER,
+    Payload,
+    payload,
+    RESUME,
+    STRAY,
 )
+
+
+Rows = Int[np.ndarray, " rows"]
 
 
 def sniff(head: bytes, path: Path) -> bool:
@@ -62,19 +65,19 @@ def load(path: Path) -> Log:
 
 def _log(data: bytes, header: Header) -> tuple[dict[str, Table], list[str]]:
     content = payload(data, header)
-    main = content.main
-    parts = segments(main, header, content.damage)
-    add_predictions(main, header, parts)
-    rows, as_scheduled = trusted_rows(main, header, parts, content.events)
+    main, damage = content.main, content.damage
+    parts = _segments(main, header, damage)
+    _add_predictions(main, header, parts)
+    rows, as_scheduled = _trusted_rows(main, header, parts, content.events)
     if not rows.size:
         raise ReadError("the log holds no readable frame", offset=header.payload)
     count = lambda number, noun: f"{number} {noun}{'s' if number > 1 else ''}"
     remarks = []
-    if content.damage:
-        size = sum(damage.size for damage in content.damage)
+    if damage:
+        size = sum(end - begin for begin, end in damage)
         remarks.append(
-            f"{count(len(content.damage), 'damaged block')} ({size} bytes) without frames skipped, "
-            f"the first at byte {content.damage[0].offset}"
+            f"{count(len(damage), 'damaged block')} ({size} bytes) without frames skipped, "
+            f"the first at byte {damage[0][0]}"
         )
     frames = main.offsets.size
     if frames > rows.size:
@@ -97,14 +100,13 @@ def _log(data: bytes, header: Header) -> tuple[dict[str, Table], list[str]]:
             "the frames between key frames differ from the I and P intervals of the header: "
             "loopIteration is not reliable, and lost frames cannot be detected"
         )
-    counter = np.ascontiguousarray(main.coded[:, 1])
+    counter = main.coded[:, 1]
     start = int(counter[:1].view(np.uint32)[0])
-    passed = np.cumsum(elapsed(counter), dtype=np.int64)
-    time = np.concatenate([[start], start + passed]) / 1e6
+    time = np.concatenate([[start], start + np.cumsum(_elapsed(counter), dtype=np.int64)]) / 1e6
     table = _table(main.coded, "I", time, header)
     columns = with_mixed_axes(with_derived(table.columns), header.settings, time)
-    slow = _slow_tables(content.slow, main, time, header)
-    return {"": dataclasses.replace(table, columns=columns), **slow}, remarks
+    tables = {"": dataclasses.replace(table, columns=columns)}
+    return tables | _slow_tables(content, main, time, header), remarks
 
 
 def _table(
@@ -126,7 +128,7 @@ def _table(
 
 
 def _slow_tables(
-    slow: dict[str, Frames], main: Frames, time: Float[np.ndarray, " samples"], header: Header
+    content: Payload, main: Frames, time: Float[np.ndarray, " samples"], header: Header
 ) -> dict[str, Table]:
     """The tables `slow` (flight modes) and `gps`, stamped with the last main frame before.
 
@@ -134,7 +136,7 @@ def _slow_tables(
     """
     tables = {}
     for letter, name in (("S", "slow"), ("G", "gps")):
-        frames = slow.get(letter)
+        frames = content.slow.get(letter)
         if frames is None or not frames.offsets.size:
             continue
         frame = header.frames[letter]
@@ -145,7 +147,7 @@ def _slow_tables(
         from_home = frame.predictors == 7
         home = np.zeros((0, int(from_home.sum())), np.int32)
         if from_home.any():
-            homes = slow.get("H")
+            homes = content.slow.get("H")
             if homes is None or not homes.offsets.size or homes.coded.shape[1] < home.shape[1]:
                 rows = rows[:0]
             else:
@@ -153,7 +155,7 @@ def _slow_tables(
                 rows = rows[last[rows] >= 0]
                 home = homes.coded[last[rows], : home.shape[1]]
         values = frames.coded[rows]
-        add_constants(values, frame, constants(frame, header))
+        _add_constants(values, frame, _constants(frame, header))
         if from_home.any():
             values[:, from_home] += home
         values[:, frame.predictors == 10] += main.coded[before[rows], 1][:, None]
@@ -161,142 +163,185 @@ def _slow_tables(
     return tables
 
 
-Values = Float[np.ndarray, "rows columns"]
-_MOST_COLUMNS = 2000
-_LONGEST_LINE = 1 << 16  # characters
-_HEADED = re.compile(r"([^()]*?)\s*\(([^()]*)\)")
-_PER_SECOND = {"": 1e6, "us": 1e6, "ms": 1e3, "s": 1.0}
-_CHUNK = 20_000  # lines
-_MODES = "flightModeFlags"
-_MOST_SETTINGS = 2000
-# In the order of the bits. An older blackbox_decode gives the bits of Betaflight, which begin with
-# ARM, the names of Cleanflight's: armed reads ANGLE_MODE, and ANGLE reads HORIZON_MODE.
-_OLD = "ANGLE_MODE HORIZON_MODE MAG BARO GPS_HOME GPS_HOLD HEADFREE AUTOTUNE PASSTHRU SONAR".split()
-_NEW = (
-    "ARM ANGLE HORIZON MAG HEADFREE PASSTHRU FAILSAFE GPSRESCUE - ANTIGRAVITY HEADADJ CAMSTAB "
-    "BEEPERON LEDLOW CALIB OSD TELEMETRY SERVO1 SERVO2 SERVO3 BLACKBOX AIRMODE 3D FPVANGLEMIX "
-    "BLACKBOXERASE CAMERA1 CAMERA2 CAMERA3 FLIPOVERAFTERCRASH PREARM BEEPGPSCOUNT VTXPITMODE"
-).split()
+# Where bytes were lost, a frame spliced of two may by chance end where another seems to begin,
+# so that the damage shows later. Each further frame has a chance of some percent.
+_DOUBTFUL = 4
+_LEAP = 10_000_000  # us: a longer step between two frames is damage
+_SLOWEST, _FASTEST = 2 / 3, 3 / 2  # pace of a key frame relative to the others
 
 
-def sniff_table(head: bytes, path: Path) -> bool:
-    first = head.removeprefix(b"\xef\xbb\xbf").lstrip(b'"')
-    explorer = first.startswith(b"Product") and b"Blackbox flight data" in first[:80]
-    return first.startswith(b"loopIteration") or explorer
+class _Segments(NamedTuple):
+    """Key frames, each with the frames after it that refer to it."""
+
+    begin: Int[np.ndarray, " segments"]  # row of the key frame
+    size: Int[np.ndarray, " segments"]  # rows up to the next one
+    usable: Int[np.ndarray, " segments"]  # rows before the first that damage makes unreadable
+    intact: Bool[np.ndarray, " segments"]  # no frame was damaged before the next one
 
 
-def load_table(path: Path) -> Log:
-    """The columns with numbers under their names, the units taken off.
+def _segments(main: Frames, header: Header, damage: list[tuple[int, int]]) -> _Segments:
+    begin = np.flatnonzero(main.key)
+    size, most = np.diff(np.append(begin, main.key.size)), header.scheduled.size
+    offsets = main.offsets[begin]
+    damaged, until = np.array(damage, np.int64).reshape(-1, 2).T
+    hits = np.append(damaged, np.iinfo(np.int64).max)
+    hit = hits[np.searchsorted(hits, offsets)]
+    undamaged = np.searchsorted(main.offsets, hit) - begin
+    intact = undamaged >= size
+    intact[:-1] &= hit[:-1] >= offsets[1:]  # none between the last frame and the next
+    if damage and begin.size:
+        # A segment may have all its frames although a few stray bytes stand between them.
+        segment = np.searchsorted(offsets, damaged, "right") - 1
+        lost = np.zeros(begin.size, np.int64)
+        np.add.at(lost, segment[segment >= 0], (until - damaged)[segment >= 0])
+        complete = (size == most) & (lost <= STRAY)
+        complete[:-1] &= _elapsed(main.coded[begin, 0]) == header.interval
+        complete[-1] = False
+        intact |= complete
+    usable = np.where(intact, size, np.maximum(undamaged - _DOUBTFUL, 0))
+    return _Segments(begin, size, np.minimum(usable, most), intact)
 
-    Cells that are missing or hold text are NaN; rows without a time are left out. Flight modes,
-    which are text, become the table `slow`, as a native log has it.
+
+def _add_predictions(main: Frames, header: Header, parts: _Segments) -> None:
+    """Turn the coded numbers of all usable rows into values, in place.
+
+    Frame after frame, but for all segments at once: the average of the last two values is
+    rounded, so that no cumulative sum can stand for it.
     """
-    with path.open(encoding="utf-8-sig", errors="replace") as file:
-        header = _table_header(file)
-        columns = [i for i, unit in enumerate(header.units) if unit != "flags"]
-        clock = columns.index(header.names.index("time"))
-        flags = header.names.index(_MODES) if _MODES in header.names else None
-        values, texts, cells = _rows(file, columns, flags)
-    timed = np.isfinite(values[:, clock])
-    remarks = ()
-    if not timed.all():
-        first = header.lines + 1 + int((~timed).argmax())
-        remarks = (f"{(~timed).sum()} lines without a time were left out, first line {first}",)
-        values = values[timed]
-    if not values.size:
-        raise ReadError(f"no line after line {header.lines} has an iteration and a time")
-    unit = header.units[columns[clock]]
-    if unit not in _PER_SECOND:
-        raise ReadError(f"the unit of time is {unit[:20]!r}: us, ms and s are known")
-    named = {
-        header.names[i]: values[:, k]
-        for k, i in enumerate(columns)
-        if not np.isnan(values[:, k]).all() and k != clock
-    }
-    units = {name: unit for name, unit in zip(header.names, header.units, strict=True) if unit}
-    time = unwrap(values[:, clock])[0] / _PER_SECOND[unit]
-    named = with_mixed_axes(with_derived(named), header.settings, time)
-    tables = {"": Table(named, time, units)}
-    modes = _flight_modes(texts)
-    if modes is not None:
-        bits = modes[cells[timed]]
-        changes = np.flatnonzero(np.diff(bits, prepend=~bits[:1]))
-        tables["slow"] = Table({_MODES: bits[changes]}, time[changes])
-    return Log(tables, remarks, "betaflight", header.settings)
+    frame, interval = header.frames["P"], header.interval
+    constant = _constants(frame, header)
+    # Neighbouring fields with the same predictor and sign are predicted together.
+    kinds = list(zip(frame.predictors.tolist(), frame.signed.tolist(), strict=True))
+    begins = [i for i in range(len(kinds)) if i == 0 or kinds[i] != kinds[i - 1]]
+    runs = [
+        (*kinds[a], slice(a, b)) for a, b in zip(begins, [*begins[1:], len(kinds)], strict=True)
+    ]
+    logged, iteration = np.append(header.scheduled, interval), np.arange(interval)
+    wait = (logged[np.searchsorted(logged, iteration, "right")] - iteration).astype(np.int32)
+    order = np.argsort(-parts.usable, kind="stable")
+    begin, usable = parts.begin[order], parts.usable[order]
+    last = older = main.coded[begin]
+    _add_constants(last, header.frames["I"], _constants(header.frames["I"], header))
+    main.coded[begin] = last
+    frames = np.arange(1, usable.max(initial=1))
+    for k, active in zip(frames, np.searchsorted(-usable, -frames), strict=True):
+        rows = begin[:active] + k
+        last, older = last[:active], older[:active]
+        value = main.coded[rows]
+        _add_constants(value, frame, constant)
+        for predictor, signed, run in runs:
+            before = last[:, run]
+            if predictor == 1:
+                value[:, run] += before
+            elif predictor == 2:
+                value[:, run] += 2 * before - older[:, run]
+            elif predictor == 3:
+                dtype = np.int32 if signed else np.uint32
+                total = before.view(dtype).astype(np.int64) + older[:, run].view(dtype)
+                value[:, run] += ((total + (total < 0)) >> 1).astype(np.int32)
+            elif predictor == 6:
+                value[:, run] += before + wait[before % interval]
+        main.coded[rows] = value
+        last, older = value, last
 
 
-class _TableHeader(NamedTuple):
-    names: list[str]
-    units: list[str]
-    settings: dict[str, str]
-    lines: int
+def _constants(frame: Frame, header: Header) -> Int[np.ndarray, " fields"]:
+    """What predictors add that depends on the header alone. Raises ReadError if it is missing."""
+    values = {8: 1500}
+    for predictor, name in ((4, "minthrottle"), (9, "vbatref"), (11, "motorOutput")):
+        if predictor not in frame.predictors:
+            continue
+        text = header.settings.get(name, "").split(",")[0].strip()
+        digits = text.removeprefix("-")
+        if not (digits.isascii() and digits.isdecimal() and len(digits) < 10):
+            raise ReadError(
+                f"predictor {predictor} needs a number in the header line {name!r}, not "
+                f"{text[:20]!r}",
+                offset=header.offset,
+            )
+        values[predictor] = int(text)
+    return np.array([values.get(int(p), 0) for p in frame.predictors], np.int32)
 
 
-def _table_header(file: TextIO) -> _TableHeader:
-    settings, lines = {}, 0
-    while True:
-        line = file.readline(_LONGEST_LINE)
-        cells = [cell.strip().strip('"') for cell in line.rstrip("\r\n").split(",")]
-        if cells[0] == "loopIteration":
-            break
-        if not line or (lines := lines + 1) > _MOST_SETTINGS:
-            raise ReadError("no line begins with loopIteration: the header of the table is missing")
-        settings[cells[0]] = ",".join(cells[1:])
-    parts = [match.groups() if (match := _HEADED.fullmatch(c)) else (c, "") for c in cells]
-    names = [name for name, _ in parts]
-    if len(names) > _MOST_COLUMNS or len(set(names)) < len(names) or "time" not in names:
-        raise ReadError(
-            f"the header has {len(names)} names: at most {_MOST_COLUMNS} are allowed, none "
-            f"twice, and one must be 'time'"
+def _add_constants(value: np.ndarray, frame: Frame, constant: Int[np.ndarray, " fields"]) -> None:
+    """Add what depends on the header and, for predictor 5, on motor[0] of the same frame."""
+    if constant.any():
+        value += constant
+    after_motor = np.flatnonzero(frame.predictors == 5)
+    if after_motor.size:
+        value[:, after_motor] += value[:, [frame.names.index("motor[0]")]]
+
+
+def _trusted_rows(
+    main: Frames, header: Header, parts: _Segments, events: list[Event]
+) -> tuple[Rows, bool]:
+    """The rows that are in order, and whether frames come as the intervals of the header say.
+
+    A segment that ends at another iteration than the next key frame says has lost frames
+    somewhere, if not part of its key frame: it is left out, unless most segments are like that.
+    """
+    begin, most = parts.begin, header.scheduled.size
+    in_order = _in_order(main, begin)
+    usable = np.where(in_order, parts.usable, 0)
+    # Segments without visible damage that hold other frames than up to the next key frame.
+    ended = parts.size != most
+    ended[:-1] |= _elapsed(main.coded[begin, 0]) != header.interval
+    resumes = [event.offset for event in events if event.name == RESUME]
+    resumed = np.searchsorted(resumes, main.offsets[begin])
+    judged = parts.intact & (parts.size > most)
+    judged[:-1] |= parts.intact[:-1] & in_order[1:] & (resumed[1:] == resumed[:-1])
+    lost = in_order & judged & ended
+    as_scheduled = bool(2 * lost.sum() <= in_order.sum())
+    if as_scheduled:
+        usable[lost] = 0
+    rows = _spread(begin, usable)
+    if not rows.size:
+        return rows, as_scheduled
+    # Segments end where time does not increase, jumps, or passes that of the next key frame.
+    segment, time = np.repeat(np.arange(begin.size), usable), main.coded[rows, 1].view(np.uint32)
+    step = _elapsed(time)
+    bad = np.zeros(rows.size, bool)
+    bad[1:] = (segment[1:] == segment[:-1]) & ((step <= 0) | (step > _LEAP))
+    kept = np.flatnonzero(usable)
+    key = main.coded[begin[kept], 1].view(np.uint32)
+    until_next = np.full(begin.size, 2**32)
+    until_next[kept[:-1]] = key[1:] - key[:-1]
+    bad |= time - np.repeat(key, usable[kept]) >= until_next[segment]
+    np.minimum.at(usable, segment[bad], (rows - begin[segment])[bad])
+    return _spread(begin, usable), as_scheduled
+
+
+def _in_order(main: Frames, begin: np.ndarray) -> Bool[np.ndarray, " segments"]:
+    """Key frames whose iteration and time go on together from those before.
+
+    Neighbours that agree on the time per iteration form a run. A key frame that agrees with
+    neither neighbour is damaged, if others do agree; a run that goes back is left out.
+    """
+    iteration, time = main.coded[begin, 0], main.coded[begin, 1]
+    steps, spans = _elapsed(iteration).astype(np.float64), _elapsed(time).astype(np.float64)
+    forward = (steps > 0) & (spans > 0)
+    pace = np.divide(spans, steps, out=np.zeros_like(spans), where=forward)
+    usual = np.median(pace[forward]) if forward.any() else 1.0
+    agree = forward & (pace > _SLOWEST * usual) & (pace < _FASTEST * usual)
+    run = np.concatenate([[0], np.cumsum(~agree)])[: iteration.size]
+    alone = np.bincount(run) == 1 if run.size else np.empty(0, bool)
+    kept = np.ones(alone.size, bool) if alone.all() else ~alone
+    last = None
+    for number in np.flatnonzero(kept):
+        first, end = np.searchsorted(run, [number, number + 1])
+        key = iteration[first], time[first]
+        kept[number] = last is None or all(
+            _elapsed(np.array(pair))[0] > 0 for pair in zip(last, key, strict=True)
         )
-    if not all(name.isprintable() for name in names):
-        raise ReadError("a name in the header has characters that cannot be printed")
-    return _TableHeader(names, [unit.strip() for _, unit in parts], settings, lines + 1)
+        last = (iteration[end - 1], time[end - 1]) if kept[number] else last
+    return kept[run]
 
 
-def _rows(
-    file: TextIO, columns: list[int], flags: int | None
-) -> tuple[Values, dict[str, int], Int[np.ndarray, " lines"]]:
-    """The numbers in the columns, the texts in the column `flags`, and which of them a line has.
-
-    A line that ends before the column `flags` has the text "".
-    """
-    parts, texts, numbers = [], {}, []
-    while chunk := list(islice(file, _CHUNK)):
-        commas = np.array([line.count(",") for line in chunk])
-        parts.append(np.full((len(chunk), len(columns)), np.nan))
-        if flags is not None:
-            cells = (line.split(",", flags + 1)[flags : flags + 1] for line in chunk)
-            for cell in cells:
-                text = cell[0].strip().strip('"') if cell else ""
-                numbers.append(texts.setdefault(text, len(texts)))
-        for count in np.unique(commas[commas > 0]):  # of lines with equally many cells
-            rows = np.flatnonzero(commas == count)
-            lines = [chunk[i] for i in rows]
-            there = [k for k, column in enumerate(columns) if column <= count]
-            wanted = [columns[k] for k in there]
-            try:
-                values = np.loadtxt(lines, delimiter=",", comments=None, usecols=wanted, ndmin=2)
-            except ValueError:
-                values = [[number_in(line.split(",")[i]) for i in wanted] for line in lines]
-            parts[-1][rows[:, None], there] = values
-    table = np.concatenate(parts) if parts else np.empty((0, len(columns)))
-    return table, texts, np.array(numbers, int)
+def _spread(begin: np.ndarray, size: np.ndarray) -> Rows:
+    """The rows `begin` .. `begin + size` of all segments, one after the other."""
+    return np.repeat(begin - np.cumsum(size) + size, size) + np.arange(size.sum())
 
 
-def _flight_modes(texts: Iterable[str]) -> UInt[np.ndarray, " texts"] | None:
-    """The bits of each text; None where all are empty, or one is no name of a mode."""
-    texts = list(texts)
-    old = any(name.endswith("_MODE") for text in texts for name in text.split("|"))
-    bits = {name: 1 << i for i, name in enumerate(_OLD if old else _NEW)}
-    masks = []
-    for text in texts:
-        if text.isascii() and text.isdecimal() and len(text) < 10:
-            masks.append(int(text))
-        elif text in ("", "NONE"):
-            masks.append(0)
-        elif all(name in bits for name in text.split("|")):
-            masks.append(sum(bits[name] for name in set(text.split("|"))))
-        else:
-            return None
-    return np.array(masks, np.uint32) if any(texts) else None
+def _elapsed(counter: Integer[np.ndarray, " rows"]) -> Int[np.ndarray, " steps"]:
+    """Steps of a counter of 32 bits, whose overflow is no step back."""
+    return np.diff(counter.view(np.uint32)).view(np.int32)

@@ -1,33 +1,164 @@
-"""Finds the frames of a blackbox log, which carry neither a length nor a checksum.
+"""Blackbox logs of Betaflight, Cleanflight and INAV: their headers, and where their frames are.
 
-A frame counts where the letter of another frame follows it, as the documentation advises.
+Frames carry neither a length nor a checksum: one counts where the letter of another follows it.
+Source: "Blackbox logging internals" of the Betaflight documentation.
 """
 
+import re
 from bisect import bisect_left
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Int
 
+from .._errors import ReadError
 from .._log import check_size
-from ._betaflight_header import Frame, Header
 
 
-class Event(NamedTuple):
-    """A transition that the flight controller noted; `end` is the offset behind it."""
+MARKER = b"H Product:Blackbox flight data recorder by Nicholas Sherlock\n"
+_MOST_LOGS = 1000
+_MOST_FIELDS = 256
+_MOST_INTERVAL = 65536  # loop iterations between key frames
+_LINE = re.compile(rb"H ([^:\x00-\x1f]{1,80}):([^\n]{0,16384})\n")
+_GROUP = {0: 1, 1: 1, 3: 1, 6: 8, 7: 3, 8: 4, 9: 1, 10: 3}  # encoding: fields coded together
+_PREDICTORS = {"I": {0, 4, 5, 8, 9, 11}, "P": set(range(12)) - {7, 10}}
+_SLOW_PREDICTORS = {0, 4, 7, 8, 9, 10, 11}
 
-    offset: int
-    name: str
-    values: tuple[int, ...]
-    end: int
+
+class Frame(NamedTuple):
+    """What a frame of one letter holds, in the order of the log."""
+
+    names: tuple[str, ...]
+    signed: np.ndarray  # bool (fields,)
+    predictors: np.ndarray  # int (fields,)
+    groups: tuple[tuple[int, int, int], ...]  # encoding, first field, fields that it writes as one
+    most_bytes: int  # with its letter
+
+
+class Header(NamedTuple):
+    """The header of one log within a file."""
+
+    offset: int  # of its first byte
+    payload: int  # offset of the first frame
+    stop: int  # offset where the next log or the file ends
+    settings: dict[str, str]
+    frames: dict[str, Frame]  # by letter: I, P and, where logged, S, G, H
+    interval: int  # loop iterations from key frame to key frame
+    scheduled: Int[np.ndarray, " logged"]  # those of them that are logged, the key frame's 0 first
+
+
+def headers(data: bytes) -> list[Header | ReadError]:
+    """The logs in a file, in order; for one whose header is damaged, what is wrong with it."""
+    starts, at = [], data.find(MARKER)
+    while at >= 0:
+        starts.append(at)
+        if len(starts) > _MOST_LOGS:
+            raise ReadError(f"the file holds more than {_MOST_LOGS} blackbox logs", offset=at)
+        at = data.find(MARKER, at + len(MARKER))
+    logs: list[Header | ReadError] = []
+    for start, stop in pairwise([*starts, len(data)]):
+        try:
+            logs.append(_header(data, start, stop))
+        except ReadError as error:
+            logs.append(ReadError(error.reason, offset=start))
+    return logs
+
+
+def _header(data: bytes, start: int, stop: int) -> Header:
+    settings, at = {}, start
+    while (line := _LINE.match(data, at, stop)) is not None:
+        settings[line[1].decode(errors="replace")] = line[2].decode(errors="replace").strip()
+        at = line.end()
+    if settings.get("Data version", "2") != "2":
+        raise ReadError(f"blackbox data version {settings['Data version']!r}: only 2 is read")
+    slow = [letter for letter in "SGH" if f"Field {letter} name" in settings]
+    frames = {letter: _frame(settings, letter) for letter in ("I", "P", *slow)}
+    # `1/4` and, since Betaflight 4, `4` both mean one of four; 0 means key frames only.
+    text = settings.get("P interval", "1/1")
+    parts = text.split("/") if "/" in text else ["1", text]
+    if len(parts) != 2 or not all(p.isascii() and p.isdecimal() and len(p) < 7 for p in parts):
+        raise ReadError(f"P interval {text[:20]!r}: an integer or a fraction is valid")
+    logged, every = map(int, parts)
+    if logged > every > 0 or (logged == 0 and every > 0):
+        raise ReadError(f"P interval {text[:20]!r}: a fraction of at most 1 is valid")
+    key = settings.get("I interval", "32")
+    if not (key.isascii() and key.isdecimal() and 0 < int(key[:9]) <= _MOST_INTERVAL):
+        raise ReadError(f"I interval {key[:20]!r}: 1 .. {_MOST_INTERVAL} loop iterations are valid")
+    iteration = np.arange(int(key))
+    scheduled = iteration[:1]
+    if every:
+        due = (iteration + logged - 1) % every < logged
+        scheduled = np.flatnonzero((iteration == 0) | due)
+    return Header(start, at, stop, settings, frames, int(key), scheduled)
+
+
+def _frame(settings: dict[str, str], letter: str) -> Frame:
+    described = "I" if letter == "P" else letter
+    names = tuple(_setting(settings, f"Field {described} name").split(","))
+    if len(names) > _MOST_FIELDS or len(set(names)) < len(names):
+        raise ReadError(
+            f"frame {letter} has {len(names)} fields: at most {_MOST_FIELDS} are allowed, none "
+            f"twice"
+        )
+    if not all(name.isascii() and name.isprintable() and 0 < len(name) < 80 for name in names):
+        raise ReadError(f"a field name of frame {letter} is empty, too long or not plain text")
+    if letter in "IP" and names[:2] != ("loopIteration", "time"):
+        raise ReadError(f"frame {letter} begins with {names[:2]}, not with loopIteration, time")
+    signs = f"Field {described} signed"
+    signed = _integers(settings, signs, len(names)) if signs in settings else [0] * len(names)
+    predictors = _integers(settings, f"Field {letter} predictor", len(names))
+    strange = set(predictors) - _PREDICTORS.get(letter, _SLOW_PREDICTORS)
+    if strange:
+        raise ReadError(f"frame {letter} cannot have predictor {min(strange)}")
+    if 5 in predictors and "motor[0]" not in names[: predictors.index(5)]:
+        raise ReadError(f"predictor 5 in frame {letter} needs motor[0] before it")
+    encodings = _integers(settings, f"Field {letter} encoding", len(names))
+    groups, at = [], 0
+    while at < len(encodings):
+        encoding = encodings[at]
+        if encoding not in _GROUP:
+            raise ReadError(
+                f"encoding {encoding} of field {at} in frame {letter} is unknown: "
+                f"{', '.join(map(str, _GROUP))} are known"
+            )
+        size, count = _GROUP[encoding], 1
+        while count < size and encodings[at + count : at + count + 1] == [encoding]:
+            count += 1
+        if encoding != 6 and count < size:
+            raise ReadError(f"encoding {encoding} in frame {letter} needs {size} fields together")
+        groups.append((encoding, at, count))
+        at += count
+    if encodings.count(9) > 4 and letter in "IP":
+        raise ReadError(f"{encodings.count(9)} fields of frame {letter} are empty (limit 4)")
+    most = 2 + 5 * len(names) + len(groups)
+    return Frame(names, np.array(signed) != 0, np.array(predictors), tuple(groups), most)
+
+
+def _setting(settings: dict[str, str], name: str) -> str:
+    if name not in settings:
+        raise ReadError(f"the blackbox header has no line {name!r}")
+    return settings[name]
+
+
+def _integers(settings: dict[str, str], name: str, count: int) -> list[int]:
+    cells = _setting(settings, name).split(",")
+    if len(cells) != count or not all(c.isascii() and c.isdecimal() and len(c) < 4 for c in cells):
+        raise ReadError(
+            f"header line {name!r} needs {count} numbers, one for each field; it has {len(cells)} "
+            f"cells"
+        )
+    return [int(cell) for cell in cells]
 
 
 Positions = Int[np.ndarray, " frames"]
 _SLACK = 16  # bytes that may be looked at beyond a frame
 _TOO_LONG = 6  # bytes: a 32-bit number takes at most 5
+_NIBBLES = np.array([0, 1, 2, 4], np.int32)
+_PAIRS = np.stack([(np.arange(256, dtype=np.int32) << s) >> 30 for s in (26, 28, 30)], axis=1)
 
 
-class _Block(NamedTuple):
+class _Numbers(NamedTuple):
     """A piece of the log and, for every byte of it, the number that would begin there."""
 
     raw: np.ndarray  # uint8
@@ -36,10 +167,8 @@ class _Block(NamedTuple):
     signed: np.ndarray  # int32, after ZigZag
 
 
-def _prepare(raw: np.ndarray) -> _Block:
-    """Bytes that end in _SLACK bytes of padding, decoded as if a number began at every one."""
-    value = (raw & 0x7F).astype(np.uint32)
-    length = np.ones(raw.size, np.uint8)
+def _numbers(raw: np.ndarray) -> _Numbers:
+    value, length = (raw & 0x7F).astype(np.uint32), np.ones(raw.size, np.uint8)
     first = np.flatnonzero(raw[:-_SLACK] & 0x80)
     following = first + 1
     for shift in (7, 14, 21, 28):
@@ -49,19 +178,16 @@ def _prepare(raw: np.ndarray) -> _Block:
         first, following = first[more], following[more] + 1
     length[first] = _TOO_LONG
     signed = (value >> 1) ^ -(value & 1)
-    return _Block(raw, length, value.view(np.int32), signed.view(np.int32))
+    return _Numbers(raw, length, value.view(np.int32), signed.view(np.int32))
 
 
-def _fields(
-    data: _Block, frame: Frame, starts: Positions
-) -> tuple[Int[np.ndarray, "frames fields"], Positions]:
-    """What the frames whose letters stand at `starts` would hold, and where each would end.
+def _decode(data: _Numbers, frame: Frame, starts: Positions) -> tuple[np.ndarray, Positions]:
+    """What the frames whose letters stand at `starts` would hold, as coded, and their ends.
 
-    The numbers are as coded, without their predictors. The end is -1 for a number too long.
+    An end is -1 where a number is too long.
     """
     out = np.zeros((starts.size, len(frame.names)), np.int32)
-    at = starts + 1
-    worst = np.zeros(starts.size, np.uint8)
+    at, worst = starts + 1, np.zeros(starts.size, np.uint8)
     for encoding, first, count in frame.groups:
         part = out[:, first : first + count]
         if encoding in (0, 1, 3):
@@ -74,46 +200,31 @@ def _fields(
         elif encoding == 6 and count == 1:
             part[:, 0] = data.signed[at]
             at += data.length[at]
-        elif encoding == 6:
-            at = _flagged(data, at, part)
-        elif encoding == 8:
-            at = _four_nibbles(data, at, part)
+        elif encoding == 6:  # TAG8_8SVB: a bit for each field that is not zero, then those numbers
+            rows = np.flatnonzero(data.raw[at])
+            flags, here = data.raw[at[rows]], at[rows] + 1
+            for field in range(count):
+                there = (flags >> field & 1).astype(bool)
+                part[rows[there], field] = data.signed[here[there]]
+                here[there] += data.length[here[there]]
+            at += 1
+            at[rows] = here
+        elif encoding == 8:  # TAG8_4S16: two bits for each field's width, then a stream of bits
+            rows = np.flatnonzero(data.raw[at])
+            tags, nibble = data.raw[at[rows]], 2 * (at[rows] + 1)
+            for field in range(4):
+                width = _NIBBLES[tags >> 2 * field & 3]
+                word = _word(data.raw, nibble >> 1, (24, 16, 8)) << (4 * (nibble & 1)).astype("i4")
+                part[rows, field] = np.where(width > 0, word >> (32 - 4 * np.maximum(width, 1)), 0)
+                nibble += width
+            at += 1
+            at[rows] = nibble + 1 >> 1
         elif encoding != 9:
-            at = _three(data, at, part, variable=encoding == 10)
+            at = _three(data.raw, at, part, variable=encoding == 10)
     return out, np.where(worst < _TOO_LONG, at, -1)
 
 
-def _flagged(data: _Block, at: Positions, out: np.ndarray) -> Positions:
-    """TAG8_8SVB: a bit for each field that is not zero, then those numbers."""
-    flags = data.raw[at]
-    at = at + 1
-    rows = np.flatnonzero(flags)
-    flags, here = flags[rows], at[rows]
-    for field in range(out.shape[1]):
-        there = (flags >> field & 1).astype(bool)
-        out[rows[there], field] = data.signed[here[there]]
-        here[there] += data.length[here[there]]
-    at[rows] = here
-    return at
-
-
-def _four_nibbles(data: _Block, at: Positions, out: np.ndarray) -> Positions:
-    """TAG8_4S16: two bits for the width of each field (0, 4, 8, 16), then a stream of bits."""
-    tags = data.raw[at]
-    at = at + 1
-    rows = np.flatnonzero(tags)
-    tags, nibble = tags[rows], 2 * at[rows]
-    for field in range(4):
-        width = _NIBBLES[tags >> 2 * field & 3]
-        byte = nibble >> 1
-        word = _word(data.raw, byte, (24, 16, 8)) << (4 * (nibble & 1)).astype(np.int32)
-        out[rows, field] = np.where(width > 0, word >> (32 - 4 * np.maximum(width, 1)), 0)
-        nibble += width
-    at[rows] = nibble + 1 >> 1
-    return at
-
-
-def _three(data: _Block, at: Positions, out: np.ndarray, *, variable: bool) -> Positions:
+def _three(raw: np.ndarray, at: Positions, out: np.ndarray, *, variable: bool) -> Positions:
     """TAG2_3S32 or TAG2_3SVARIABLE.
 
     Three fields of 2, of 4, of 6 bits, or of 1 to 4 bytes each. In the second they have 2 bits, 5,
@@ -121,11 +232,11 @@ def _three(data: _Block, at: Positions, out: np.ndarray, *, variable: bool) -> P
     """
     widths = ((5, 5, 4), (8, 7, 7)) if variable else ((4, 4, 4), (6, 6, 6))
     begins = ((2, 7, 12), (2, 10, 17)) if variable else ((4, 8, 12), (2, 10, 18))
-    tags = data.raw[at]
+    tags = raw[at]
     out[:] = _PAIRS[tags]
     for choice in (1, 2):
         rows = np.flatnonzero(tags >> 6 == choice)
-        word = _word(data.raw, at[rows], (24, 16, 8))
+        word = _word(raw, at[rows], (24, 16, 8))
         for field in range(3):
             left = word << begins[choice - 1][field]
             out[rows, field] = left >> (32 - widths[choice - 1][field])
@@ -134,7 +245,7 @@ def _three(data: _Block, at: Positions, out: np.ndarray, *, variable: bool) -> P
     here = at[rows] + 1
     for field in range(3):
         size = (tags[rows] >> 2 * field & 3).astype(np.int32)
-        word = _word(data.raw, here, (0, 8, 16, 24)) << 8 * (3 - size)
+        word = _word(raw, here, (0, 8, 16, 24)) << 8 * (3 - size)
         out[rows, field] = word >> 8 * (3 - size)
         here += size + 1
     end[rows] = here
@@ -149,22 +260,6 @@ def _word(raw: np.ndarray, at: Positions, shifts: tuple[int, ...]) -> np.ndarray
     return word.view(np.int32)
 
 
-_NIBBLES = np.array([0, 1, 2, 4], np.int32)
-_PAIRS = np.stack([(np.arange(256, dtype=np.int32) << s) >> 30 for s in (26, 28, 30)], axis=1)
-
-
-_BLOCK = 1 << 20  # bytes decoded at a time
-STRAY = 8  # bytes between two frames behind which both may be intact
-_NUMBERS = 1 << 22  # decoded at a time, wherever a frame may begin
-
-
-class Damage(NamedTuple):
-    """Bytes that belong to no frame."""
-
-    offset: int
-    size: int
-
-
 class Frames(NamedTuple):
     """Frames with the same fields, as coded: the predictions are not yet added."""
 
@@ -173,97 +268,99 @@ class Frames(NamedTuple):
     key: Bool[np.ndarray, " frames"]  # an I frame, which needs no earlier one
 
 
+class Event(NamedTuple):
+    """A transition that the flight controller noted; `end` is the offset behind it."""
+
+    offset: int
+    name: str
+    end: int
+
+
 class Payload(NamedTuple):
     """What one log holds, each in the order of the file."""
 
     main: Frames  # I and P
     slow: dict[str, Frames]  # S, G, H
     events: list[Event]
-    damage: list[Damage]
+    damage: list[tuple[int, int]]  # offsets of bytes that belong to no frame, and behind them
 
 
-class _Piece(NamedTuple):
-    """All places in a stretch of the log where a frame may begin, and what is coded there."""
-
-    stop: int
-    places: Int[np.ndarray, " places"]
-    ends: Int[np.ndarray, " places"]  # -1 where no letter of a frame follows
-    reach: Int[np.ndarray, " places"]  # the same whatever follows; -1 for a number too long
-    coded: dict[str, Frames]  # by letter, I and P together under M
+_BLOCK = 1 << 20  # bytes decoded at a time
+_MOST_NUMBERS = 1 << 22  # decoded at a time, wherever a frame may begin
+STRAY = 8  # bytes between two frames behind which both may be intact
 
 
 def payload(data: bytes, header: Header) -> Payload:
     """Walk from frame to frame; after damage, on to the next place from which that works."""
-    fields = len(header.frames["I"].names)
-    none = Frames(np.empty(0, int), np.empty((0, fields), np.int32), np.empty(0, bool))
-    result = Payload(none, {}, [], [])
+    begins = np.isin(np.arange(256), [ord(letter) for letter in (*header.frames, "E")])
+    most = max(frame.most_bytes for frame in header.frames.values())
+    most_places = _MOST_NUMBERS // max(len(frame.names) for frame in header.frames.values())
     frames: dict[str, list[Frames]] = {}
-    at, stored = header.payload, 0
+    events, damage, at, stored = [], [], header.payload, 0
     while at < header.stop:
-        piece = _decode_piece(data, header, at)
-        at, path = _walk(data, header, piece, at, result)
-        on_path = np.zeros(piece.places.size, bool)
+        # All places in a stretch of the log where a frame may begin, and what is coded there.
+        base, stop = at, min(at + _BLOCK, header.stop)
+        raw = np.zeros(stop - base + most + _SLACK, np.uint8)
+        inside = np.frombuffer(data, np.uint8, min(raw.size, header.stop - base), base)
+        raw[: inside.size] = inside
+        places = np.flatnonzero(begins[raw[: stop - base]])
+        if places.size > most_places:
+            stop, places = base + int(places[most_places]), places[:most_places]
+        numbers, reach, coded = _numbers(raw), np.full(places.size, -1), {}
+        for letter, frame in header.frames.items():
+            rows = np.flatnonzero(raw[places] == ord(letter))
+            values, reach[rows] = _decode(numbers, frame, places[rows])
+            coded[letter] = Frames(places[rows] + base, values, np.full(rows.size, letter == "I"))
+        both = _join([coded.pop("I"), coded.pop("P")])
+        order = np.argsort(both.offsets)
+        coded["M"] = Frames(*(part[order] for part in both))
+        follows = begins[raw]  # whether a frame may begin there, or the log ends
+        follows[header.stop - base :] = False
+        follows[header.stop - base : header.stop - base + 1] = True
+        good = (reach >= 0) & follows[np.maximum(reach, 0)]
+        places, reach = places + base, np.where(reach >= 0, reach + base, -1)
+        at, path = _walk(data, header, places, reach, good, at, stop, events, damage)
+        on_path = np.zeros(places.size, bool)
         on_path[path] = True
-        for letter, every in piece.coded.items():
-            taken = on_path[np.searchsorted(piece.places, every.offsets)]
+        for letter, every in coded.items():
+            taken = on_path[np.searchsorted(places, every.offsets)]
             frames.setdefault(letter, []).append(Frames(*(part[taken] for part in every)))
             stored += frames[letter][-1].coded.nbytes
         check_size("the blackbox log", stored, len(data), offset=header.offset)
     # A log may stop in the middle of its last frame, which loses nothing else.
-    most = max(frame.most_bytes for frame in header.frames.values())
-    damage = result.damage
-    if damage and sum(damage[-1]) == header.stop and damage[-1].size < most:
+    if damage and damage[-1][1] == header.stop and header.stop - damage[-1][0] < most:
         damage.pop()
     joined = {letter: _join(parts) for letter, parts in frames.items()}
-    return result._replace(main=joined.pop("M", result.main), slow=joined)
+    fields = len(header.frames["I"].names)
+    none = Frames(np.empty(0, int), np.empty((0, fields), np.int32), np.empty(0, bool))
+    return Payload(joined.pop("M", none), joined, events, damage)
 
 
 def _join(parts: list[Frames]) -> Frames:
     return Frames(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
 
 
-def _decode_piece(data: bytes, header: Header, at: int) -> _Piece:
-    stop = min(at + _BLOCK, header.stop)
-    margin = max(frame.most_bytes for frame in header.frames.values()) + _SLACK
-    raw = np.zeros(stop - at + margin, np.uint8)
-    inside = np.frombuffer(data, np.uint8, min(raw.size, header.stop - at), at)
-    raw[: inside.size] = inside
-    begins = np.zeros(256, bool)
-    begins[[ord(letter) for letter in (*header.frames, "E")]] = True
-    places = np.flatnonzero(begins[raw[: stop - at]])
-    most = _NUMBERS // max(len(frame.names) for frame in header.frames.values())
-    if places.size > most:
-        stop, places = at + int(places[most]), places[:most]
-    prepared, letters = _prepare(raw), raw[places]
-    ends, coded = np.full(places.size, -1), {}
-    for letter, frame in header.frames.items():
-        rows = np.flatnonzero(letters == ord(letter))
-        values, ends[rows] = _fields(prepared, frame, places[rows])
-        coded[letter] = Frames(places[rows] + at, values, np.full(rows.size, letter == "I"))
-    key, between = coded.pop("I"), coded.pop("P")
-    order = np.argsort(np.concatenate([key.offsets, between.offsets]))
-    coded["M"] = Frames(*(part[order] for part in _join([key, between])))
-    follows = begins[raw]
-    follows[header.stop - at :] = False
-    if header.stop - at < raw.size:
-        follows[header.stop - at] = True
-    reach = np.where(ends >= 0, ends + at, -1)
-    ends = np.where((ends >= 0) & follows[np.maximum(ends, 0)], ends + at, -1)
-    return _Piece(stop, places + at, ends, reach, coded)
-
-
 def _walk(
-    data: bytes, header: Header, piece: _Piece, at: int, result: Payload
-) -> tuple[int, list[int]]:
-    """Where the walk leaves the piece, and the numbers of the places it came through."""
-    places, ends = piece.places.tolist(), piece.ends.tolist()
-    good = piece.ends >= 0
-    following = np.where(good, np.searchsorted(piece.places, piece.ends), -1).tolist() + [-1]
-    letters = {ord(letter) for letter in (*header.frames, "E")}
+    data: bytes, header: Header, begins: np.ndarray, reach: np.ndarray, good: np.ndarray,
+    at: int, stop: int, events: list[Event], damage: list[tuple[int, int]],
+) -> tuple[int, list[int]]:  # fmt: skip
+    """Where the walk leaves the piece, and the numbers of the places it came through.
+
+    A frame that may begin at one of the places ends where it `reach`es, which is `good` where the
+    letter of another one follows.
+    """
+    places, ends = begins.tolist(), reach.tolist()
+    following = np.where(good, np.searchsorted(begins, reach), -1).tolist() + [-1]
+    letters = (*header.frames, "E")
     path, rank = [], bisect_left(places, at)
+
+    def skip_to(place: int) -> None:
+        first = damage.pop()[0] if damage and damage[-1][1] == at else at
+        damage.append((first, place))
+
     while rank < len(places):
         if skipped := places[rank] > at:
-            _add_damage(result.damage, at, places[rank])
+            skip_to(places[rank])
         begin = rank
         while (after := following[rank]) >= 0:
             path.append(rank)
@@ -273,83 +370,52 @@ def _walk(
             break
         event = _event(data, at, header.stop)
         if event and event.name == LOG_END:
-            result.events.append(event)
+            events.append(event)
             return header.stop, path
-        end = int(piece.reach[rank])
-        if data[places[rank]] == ord("I") and end >= 0 and not (skipped and rank == begin):
+        if data[places[rank]] == ord("I") and ends[rank] >= 0 and not (skipped and rank == begin):
             # An I frame that begins where the frame before it ends: a few stray bytes may follow
             # it, behind which frames go on.
-            first, last = np.searchsorted(piece.places, [end, end + STRAY + 1])
+            first, last = np.searchsorted(begins, [ends[rank], ends[rank] + STRAY + 1])
             resumed = next((k for k in range(first, last) if following[k] >= 0), None)
             if resumed is not None:
                 path.append(rank)
-                at, rank = end, resumed
+                at, rank = ends[rank], resumed
                 continue
         rank += 1
-        if event and (event.end == header.stop or data[event.end] in letters):
-            result.events.append(event)
+        if event and (event.end == header.stop or chr(data[event.end]) in letters):
+            events.append(event)
             at = event.end
             rank = bisect_left(places, at, rank)
-    if at < piece.stop:
-        _add_damage(result.damage, at, piece.stop)
-        at = piece.stop
+    if at < stop:
+        skip_to(stop)
+        at = stop
     return at, path
-
-
-def _add_damage(damage: list[Damage], begin: int, end: int) -> None:
-    """Note the bytes `begin` .. `end`, as part of the stretch before where they follow on it."""
-    if damage and damage[-1].offset + damage[-1].size == begin:
-        damage[-1] = Damage(damage[-1].offset, end - damage[-1].offset)
-    else:
-        damage.append(Damage(begin, end - begin))
 
 
 LOG_END = "log end"
 RESUME = "logging resume"
 ADJUSTMENT = "inflight adjustment"
-
 # Event type: its name and how many variable-byte numbers it carries.
-_COUNTED = {
-    0: ("sync beep", 1),
-    14: (RESUME, 2),
-    15: ("disarm", 1),
-    30: ("flight mode", 2),
-}
-_ADJUSTED = 13
-_END = 255
+_COUNTED = {0: ("sync beep", 1), 14: (RESUME, 2), 15: ("disarm", 1), 30: ("flight mode", 2)}
 
 
 def _event(data: bytes, at: int, stop: int) -> Event | None:
     """The event frame at `at`, or None where there is none that is known and whole."""
     if data[at : at + 1] != b"E" or at + 2 >= stop:
         return None
-    kind = data[at + 1]
-    if kind == _END:
-        null = data.find(b"\0", at + 2, min(stop, at + 80))
-        ends = null >= 0 and data.startswith(b"End of log", at + 2)
-        return Event(at, LOG_END, (), null + 1) if ends else None
-    if kind == _ADJUSTED:  # the number of a setting, and its value unless that is a float
-        setting = data[at + 2]
-        if setting >= 128:
-            return Event(at, ADJUSTMENT, (setting,), at + 7) if at + 7 <= stop else None
-        value, end = _variable(data, at + 3, stop)
-        values = [setting, value >> 1 ^ -(value & 1)]
-        return Event(at, ADJUSTMENT, tuple(values), end) if end <= stop else None
-    if kind not in _COUNTED:
+    kind, end = data[at + 1], at + 2
+    if kind == 255:
+        null = data.find(b"\0", end, min(stop, at + 80))
+        ended = null >= 0 and data.startswith(b"End of log", end)
+        return Event(at, LOG_END, null + 1) if ended else None
+    if kind == 13:  # the number of a setting, and its value: of a float four bytes
+        name, count = ADJUSTMENT, int(data[end] < 128)
+        end += 1 if count else 5
+    elif kind in _COUNTED:
+        name, count = _COUNTED[kind]
+    else:
         return None
-    name, count = _COUNTED[kind]
-    values, end = [], at + 2
     for _ in range(count):
-        value, end = _variable(data, end, stop)
-        values.append(value)
-    return Event(at, name, tuple(values), end) if end <= stop else None
-
-
-def _variable(data: bytes, at: int, stop: int) -> tuple[int, int]:
-    """A number of at most five bytes and the offset behind it, which is beyond `stop` if none."""
-    value = 0
-    for i, byte in enumerate(data[at : min(at + 5, stop)]):
-        value |= (byte & 0x7F) << 7 * i
-        if byte < 0x80:
-            return value & 0xFFFFFFFF, at + i + 1
-    return 0, stop + 1
+        number = data[end : min(end + 5, stop)]
+        end += next((i for i, byte in enumerate(number, start=1) if byte < 0x80), stop)
+    return Event(at, name, end) if end <= stop else None

@@ -10,82 +10,16 @@ import re
 import struct
 import zlib
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Int
 
-from .._clock import unwrap
+from .._channel import unwrap
 from .._errors import ReadError
 from .._log import Log, Table
 
 
 _WINDOW = 60  # s: the most between the two events with which reading goes on
 _TRIES = 200_000  # places looked at after damage, in one file
-
-
-class _Kind(NamedTuple):
-    """One type of event."""
-
-    number: int
-    name: str
-    layout: np.dtype  # event id, time stamp, then the variables in order
-
-
-def _events(
-    data: bytes, kinds: dict[int, _Kind], begin: int, end: int, per_second: float
-) -> tuple[dict[int, Int[np.ndarray, " events"]], list[tuple[int, int]]]:
-    """Where the events of each type begin, and the stretches (offset, bytes) in between.
-
-    Walks from event to event up to `end`; after damage, on to the next two that fit together. The
-    event before a place where none of a known type begins has lost or gained bytes itself, and is
-    left out.
-    """
-    sizes = {number: kind.layout.itemsize for number, kind in kinds.items()}
-    offsets: dict[int, list[int]] = {number: [] for number in kinds}
-    skipped: list[tuple[int, int]] = []
-    last: list[int] = []
-    at, tries, window = begin, _TRIES, int(_WINDOW * per_second)
-    smallest = min(sizes.values())
-    while at + smallest <= end:
-        number = data[at] | data[at + 1] << 8
-        size = sizes.get(number)
-        if size is not None and at + size <= end:
-            last = offsets[number]
-            last.append(at)
-            at += size
-            continue
-        bad = last.pop() if size is None and last else at
-        at, tries = _resume(data, kinds, bad, end, window, tries)
-        skipped.append((bad, at - bad))
-        last = []
-    return {number: np.array(places, int) for number, places in offsets.items()}, skipped
-
-
-def _resume(
-    data: bytes, kinds: dict[int, _Kind], at: int, end: int, window: int, tries: int
-) -> tuple[int, int]:
-    """Where two events follow each other with stamps that go on, else `end`; tries left."""
-    for place in range(at + 1, end):
-        if tries == 0:
-            break
-        tries -= 1
-        first = _stamp(data, kinds, place, end)
-        if first is None:
-            continue
-        size = kinds[data[place] | data[place + 1] << 8].layout.itemsize
-        second = _stamp(data, kinds, place + size, end)
-        if second is not None and first <= second <= first + window:
-            return place, tries
-    return end, tries
-
-
-def _stamp(data: bytes, kinds: dict[int, _Kind], at: int, end: int) -> int | None:
-    """The time stamp of the event at `at`, None where there is no whole event of a known type."""
-    kind = kinds.get(data[at] | data[at + 1] << 8) if at + 1 < end else None
-    if kind is None or at + kind.layout.itemsize > end:
-        return None
-    return int.from_bytes(data[at + 2 : at + 2 + kind.layout["time stamp"].itemsize], "little")
 
 
 MAGIC = 0xBC
@@ -118,18 +52,40 @@ def load(path: Path) -> Log:
             offset=3,
         )
     stamp, per_second = _STAMP[version]
-    kinds: dict[int, _Kind] = {}
+    layouts: dict[int, np.dtype] = {}  # of the events by number: id, time stamp, then variables
+    names: dict[str, int] = {}
     begin = 5
     for _ in range(count):
-        kind, following = _kind(data, begin, stamp)
-        if kind.number in kinds or kind.name in (other.name for other in kinds.values()):
-            raise ReadError(f"the event {kind.name!r} is described twice", offset=begin)
-        kinds[kind.number], begin = kind, following
+        first = begin
+        number, at = _short(data, begin)
+        name, at = _text(data, at)
+        variables, at = _short(data, at)
+        if variables > _MOST_VARIABLES:
+            raise ReadError(
+                f"the event {name!r} has {variables} variables: at most {_MOST_VARIABLES} are "
+                f"possible",
+                offset=at - 2,
+            )
+        layout = {_ID: "<u2", _TIME: stamp}
+        for _ in range(variables):
+            text, begin = _text(data, at)
+            variable = _VARIABLE.fullmatch(text)
+            if variable is None or variable[2] not in _TYPES or variable[1] in layout:
+                raise ReadError(
+                    f"variable {text[:60]!r} of the event {name!r} is not a new name with a type "
+                    f"in brackets, as in 'gyro.x(f)'",
+                    offset=at,
+                )
+            layout[variable[1]] = np.dtype(variable[2]).newbyteorder("<").str
+            at = begin
+        if number in layouts or name in names:
+            raise ReadError(f"the event {name!r} is described twice", offset=first)
+        layouts[number], names[name], begin = np.dtype(list(layout.items())), number, at
     end, remarks = len(data) - 4, []
     if zlib.crc32(memoryview(data)[:end]) != int.from_bytes(data[end:], "little"):
         remarks.append("the checksum is wrong: the log was cut off or damaged")
         end = len(data)
-    offsets, skipped = _events(data, kinds, begin, end, per_second)
+    offsets, skipped = _events(data, layouts, begin, end, int(_WINDOW * per_second))
     if skipped:
         size = sum(stretch for _, stretch in skipped)
         remarks.append(
@@ -137,47 +93,22 @@ def load(path: Path) -> Log:
             f"skipped, the first at byte {skipped[0][0]}"
         )
     tables = {}
-    for number, kind in kinds.items():
-        places, size = offsets[number], kind.layout.itemsize
+    for event, number in names.items():
+        places, layout = np.array(offsets[number], int), layouts[number]
         if places.size:
-            if (np.diff(places) == size).all():  # a view where nothing is between them
-                rows = np.frombuffer(data, kind.layout, places.size, int(places[0]))
+            if (np.diff(places) == layout.itemsize).all():  # a view where nothing is between them
+                rows = np.frombuffer(data, layout, places.size, int(places[0]))
             else:
                 raw = np.frombuffer(data, np.uint8)
-                rows = raw[places[:, None] + np.arange(size)].view(kind.layout)[:, 0]
-            names = [name for name in kind.layout.names or () if name not in (_ID, _TIME)]
-            units = {name: unit for name in names if (unit := _UNITS.get(name.partition(".")[0]))}
-            time = unwrap(rows[_TIME])[0] / per_second
-            tables[kind.name] = Table({name: rows[name] for name in names}, time, units)
+                rows = raw[places[:, None] + np.arange(layout.itemsize)].view(layout)[:, 0]
+            columns = {name: rows[name] for name in layout.names or () if name not in (_ID, _TIME)}
+            units = {name: unit for name in columns if (unit := _UNITS.get(name.partition(".")[0]))}
+            tables[event] = Table(columns, unwrap(rows[_TIME])[0] / per_second, units)
     if not tables:
         raise ReadError("the log holds no event of the types it describes", offset=begin)
-    if len(kinds) == 1:
+    if len(names) == 1:
         tables = {"": next(iter(tables.values()))}
     return Log(tables, tuple(remarks), "crazyflie")
-
-
-def _kind(data: bytes, at: int, stamp: str) -> tuple[_Kind, int]:
-    number, at = _short(data, at)
-    name, at = _text(data, at)
-    count, at = _short(data, at)
-    if count > _MOST_VARIABLES:
-        raise ReadError(
-            f"the event {name!r} has {count} variables: at most {_MOST_VARIABLES} are possible",
-            offset=at - 2,
-        )
-    layout = {_ID: "<u2", _TIME: stamp}
-    for _ in range(count):
-        begin = at
-        text, at = _text(data, at)
-        variable = _VARIABLE.fullmatch(text)
-        if variable is None or variable[2] not in _TYPES or variable[1] in layout:
-            raise ReadError(
-                f"variable {text[:60]!r} of the event {name!r} is not a new name with a type in "
-                f"brackets, as in 'gyro.x(f)'",
-                offset=begin,
-            )
-        layout[variable[1]] = np.dtype(variable[2]).newbyteorder("<").str
-    return _Kind(number, name, np.dtype(list(layout.items()))), at
 
 
 def _short(data: bytes, at: int) -> tuple[int, int]:
@@ -192,3 +123,50 @@ def _text(data: bytes, at: int) -> tuple[str, int]:
     if end < 0 or not text.isascii() or not text.isprintable() or not text:
         raise ReadError("a name in the description of events is damaged", offset=at)
     return text, end + 1
+
+
+def _events(
+    data: bytes, layouts: dict[int, np.dtype], begin: int, end: int, window: int
+) -> tuple[dict[int, list[int]], list[tuple[int, int]]]:
+    """Where the events of each type begin, and the stretches (offset, bytes) in between.
+
+    Walks from event to event up to `end`; after damage, on to the next two that fit together, whose
+    stamps go on by at most the `window`. The event before a place where none of a known type begins
+    has lost or gained bytes itself, and is left out.
+    """
+    sizes = {number: layout.itemsize for number, layout in layouts.items()}
+    offsets: dict[int, list[int]] = {number: [] for number in layouts}
+    skipped: list[tuple[int, int]] = []
+    last: list[int] = []
+    at, tries, smallest = begin, _TRIES, min(sizes.values())
+    while at + smallest <= end:
+        number = data[at] | data[at + 1] << 8
+        size = sizes.get(number)
+        if size is not None and at + size <= end:
+            last = offsets[number]
+            last.append(at)
+            at += size
+            continue
+        bad = last.pop() if size is None and last else at
+        at = end
+        for place in range(bad + 1, min(end, bad + 1 + tries)):
+            tries -= 1
+            first = _stamp(data, layouts, place, end)
+            if first is None:
+                continue
+            size = sizes[data[place] | data[place + 1] << 8]
+            second = _stamp(data, layouts, place + size, end)
+            if second is not None and first <= second <= first + window:
+                at = place
+                break
+        skipped.append((bad, at - bad))
+        last = []
+    return offsets, skipped
+
+
+def _stamp(data: bytes, layouts: dict[int, np.dtype], at: int, end: int) -> int | None:
+    """The time stamp of the event at `at`, None where there is no whole event of a known type."""
+    layout = layouts.get(data[at] | data[at + 1] << 8) if at + 1 < end else None
+    if layout is None or at + layout.itemsize > end:
+        return None
+    return int.from_bytes(data[at + 2 : at + 2 + layout[_TIME].itemsize], "little")

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from .._clock import FEWEST
+from .._channel import FEWEST
 from .._errors import ReadError
 from .._log import columns_of, Log, Table
 
@@ -44,12 +44,28 @@ def load(path: Path) -> Log:
     if b"\r" in content:
         content = content.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
     header = _header(content)
+    place, number, names = header.place, header.number, header.names
+    # A row takes two bytes for each cell at least, however many line ends there are.
+    most = min(content.count(b"\n", place) + 1, (len(content) - place + 1) // (2 * len(names)))
+    values, count = np.empty((len(names), most)), 0
     try:
-        values = _rows(content, header)
+        while place < len(content):
+            end = content.find(b"\n", min(place + _BLOCK, len(content)))
+            end = len(content) if end < 0 else end + 1
+            block = content[place:end]
+            table = _parse(block, header)
+            table = _parse_rows(block, number, header) if table is None else table
+            values[:, count : count + len(table)] = table.T
+            count, number, place = count + len(table), number + block.count(b"\n"), end
     except _BlankCell as error:
         columns, rows, remarks = _topics(content, header, error)
     else:
-        columns, rows, remarks = dict(zip(header.names, values, strict=True)), {}, ()
+        values = values[:, :count]
+        if not count:
+            raise ReadError(
+                f"the file has only a header ({', '.join(names)}) and no row of numbers"
+            )
+        columns, rows, remarks = dict(zip(names, values, strict=True)), {}, ()
         if not header.named:
             remark = (
                 "the file has no line of channel names: its columns are called data[0] .. "
@@ -81,24 +97,6 @@ class _BlankCell(ReadError):
     """A cell without a number, in a table that has one elsewhere in its column."""
 
 
-def _rows(content: bytes, header: _Header) -> Float[np.ndarray, "columns rows"]:
-    names, _, separator, place, number = header
-    # A row takes two bytes for each cell at least, however many line ends there are.
-    most = min(content.count(b"\n", place) + 1, (len(content) - place + 1) // (2 * len(names)))
-    values, rows = np.empty((len(names), most)), 0
-    while place < len(content):
-        end = content.find(b"\n", min(place + _BLOCK, len(content)))
-        end = len(content) if end < 0 else end + 1
-        block = content[place:end]
-        table = _parse(block, separator, len(names))
-        table = _parse_rows(block, number, names, separator) if table is None else table
-        values[:, rows : rows + len(table)] = table.T
-        rows, number, place = rows + len(table), number + block.count(b"\n"), end
-    if not rows:
-        raise ReadError(f"the file has only a header ({', '.join(names)}) and no row of numbers")
-    return values[:, :rows]
-
-
 def _topics(
     content: bytes, header: _Header, error: _BlankCell
 ) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray], tuple[str, ...]]:
@@ -107,18 +105,13 @@ def _topics(
     A row has the values of one topic, or each topic rows of its own. Raises `error` where a few
     cells are blank only: those are missing values.
     """
-    lines = enumerate(content[header.place :].decode().split("\n"), start=header.number)
-    rows = [
-        _numbers(number, text, header.names, header.separator, blank=np.nan)
-        for number, text in lines
-        if text.strip() and not text.lstrip().startswith("#")
-    ]
-    table = np.array(rows).T
+    table = _parse_rows(content[header.place :], header.number, header, blank=np.nan).T
+    rows = table.shape[1]
     filled = dict(zip(header.names, ~np.isnan(table), strict=True))
     counts = {name: int(there.sum()) for name, there in filled.items()}
-    partly = {name for name, count in counts.items() if 0 < count < len(rows)}
-    rarest = min(partly or counts, key=lambda name: counts[name] or len(rows))
-    if counts[rarest] < FEWEST or (partly and 1 - counts[rarest] / len(rows) < _BLANK):
+    partly = {name for name, count in counts.items() if 0 < count < rows}
+    rarest = min(partly or counts, key=lambda name: counts[name] or rows)
+    if counts[rarest] < FEWEST or (partly and 1 - counts[rarest] / rows < _BLANK):
         raise error
     named = dict(zip(header.names, table, strict=True))
     columns = {name: values[filled[name]] for name, values in named.items() if counts[name]}
@@ -126,7 +119,7 @@ def _topics(
     if partly:
         remarks += [
             f"cells are blank where a topic has no message: {rarest!r}, for instance, has "
-            f"{counts[rarest]} values in {len(rows)} rows"
+            f"{counts[rarest]} values in {rows} rows"
         ]
     if empty := [name for name in header.names if not counts[name]]:
         remarks.append(f"columns without any value were left out: {', '.join(empty)}")
@@ -177,61 +170,53 @@ def _split(text: str, separator: str | None) -> list[str]:
     return [cell.strip() for cell in cells]
 
 
-def _parse(
-    block: bytes, separator: str | None, columns: int
-) -> Float[np.ndarray, "rows columns"] | None:
+def _parse(block: bytes, header: _Header) -> Float[np.ndarray, "rows columns"] | None:
     """The numbers of whole lines; None where they are not one plain number per cell."""
     if not block.strip():
-        return np.empty((0, columns))
+        return np.empty((0, len(header.names)))
     try:
         text = io.StringIO(block.decode())
-        table = np.loadtxt(text, delimiter=separator, comments=None, ndmin=2)
+        table = np.loadtxt(text, delimiter=header.separator, comments=None, ndmin=2)
     except ValueError:  # says less of what is wrong than reading row by row does
         return None
-    return table if table.shape[1] == columns else None
+    return table if table.shape[1] == len(header.names) else None
 
 
 def _parse_rows(
-    block: bytes, first: int, names: list[str], separator: str | None
+    block: bytes, first: int, header: _Header, *, blank: float | None = None
 ) -> Float[np.ndarray, "rows columns"]:
-    """Row by row, which finds what is wrong, and takes comments and quotes."""
+    """Row by row, which finds what is wrong, and takes comments and quotes.
+
+    The lines count from `first`; a cell without a number is `blank`.
+    """
     rows = []
     for number, text in enumerate(block.decode().split("\n"), start=first):
-        if text.strip() and not text.lstrip().startswith("#"):
-            rows.append(_numbers(number, text, names, separator))
-    return np.array(rows).reshape(-1, len(names))
-
-
-def _numbers(
-    number: int,
-    text: str,
-    header: list[str],
-    separator: str | None,
-    *,
-    blank: float | None = None,
-) -> list[float]:
-    """The numbers of a line, the file's `number` from 1; a cell without one is `blank`."""
-    cells = _split(text, separator)
-    if len(cells) != len(header):
-        raise ReadError(
-            f"line {number} has {len(cells)} cells for {len(header)} columns: the file is cut off, "
-            f"or its separator changes"
-        )
-    try:
-        return [blank if blank is not None and not cell else float(cell) for cell in cells]
-    except ValueError as error:
-        wrong = (i for i, cell in enumerate(cells) if not _is_number(cell))
-        i = next(i for i in wrong if cells[i] or blank is None)
-        place = f"line {number}, column {i + 1} ({header[i]!r})"
-        if cells[i]:
-            what = f"{cells[i][:40]!r} is not a number"
+        if not text.strip() or text.lstrip().startswith("#"):
+            continue
+        cells = _split(text, header.separator)
+        if len(cells) != len(header.names):
             raise ReadError(
-                f"{place}: {what}. Correct or delete the row; write decimals with a point"
+                f"line {number} has {len(cells)} cells for {len(header.names)} columns: the file "
+                f"is cut off, or its separator changes"
+            )
+        try:
+            rows.append(
+                [blank if blank is not None and not cell else float(cell) for cell in cells]
+            )
+        except ValueError as error:
+            wrong = (i for i, cell in enumerate(cells) if not _is_number(cell))
+            i = next(i for i in wrong if cells[i] or blank is None)
+            place = f"line {number}, column {i + 1} ({header.names[i]!r})"
+            if cells[i]:
+                what = f"{cells[i][:40]!r} is not a number"
+                raise ReadError(
+                    f"{place}: {what}. Correct or delete the row; write decimals with a point"
+                ) from error
+            raise _BlankCell(
+                f"{place}: the cell is blank. Fill it in, delete the row, or write nan and let "
+                "gaps be interpolated («max_gap=»)"
             ) from error
-        raise _BlankCell(
-            f"{place}: the cell is blank. Fill it in, delete the row, or write nan and let gaps be "
-            "interpolated («max_gap=»)"
-        ) from error
+    return np.array(rows).reshape(-1, len(header.names))
 
 
 def _is_number(cell: str) -> bool:

@@ -1,21 +1,21 @@
-"""ArduPilot DataFlash logs, binary (.bin), which describe their own messages.
+"""ArduPilot DataFlash logs, which describe their own messages: binary (.bin), and as text (.log).
 
 Format: ardupilot.org/dev, "Adding a new log message", and the FMT, FMTU, UNIT and MULT messages
-that every log begins with.
+that every log begins with. Ground stations write the text from the binary.
 """
 
 import collections
 import dataclasses
+import itertools
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import UInt8
 
 from .._errors import ReadError
-from .._log import changes_of, describe_skips, Log, Table
+from .._log import changes_of, describe_skips, Log, number_in, Table
 
 
 _FORMAT_TYPE = 128
@@ -25,13 +25,15 @@ _CODES = {
     "e": "<i4", "E": "<u4", "L": "<i4", "M": "u1", "q": "<i8", "Q": "<u8",
 }  # fmt: skip
 _BUILT_IN = {"c": 0.01, "C": 0.01, "e": 0.01, "E": 0.01, "L": 1e-7}
-CLOCKS = {"TimeUS": 1e-6, "TimeMS": 1e-3}  # s
-
+_CLOCKS = {"TimeUS": 1e-6, "TimeMS": 1e-3}  # s
+_ABOUT = ("FMT", "FMTU", "UNIT", "MULT", "PARM")  # tables about the log, not of signals
+_MOST_INSTANCES = 64
 
 Offsets = dict[int, list[int]]  # of the messages of each type, in bytes
+Stamped = list[tuple[float | None, str, str]]  # time in s, name and value of parameters
 
 
-class Format(NamedTuple):
+class _Format(NamedTuple):
     """The layout of one message type."""
 
     kind: int
@@ -56,7 +58,7 @@ class Format(NamedTuple):
         )
 
 
-class Scaling(NamedTuple):
+class _Scaling(NamedTuple):
     """What FMTU, UNIT and MULT say about the columns of the other messages."""
 
     units: Mapping[str, str]  # by letter
@@ -64,259 +66,57 @@ class Scaling(NamedTuple):
     letters: Mapping[str, tuple[str, str]]  # by message: one letter per column, of either kind
 
 
-_HEAD = b"\xa3\x95"  # of a message, before its type
-_FMT_LENGTH = 89
-ABOUT = ("FMT", "FMTU", "UNIT", "MULT", "PARM")  # tables about the log, not of signals
+_FIRMWARE = re.compile(r"\b[A-Z][\w:]*\w V\d+\.\d+[^\0,]*")
 
 
-def sniff(head: bytes, path: Path) -> bool:
-    return head.startswith(_HEAD + bytes([_FORMAT_TYPE]))
+def _log(
+    messages: Iterable[tuple[_Format, Mapping[str, np.ndarray]]],
+    scaling: _Scaling,
+    remarks: list[str],
+    stamped: Stamped,
+    texts: Iterable[str],
+    *,
+    applied: bool,
+) -> Log:
+    """The messages of each type as a table, or one table per instance: `IMU[0]`, `IMU[1]`, ...
 
-
-def load(path: Path) -> Log:
-    """The message types of a DataFlash log as tables, those with instances as `IMU[0]`, ..."""
-    data = path.read_bytes()
-    parts, remarks = _scan(data)
-    if not parts[0].formats:
-        raise ReadError(
-            "there is no FMT message: the file is not a DataFlash log, or its beginning is missing",
-            offset=0,
-        )
-    buffer = np.frombuffer(data, np.uint8)
-    formats, offsets, left_out = _one_log(buffer, parts)
-    rows, odd = _all_rows(buffer, formats, offsets)
-    remarks += left_out
-    if odd:
-        remarks.append(f"messages with an inconsistent format were left out: {', '.join(odd)}")
-    unit_labels = dict(_cells(rows.get("UNIT"), "Id", "Label"))
-    multipliers = dict(_cells(rows.get("MULT"), "Id", "Mult"))
-    scaled = Scaling(
-        {chr(letter & 0xFF): text(label) for letter, label in unit_labels.items()},
-        {chr(letter & 0xFF): mult for letter, mult in multipliers.items() if 0 < mult < np.inf},
-        {
-            formats[kind].name: (text(units), text(mults))
-            for kind, units, mults in _cells(rows.get("FMTU"), "FmtType", "UnitIds", "MultIds")
-            if kind in formats
-        },
-    )
+    They are columns by name, with their own scale `applied` or not. Messages without a time stamp
+    (formats, parameters) make no table. The `texts` of VER and MSG name the firmware.
+    """
     tables: dict[str, Table] = {}
-    for layout in formats.values():
-        if layout.name in rows and layout.name not in ABOUT:
-            columns = {name: rows[layout.name][name] for name in layout.columns}
-            tables |= tables_of(layout, columns, scaled)
-    remarks += find_rate_unit(tables, scaled)
-    parameters = list(_cells(rows.get("PARM"), "Name", "Value"))
-    times = [1e-6 * time for (time,) in _cells(rows.get("PARM"), "TimeUS")]
-    stamped = [
-        (time, name.decode("latin-1"), f"{value:.9g}")
-        for time, (name, value) in zip(times or [None] * len(parameters), parameters, strict=False)
-    ]
-    named = (*_cells(rows.get("VER"), "FWS"), *_cells(rows.get("MSG"), "Message"))
-    firmware = firmware_of(text(message) for (message,) in named)
+    for layout, rows in messages:
+        clock = next((name for name in layout.columns if name in _CLOCKS), None)
+        if clock is None or clock not in rows:
+            continue
+        if rows[clock].ndim != 1 or rows[clock].dtype.kind not in "iuf":
+            continue
+        time = rows[clock] * _CLOCKS[clock]
+        unit_ids, mult_ids = scaling.letters.get(layout.name, ("", ""))
+        units, scales, instance = {}, {}, ""
+        for i, (name, code) in enumerate(zip(layout.columns, layout.codes, strict=True)):
+            letter = unit_ids[i : i + 1]
+            units[name] = scaling.units.get(letter, "")
+            scales[name] = scaling.multipliers.get(mult_ids[i : i + 1], 1.0)
+            if code in _BUILT_IN:
+                scales[name] = 1.0 if applied else _BUILT_IN[code]
+            if letter == "#":  # of the column that numbers the sensors of one kind
+                instance = name
+        columns = {name: rows[name] for name in layout.columns if name in rows and name != clock}
+        numbers = np.unique(columns[instance]) if instance in columns else np.empty(0)
+        if not 0 < numbers.size <= _MOST_INSTANCES:
+            tables[layout.name] = Table(columns, time, units, scales)
+            continue
+        for number in numbers.tolist():
+            kept = columns[instance] == number
+            values = {name: column[kept] for name, column in columns.items() if name != instance}
+            tables[f"{layout.name}[{number:.0f}]"] = Table(values, time[kept], units, scales)
+    if not scaling.letters.get("RATE"):
+        remarks = [*remarks, *_find_rate_unit(tables)]
     settings = {name: value for _, name, value in stamped}
     changes = changes_of(stamped, lambda time: time)
+    hit = next(filter(None, map(_FIRMWARE.search, texts)), None)
+    firmware = "" if hit is None else hit.group().strip()
     return Log(tables, tuple(remarks), "ardupilot", settings, changes, firmware)
-
-
-def _all_rows(
-    buffer: UInt8[np.ndarray, " bytes"], formats: Mapping[int, Format], offsets: Offsets
-) -> tuple[dict[str, np.ndarray], list[str]]:
-    """The messages by name as structured arrays, and the names of what cannot be laid out."""
-    rows, odd = {}, []
-    for kind, layout in formats.items():
-        dtype = layout.dtype()
-        if not offsets.get(kind):
-            continue
-        if dtype is None or layout.name in rows:
-            odd.append(layout.name)
-        else:
-            windows = np.lib.stride_tricks.sliding_window_view(buffer, layout.length)
-            rows[layout.name] = windows[np.array(offsets[kind])].view(dtype)[:, 0]
-    return rows, odd
-
-
-@dataclasses.dataclass(frozen=True)
-class _Part:
-    """From definitions of messages to the next ones: formats by message type, offsets of each.
-
-    `defined` are the types that it defines itself, and `redefined` place, old and new format of
-    those that the part before defined otherwise.
-    """
-
-    begin: int
-    formats: dict[int, Format]
-    offsets: dict[int, list[int]] = dataclasses.field(
-        default_factory=lambda: collections.defaultdict(list)
-    )
-    defined: set[int] = dataclasses.field(default_factory=set)
-    redefined: list[tuple[int, Format, Format]] = dataclasses.field(default_factory=list)
-
-
-_FIRST = _HEAD + bytes([_FORMAT_TYPE, _FORMAT_TYPE, _FMT_LENGTH])  # of a log: the FMT of FMT
-
-
-def _scan(data: bytes) -> tuple[list[_Part], list[str]]:
-    """The parts of a file, and what was skipped.
-
-    A log ends within a message, wherever the writer's buffer did, which is no damage.
-    """
-    parts = [part := _Part(0, {})]
-    lengths = [0] * 256
-    lengths[_FORMAT_TYPE] = _FMT_LENGTH
-    skipped: list[tuple[int, int]] = []
-    place, last, end = 0, -1, len(data)
-    while place + 3 <= end:
-        kind = data[place + 2]
-        length = lengths[kind]
-        if not length or data[place] != 0xA3 or data[place + 1] != 0x95:
-            begin = data.find(_FIRST, last + 3, place) if last >= 0 else -1
-            if begin >= 0:  # the log before ended within its last message
-                part.offsets[data[last + 2]].pop()
-                place = last = begin
-                continue
-            after = _next_message(data, place + 1, lengths)
-            skipped.append((place, after))
-            place, last = after, -1
-        elif place + length > end:
-            break
-        else:
-            if kind == _FORMAT_TYPE:
-                part = _define(data, place, parts, lengths)
-            part.offsets[kind].append(place)
-            last = place
-            place += length
-    if skipped and skipped[-1][1] == end and not data[skipped[-1][0] :].strip(b"\0\xff"):
-        skipped.pop()  # what a file was prepared with, and not written
-    return parts, describe_skips(skipped, end, end)
-
-
-def _define(data: bytes, place: int, parts: list[_Part], lengths: list[int]) -> _Part:
-    """Take a FMT message; returns its part: a new one where it defines its type once more."""
-    body, part = data[place + 3 : place + _FMT_LENGTH], parts[-1]
-    kind, length = body[0], body[1]
-    if kind in part.defined and part.offsets.keys() != {_FORMAT_TYPE}:
-        if len(parts) == MOST_PARTS:
-            raise ReadError(
-                f"the file defines its messages more than {MOST_PARTS} times: {CUT_IT}",
-                offset=place,
-            )
-        parts.append(part := _Part(place, dict(part.formats)))
-    part.defined.add(kind)
-    name, codes, columns = (text(body[a:b]) for a, b in ((2, 6), (6, 22), (22, 86)))
-    new, old = Format(kind, length, name, codes, tuple(columns.split(","))), part.formats.get(kind)
-    if old is not None and old != new:
-        part.redefined.append((place, old, new))
-    if kind == _FORMAT_TYPE and length != _FMT_LENGTH:
-        raise ReadError(
-            f"the FMT message declares a length of {length} bytes; it has 89", offset=place
-        )
-    part.formats[kind] = new
-    lengths[kind] = length if length > 3 else 0
-    return part
-
-
-def _one_log(
-    buffer: UInt8[np.ndarray, " bytes"], parts: Sequence[_Part]
-) -> tuple[Mapping[int, Format], Offsets, list[str]]:
-    """Formats and offsets of one of the logs that a file holds, and a remark on the others."""
-    ends = [*(part.begin for part in parts[1:]), buffer.size]
-    described = []
-    for part, end in zip(parts, ends, strict=True):
-        stored = [x for kind, x in part.formats.items() if part.offsets.get(kind)]
-        timed = [x for x in stored if x.columns[0] in CLOCKS and x.name not in ABOUT]
-        timed = [layout for layout in timed if layout.dtype() is not None]
-        span = None
-        if timed:
-            most = max(timed, key=lambda layout: len(part.offsets[layout.kind]))
-            rows, _ = _all_rows(buffer, {most.kind: most}, part.offsets)
-            clock = most.columns[0]
-            span = span_of(CLOCKS[clock] * rows[most.name][clock].astype(np.float64))
-        chirped = any(layout.name == "SIDD" for layout in stored)
-        anew = bool(part.redefined) and _FORMAT_TYPE in part.defined
-        described.append(LogPart(part.begin, end, span, chirped, anew))
-    numbers, remarks = choose_log(described)
-    offsets: Offsets = collections.defaultdict(list)
-    for i in numbers:
-        if parts[i].redefined and (i == 0 or i - 1 in numbers):
-            place, old, new = parts[i].redefined[0]
-            raise ReadError(
-                f"message type {new.kind} ({old.name}) is defined a second time, differently "
-                f"({new.name}): if the file holds two logs, cut it there",
-                offset=place,
-            )
-        for kind, places in parts[i].offsets.items():
-            offsets[kind] += places
-    return parts[numbers[-1]].formats, offsets, remarks
-
-
-def _next_message(data: bytes, place: int, lengths: list[int]) -> int:
-    """Where a message begins that another one, or the end of the file, follows."""
-    while (place := data.find(_HEAD, place)) >= 0 and place + 3 <= len(data):
-        length = lengths[data[place + 2]]
-        after = place + length
-        if length and (after == len(data) or data[after : after + 2] == _HEAD):
-            return place
-        place += 1
-    return len(data)
-
-
-def text(field: bytes) -> str:
-    """A padded field as text; where a log is damaged, it may not be UTF-8."""
-    return field.split(b"\0")[0].decode("latin-1").strip()
-
-
-_KINDS = {
-    "Label": "S", "UnitIds": "S", "MultIds": "S", "Mult": "f", "Id": "iu", "FmtType": "iu",
-    "Name": "S", "Value": "f", "TimeUS": "iuf", "FWS": "S", "Message": "S",
-}  # fmt: skip
-
-
-def _cells(rows: np.ndarray | None, *columns: str) -> Iterator[tuple]:
-    """The rows of the columns; none where one is missing, or of another type than it should be."""
-    if rows is None or not set(columns) <= set(rows.dtype.names or ()):
-        return iter(())
-    if not all(rows.dtype[column].kind in _KINDS[column] for column in columns):
-        return iter(())
-    return zip(*(rows[column].tolist() for column in columns), strict=True)
-
-
-_MOST_INSTANCES = 64
-
-
-def tables_of(
-    layout: Format, rows: Mapping[str, np.ndarray], scaled: Scaling, *, applied: bool = False
-) -> dict[str, Table]:
-    """The messages of one type as a table, or one table per instance: `IMU[0]`, `IMU[1]`, ...
-
-    `rows` are columns by name, with their own scale `applied` or not. Messages without a time
-    stamp (formats, parameters) make no table.
-    """
-    clock = next((name for name in layout.columns if name in CLOCKS), None)
-    if clock is None or clock not in rows:
-        return {}
-    if rows[clock].ndim != 1 or rows[clock].dtype.kind not in "iuf":
-        return {}
-    time = rows[clock] * CLOCKS[clock]
-    unit_ids, mult_ids = scaled.letters.get(layout.name, ("", ""))
-    units, scales, instance = {}, {}, ""
-    for i, (name, code) in enumerate(zip(layout.columns, layout.codes, strict=True)):
-        letter = unit_ids[i : i + 1]
-        units[name] = scaled.units.get(letter, "")
-        scales[name] = scaled.multipliers.get(mult_ids[i : i + 1], 1.0)
-        if code in _BUILT_IN:
-            scales[name] = 1.0 if applied else _BUILT_IN[code]
-        if letter == "#":  # of the column that numbers the sensors of one kind
-            instance = name
-    columns = {name: rows[name] for name in layout.columns if name in rows and name != clock}
-    numbers = np.unique(columns[instance]) if instance in columns else np.empty(0)
-    if not 0 < numbers.size <= _MOST_INSTANCES:
-        return {layout.name: Table(columns, time, units, scales)}
-    tables = {}
-    for number in numbers.tolist():
-        kept = columns[instance] == number
-        values = {name: column[kept] for name, column in columns.items() if name != instance}
-        tables[f"{layout.name}[{number:.0f}]"] = Table(values, time[kept], units, scales)
-    return tables
 
 
 _RATES = ("RDes", "R", "PDes", "P", "YDes", "Y")  # of RATE: set-points and rates
@@ -324,15 +124,15 @@ _GYROS = {"R": "GyrX", "P": "GyrY", "Y": "GyrZ"}  # of IMU, in rad/s
 _DEGREES = {1.0: ("rad/s", 1.0), 57.3: ("deg/s", 1.0), 5730.0: ("deg/s", 0.01)}  # rate over gyro
 
 
-def find_rate_unit(tables: dict[str, Table], scaled: Scaling) -> list[str]:
+def _find_rate_unit(tables: dict[str, Table]) -> list[str]:
     """Give RATE its unit in logs before FMTU, by the size of IMU's gyro; returns the remark."""
     rate = tables.get("RATE")
-    if rate is None or scaled.letters.get("RATE"):
+    if rate is None:
         return []
     # The first gyro, as `IMU` or `IMU[0]`; by the deviations over all axes.
     imu = tables.get(min((name for name in tables if name.partition("[")[0] == "IMU"), default=""))
-    pairs = [] if imu is None else [(rate.columns.get(r), imu.columns.get(g)) for r, g in
-                                    _GYROS.items()]  # fmt: skip
+    gyros = {} if imu is None else imu.columns
+    pairs = [(rate.columns.get(r), gyros.get(g)) for r, g in _GYROS.items()]
     pairs = [(r, g) for r, g in pairs if r is not None and g is not None]
     turned = np.sqrt(sum(float(np.var(r)) for r, _ in pairs))
     measured = np.sqrt(sum(float(np.var(g)) for _, g in pairs))
@@ -352,35 +152,33 @@ def find_rate_unit(tables: dict[str, Table], scaled: Scaling) -> list[str]:
     return [f"the log does not say the unit of RATE: taken as {unit}{hundredths}, {why}"]
 
 
-class LogPart(NamedTuple):
+class _Extent(NamedTuple):
     """A part of a file from definitions of its messages to the next ones.
 
-    `begin` and `end` are its first byte and the one after its last, `span` its first and last time
-    in s, None where nothing has a time, and `chirped` says whether it holds a SystemID chirp. One
-    of `other_layout` begins anew, and defines messages otherwise than the part before.
+    One of `other_layout` begins anew, and defines messages otherwise than the part before.
     """
 
-    begin: int
-    end: int
-    span: tuple[float, float] | None
-    chirped: bool
+    begin: int  # its first byte
+    end: int  # the one after its last
+    span: tuple[float, float] | None  # first and last time in s; None where nothing has a time
+    chirped: bool  # whether it holds a SystemID chirp
     other_layout: bool = False
 
 
-MOST_PARTS = 100  # of one file
-CUT_IT = "it is damaged, or holds too many logs: cut it into files of one log each"
+_MOST_PARTS = 100  # of one file
+_CUT_IT = "it is damaged, or holds too many logs: cut it into files of one log each"
 _BACKWARD = 1.0  # s by which the clock goes back at a restart: messages are not quite in order
 _ENDS = 5  # messages at each end of a part whose median is its first and last time
 
 
-def span_of(times: np.ndarray) -> tuple[float, float] | None:
+def _span(times: np.ndarray) -> tuple[float, float] | None:
     """First and last time of the messages of one type, whatever a damaged one says."""
     if not times.size:
         return None
     return float(np.median(times[:_ENDS])), float(np.median(times[-_ENDS:]))
 
 
-def choose_log(parts: Sequence[LogPart]) -> tuple[list[int], list[str]]:
+def _choose_log(parts: Sequence[_Extent]) -> tuple[list[int], list[str]]:
     """The numbers of the parts of the log to read, and a remark on those that are left out.
 
     It is the longest one with a chirp, else the longest.
@@ -414,10 +212,323 @@ def choose_log(parts: Sequence[LogPart]) -> tuple[list[int], list[str]]:
     return logs[best], [remark]
 
 
-_FIRMWARE = re.compile(r"\b[A-Z][\w:]*\w V\d+\.\d+[^\0,]*")
+_HEAD = b"\xa3\x95"  # of a message, before its type
+_FMT_LENGTH = 89
+_FIRST = _HEAD + bytes([_FORMAT_TYPE, _FORMAT_TYPE, _FMT_LENGTH])  # of a log: the FMT of FMT
 
 
-def firmware_of(messages: Iterable[str]) -> str:
-    """Name and version, `ArduCopter V4.5.7 (2a3dc4b7)`, from the texts of VER and MSG."""
-    hit = next(filter(None, map(_FIRMWARE.search, messages)), None)
-    return "" if hit is None else hit.group().strip()
+def sniff(head: bytes, path: Path) -> bool:
+    return head.startswith(_FIRST[:3])
+
+
+def load(path: Path) -> Log:
+    """The message types of a DataFlash log as tables, those with instances as `IMU[0]`, ..."""
+    data = path.read_bytes()
+    parts, remarks = _scan(data)
+    if not parts[0].formats:
+        raise ReadError(
+            "there is no FMT message: the file is not a DataFlash log, or its beginning is missing",
+            offset=0,
+        )
+    formats, offsets, left_out = _one_log(data, parts)
+    rows, odd = _rows(data, formats, offsets)
+    remarks += left_out
+    if odd:
+        remarks.append(f"messages with an inconsistent format were left out: {', '.join(odd)}")
+    units, mults = _cells(rows.get("UNIT"), "Id", "Label"), _cells(rows.get("MULT"), "Id", "Mult")
+    scaling = _Scaling(
+        {chr(letter & 0xFF): _text(label) for letter, label in units},
+        {chr(letter & 0xFF): mult for letter, mult in dict(mults).items() if 0 < mult < np.inf},
+        {
+            formats[kind].name: (_text(units), _text(mults))
+            for kind, units, mults in _cells(rows.get("FMTU"), "FmtType", "UnitIds", "MultIds")
+            if kind in formats
+        },
+    )
+    messages = [
+        (layout, {name: rows[layout.name][name] for name in layout.columns})
+        for layout in formats.values()
+        if layout.name in rows and layout.name not in _ABOUT
+    ]
+    parameters = list(_cells(rows.get("PARM"), "Name", "Value"))
+    times = [1e-6 * time for (time,) in _cells(rows.get("PARM"), "TimeUS")]
+    stamped: Stamped = [
+        (time, name.decode("latin-1"), f"{value:.9g}")
+        for time, (name, value) in zip(times or [None] * len(parameters), parameters, strict=False)
+    ]
+    named = (*_cells(rows.get("VER"), "FWS"), *_cells(rows.get("MSG"), "Message"))
+    texts = (_text(message) for (message,) in named)
+    return _log(messages, scaling, remarks, stamped, texts, applied=False)
+
+
+def _rows(
+    data: bytes, formats: Mapping[int, _Format], offsets: Offsets
+) -> tuple[dict[str, np.ndarray], list[str]]:
+    """The messages by name as structured arrays, and the names of what cannot be laid out."""
+    buffer = np.frombuffer(data, np.uint8)
+    rows, odd = {}, []
+    for kind, layout in formats.items():
+        dtype = layout.dtype()
+        if not offsets.get(kind):
+            continue
+        if dtype is None or layout.name in rows:
+            odd.append(layout.name)
+        else:
+            windows = np.lib.stride_tricks.sliding_window_view(buffer, layout.length)
+            rows[layout.name] = windows[np.array(offsets[kind])].view(dtype)[:, 0]
+    return rows, odd
+
+
+@dataclasses.dataclass(frozen=True)
+class _Part:
+    """From definitions of messages to the next ones: formats by message type, offsets of each.
+
+    `defined` are the types that it defines itself, and `redefined` place, old and new format of
+    those that the part before defined otherwise.
+    """
+
+    begin: int
+    formats: dict[int, _Format]
+    offsets: Offsets = dataclasses.field(default_factory=lambda: collections.defaultdict(list))
+    defined: set[int] = dataclasses.field(default_factory=set)
+    redefined: list[tuple[int, _Format, _Format]] = dataclasses.field(default_factory=list)
+
+
+def _scan(data: bytes) -> tuple[list[_Part], list[str]]:
+    """The parts of a file, and what was skipped.
+
+    A log ends within a message, wherever the writer's buffer did, which is no damage.
+    """
+    parts = [part := _Part(0, {})]
+    lengths = [0] * 256
+    lengths[_FORMAT_TYPE] = _FMT_LENGTH
+    skipped: list[tuple[int, int]] = []
+    place, last, end = 0, -1, len(data)
+    while place + 3 <= end:
+        kind = data[place + 2]
+        length = lengths[kind]
+        if not length or data[place] != 0xA3 or data[place + 1] != 0x95:
+            begin = data.find(_FIRST, last + 3, place) if last >= 0 else -1
+            if begin >= 0:  # the log before ended within its last message
+                part.offsets[data[last + 2]].pop()
+                place = last = begin
+                continue
+            after = place + 1  # where a message begins that another one, or the end, follows
+            while (after := data.find(_HEAD, after)) >= 0 and after + 3 <= end:
+                length = lengths[data[after + 2]]
+                follows = after + length == end or data.startswith(_HEAD, after + length)
+                if length and follows:
+                    break
+                after += 1
+            else:
+                after = end
+            skipped.append((place, after))
+            place, last = after, -1
+        elif place + length > end:
+            break
+        else:
+            if kind == _FORMAT_TYPE:
+                part = _define(data, place, parts, lengths)
+            part.offsets[kind].append(place)
+            last = place
+            place += length
+    if skipped and skipped[-1][1] == end and not data[skipped[-1][0] :].strip(b"\0\xff"):
+        skipped.pop()  # what a file was prepared with, and not written
+    return parts, describe_skips(skipped, end, end)
+
+
+def _define(data: bytes, place: int, parts: list[_Part], lengths: list[int]) -> _Part:
+    """Take a FMT message; returns its part: a new one where it defines its type once more."""
+    body, part = data[place + 3 : place + _FMT_LENGTH], parts[-1]
+    kind, length = body[0], body[1]
+    if kind in part.defined and part.offsets.keys() != {_FORMAT_TYPE}:
+        if len(parts) == _MOST_PARTS:
+            raise ReadError(
+                f"the file defines its messages more than {_MOST_PARTS} times: {_CUT_IT}",
+                offset=place,
+            )
+        parts.append(part := _Part(place, dict(part.formats)))
+    part.defined.add(kind)
+    name, codes, columns = (_text(body[a:b]) for a, b in ((2, 6), (6, 22), (22, 86)))
+    old = part.formats.get(kind)
+    new = part.formats[kind] = _Format(kind, length, name, codes, tuple(columns.split(",")))
+    if old is not None and old != new:
+        part.redefined.append((place, old, new))
+    if kind == _FORMAT_TYPE and length != _FMT_LENGTH:
+        raise ReadError(
+            f"the FMT message declares a length of {length} bytes; it has 89", offset=place
+        )
+    lengths[kind] = length if length > 3 else 0
+    return part
+
+
+def _one_log(
+    data: bytes, parts: Sequence[_Part]
+) -> tuple[Mapping[int, _Format], Offsets, list[str]]:
+    """Formats and offsets of one of the logs that a file holds, and a remark on the others."""
+    ends = [*(part.begin for part in parts[1:]), len(data)]
+    extents = []
+    for part, end in zip(parts, ends, strict=True):
+        stored = [x for kind, x in part.formats.items() if part.offsets.get(kind)]
+        timed = [x for x in stored if x.columns[0] in _CLOCKS and x.name not in _ABOUT]
+        timed = [layout for layout in timed if layout.dtype() is not None]
+        span = None
+        if timed:
+            most = max(timed, key=lambda layout: len(part.offsets[layout.kind]))
+            rows, _ = _rows(data, {most.kind: most}, part.offsets)
+            clock = most.columns[0]
+            span = _span(_CLOCKS[clock] * rows[most.name][clock].astype(np.float64))
+        chirped = any(layout.name == "SIDD" for layout in stored)
+        anew = bool(part.redefined) and _FORMAT_TYPE in part.defined
+        extents.append(_Extent(part.begin, end, span, chirped, anew))
+    numbers, remarks = _choose_log(extents)
+    offsets: Offsets = collections.defaultdict(list)
+    for i in numbers:
+        if parts[i].redefined and (i == 0 or i - 1 in numbers):
+            place, old, new = parts[i].redefined[0]
+            raise ReadError(
+                f"message type {new.kind} ({old.name}) is defined a second time, differently "
+                f"({new.name}): if the file holds two logs, cut it there",
+                offset=place,
+            )
+        for kind, places in parts[i].offsets.items():
+            offsets[kind] += places
+    return parts[numbers[-1]].formats, offsets, remarks
+
+
+def _text(field: bytes) -> str:
+    """A padded field as text; where a log is damaged, it may not be UTF-8."""
+    return field.split(b"\0")[0].decode("latin-1").strip()
+
+
+_KINDS = {
+    "Label": "S", "UnitIds": "S", "MultIds": "S", "Mult": "f", "Id": "iu", "FmtType": "iu",
+    "Name": "S", "Value": "f", "TimeUS": "iuf", "FWS": "S", "Message": "S",
+}  # fmt: skip
+
+
+def _cells(rows: np.ndarray | None, *columns: str) -> Iterator[tuple]:
+    """The rows of the columns; none where one is missing, or of another type than it should be."""
+    if rows is None or not set(columns) <= set(rows.dtype.names or ()):
+        return iter(())
+    if not all(rows.dtype[column].kind in _KINDS[column] for column in columns):
+        return iter(())
+    return zip(*(rows[column].tolist() for column in columns), strict=True)
+
+
+_MOST_TYPES = 1000
+_MOST_COLUMNS = 64
+_BEGIN = re.compile(rb"^[ \t]*FMT, *128,", re.MULTILINE)
+Lines = dict[str, list[bytes]]  # what follows the name of a message, by name
+
+
+def sniff_text(head: bytes, path: Path) -> bool:
+    return head.lstrip().startswith(b"FMT,")
+
+
+def load_text(path: Path) -> Log:
+    """The same of a text log.
+
+    Numbers stand in the units of their format letters; those of FMTU remain to be multiplied.
+    """
+    content = path.read_bytes()
+    begins = [hit.start() for hit in _BEGIN.finditer(content)][1:]
+    if len(begins) >= _MOST_PARTS:
+        raise ReadError(
+            f"the file defines its messages {len(begins) + 1} times: {_CUT_IT}", offset=0
+        )
+    parts = []
+    for begin, end in itertools.pairwise([0, *begins, len(content)]) if begins else ():
+        lines, _ = _lines(content[begin:end])
+        timed = [x for x in _text_formats(lines) if x.name not in _ABOUT and x.name in lines]
+        timed = [layout for layout in timed if layout.columns[0] in _CLOCKS]
+        span = None
+        if timed:
+            most = max(timed, key=lambda layout: len(lines[layout.name]))
+            cells = (line.partition(b",")[0] for line in lines[most.name])
+            stamps = np.array([number_in(cell.decode("latin-1")) for cell in cells])
+            span = _span(_CLOCKS[most.columns[0]] * stamps)
+        parts.append(_Extent(begin, end, span, bool(timed) and "SIDD" in lines))
+    numbers, remarks = _choose_log(parts)
+    if begins:
+        content = b"".join(content[parts[i].begin : parts[i].end] for i in numbers)
+    lines, skipped = _lines(content)
+    formats = _text_formats(lines)
+    if not formats:
+        raise ReadError(
+            "there is no valid FMT line: the file is not a DataFlash log, or its beginning is "
+            "missing",
+            offset=0,
+        )
+    names = {layout.kind: layout.name for layout in formats}
+    units, mults = (
+        {
+            chr(int(cells[-2])): cells[-1]
+            for cells in _split(lines.get(name, []))
+            if len(cells) >= 2 and cells[-2].isdecimal() and len(cells[-2]) <= 3
+        }
+        for name in ("UNIT", "MULT")
+    )
+    letters = {
+        names[int(kind)]: (unit_ids, mult_ids)
+        for kind, unit_ids, mult_ids in (c[-3:] for c in _split(lines.get("FMTU", [])) if c[2:])
+        if kind.isdecimal() and len(kind) < 9 and int(kind) in names
+    }
+    factors = {letter: number_in(text) for letter, text in mults.items()}
+    factors = {letter: factor for letter, factor in factors.items() if 0 < factor < np.inf}
+    messages = []
+    for layout in formats:
+        if layout.name not in lines or layout.name in _ABOUT:
+            continue
+        width = len(layout.columns)
+        fitting = [line for line in lines[layout.name] if line.count(b",") == width - 1]
+        skipped += len(lines[layout.name]) - len(fitting)
+        try:  # all numbers at once, where there is nothing else
+            table = np.fromstring(b",".join(fitting).decode("latin-1"), sep=",")
+        except ValueError:
+            table = np.empty(0)
+        if table.size == width * len(fitting):
+            columns = dict(zip(layout.columns, table.reshape(-1, width).T, strict=True))
+        else:  # the columns that hold numbers
+            texts = zip(layout.columns, zip(*_split(fitting), strict=True), strict=True)
+            columns = {name: np.array([number_in(cell) for cell in cells]) for name, cells in texts}
+            columns = {name: x for name, x in columns.items() if np.isfinite(x).any()}
+        messages.append((layout, columns))
+    remarks += [f"{skipped} lines that match no format were left out"] if skipped else []
+    columns = next((layout.columns for layout in formats if layout.name == "PARM"), ())
+    name, value = -2, -1  # Later versions log a parameter's default behind its value.
+    if {"Name", "Value"} <= set(columns):
+        name, value = columns.index("Name"), columns.index("Value")
+    cells = [c for c in _split(lines.get("PARM", [])) if len(c) >= max(2, name + 1, value + 1)]
+    timed = columns[:1] == ("TimeUS",)
+    stamped = [(1e-6 * number_in(c[0]) if timed else None, c[name], c[value]) for c in cells]
+    texts = (line.decode("latin-1") for name in ("VER", "MSG") for line in lines.get(name, []))
+    return _log(messages, _Scaling(units, factors, letters), remarks, stamped, texts, applied=True)
+
+
+def _lines(content: bytes) -> tuple[Lines, int]:
+    """The lines by the name of their message; and how many have none."""
+    lines: dict[bytes, list[bytes]] = {}
+    skipped = 0
+    for line in content.split(b"\n"):
+        name, comma, rest = line.partition(b",")
+        if comma and (name in lines or len(lines) < _MOST_TYPES):
+            lines.setdefault(name, []).append(rest)
+        else:
+            skipped += bool(line.strip())
+    return {name.decode("latin-1").strip(): rests for name, rests in lines.items()}, skipped
+
+
+def _split(lines: Sequence[bytes]) -> list[list[str]]:
+    return [[cell.strip() for cell in line.decode("latin-1").split(",")] for line in lines]
+
+
+def _text_formats(lines: Lines) -> list[_Format]:
+    """From `140, 27, RATE, Qfff, TimeUS,RDes,R,ROut`; the first of a name counts."""
+    formats: dict[str, _Format] = {}
+    for kind, length, name, codes, *columns in (c for c in _split(lines.get("FMT", [])) if c[4:]):
+        plausible = kind.isdecimal() and length.isdecimal() and name
+        if plausible and len(codes) == len(columns) == len(set(columns)) <= _MOST_COLUMNS:
+            layout = _Format(int(kind[:9]), int(length[:9]), name, codes, tuple(columns))
+            formats.setdefault(name, layout)
+    return list(formats.values())

@@ -24,14 +24,13 @@ from .._errors import located, printable, ReadError, RecordWarning
 from .._firmwares import registered_logs
 from .._log import allowance, flattened, Log, oversize, Signals, Table
 from . import (
+    _arrays,
     _betaflight,
+    _betaflight_columns,
     _by_library,
     _crazyflie,
     _csv,
     _dataflash,
-    _dataflash_text,
-    _mat,
-    _npz,
     _ulog,
 )
 
@@ -42,16 +41,13 @@ _CHILD = Path(__file__).with_name("_by_library.py")
 PATIENCE = 20.0  # s, beside what the size of the file allows
 
 
-def _in_child(name: str, kind: str, *, per_megabyte: float = 0.1) -> Callable[[Path], Log]:
-    """A `load` function that reads the format `name` of `_by_library` in a child process.
+def _in_child(name: str, per_megabyte: float, path: Path) -> Log:
+    """A file of the format `name` of `_by_library`, read in a child process.
 
     A column `time` of a table with a name is its clock, in s. The process may take `per_megabyte`
     s for each megabyte of the file beside `PATIENCE`.
     """
-    return ft.partial(_load_in_child, name, kind, per_megabyte)
-
-
-def _load_in_child(name: str, kind: str, per_megabyte: float, path: Path) -> Log:
+    kind = READERS[name].kind
     files = [file for file in path.iterdir() if file.is_file()] if path.is_dir() else [path]
     stored = sum(file.stat().st_size for file in files)
     words = [str(_CHILD), name, str(path.absolute()), str(allowance(stored))]
@@ -118,34 +114,34 @@ class Reader(NamedTuple):
 
 
 READERS: Mapping[str, Reader] = {
-    "npz": Reader("a NumPy archive", _npz.sniff, _npz.load, (".npz", ".npy")),
-    "mat": Reader("a MATLAB file", _mat.sniff, _mat.load, (".mat",)),
+    "npz": Reader(
+        "a NumPy archive", _arrays.sniff_numpy, _arrays.load_numpy, (".npz", ".npy")
+    ),
+    "mat": Reader("a MATLAB file", _arrays.sniff_matlab, _arrays.load_matlab, (".mat",)),
     "dataflash": Reader(
         "an ArduPilot DataFlash log", _dataflash.sniff, _dataflash.load, (".bin",)
     ),
     "dataflash_text": Reader(
-        "an ArduPilot text log", _dataflash_text.sniff_text, _dataflash_text.load_text, (".log",)
+        "an ArduPilot text log", _dataflash.sniff_text, _dataflash.load_text, (".log",)
     ),
     "ulog": Reader("a PX4 ULog", _ulog.sniff, _ulog.load, (".ulg", ".ulog")),
     "betaflight": Reader(
         "a Betaflight blackbox log", _betaflight.sniff, _betaflight.load, (".bbl", ".bfl")
     ),
     "betaflight_csv": Reader(
-        "a table of blackbox_decode", _betaflight.sniff_table, _betaflight.load_table
+        "a table of blackbox_decode", _betaflight_columns.sniff, _betaflight_columns.load
     ),
     "crazyflie": Reader("a Crazyflie log", _crazyflie.sniff, _crazyflie.load),
     "hdf5": Reader(
-        "an HDF5 or MATLAB v7.3 file",
-        _by_library.sniff_hdf5,
-        _in_child("hdf5", "an HDF5 or MATLAB v7.3 file"),
+        "an HDF5 or MATLAB v7.3 file", _by_library.sniff_hdf5, ft.partial(_in_child, "hdf5", 0.1),
         (".h5", ".hdf5", ".hdf"),
     ),
     "parquet": Reader(
-        "a Parquet table", _by_library.sniff_parquet, _in_child("parquet", "a Parquet table"),
+        "a Parquet table", _by_library.sniff_parquet, ft.partial(_in_child, "parquet", 0.1),
         (".parquet", ".pq"),
     ),
     "rosbag": Reader(
-        "a ROS 2 bag", _by_library.sniff_bag, _in_child("rosbag", "a ROS 2 bag", per_megabyte=2.0),
+        "a ROS 2 bag", _by_library.sniff_bag, ft.partial(_in_child, "rosbag", 2.0),
         (".mcap", ".db3"),
     ),
     "csv": Reader("a text table", _csv.sniff, _csv.load, (".csv", ".tsv", ".txt")),

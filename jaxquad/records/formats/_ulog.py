@@ -36,8 +36,8 @@ Formats = Mapping[str, tuple[Field, ...]]
 class _Topic:
     """One subscription: how its messages are laid out, and where their bytes begin."""
 
+    name: str
     dtype: np.dtype
-    units: dict[str, str]
     offsets: list[int] = dataclasses.field(default_factory=list)
 
     def __post_init__(self):
@@ -86,14 +86,19 @@ def load(path: Path) -> Log:
     if not messages.topics:
         raise ReadError("the file logs no topic: it is cut off or damaged", offset=place)
     tables = {}
-    for name, topic in messages.topics.items():
+    for label, topic in messages.topics.items():
         if topic.offsets:
             buffer = np.frombuffer(data, np.uint8)
             windows = np.lib.stride_tricks.sliding_window_view(buffer, topic.length)
             rows = windows[np.array(topic.offsets)].view(topic.dtype)[:, 0]
             shown = [name for name in topic.dtype.names or () if "_padding" not in name]
             columns = {name: rows[name] for name in shown if name != "timestamp"}
-            tables[name] = Table(columns, rows["timestamp"] * 1e-6, topic.units)
+            units = dict(_UNITS.get(topic.name, {}))  # by topic, else by a name's ending
+            for column in columns:
+                for ending, unit in _ENDINGS.items():
+                    if column.endswith(ending):
+                        units.setdefault(column, unit)
+            tables[label] = Table(columns, rows["timestamp"] * 1e-6, units)
     remarks = [*describe_skips(skipped, place, len(data)), *messages.notes]
     if messages.stray:
         remarks.append(f"{messages.stray} messages of unknown topics were left out")
@@ -140,7 +145,17 @@ def _scan(data: bytes) -> tuple[_Messages, list[tuple[int, int]], int]:
             limit = messages.limit(after, len(data))
             place = after
         else:
-            resumed = _resumed(data, place + 1, messages)
+            resumed = place + 1  # where a data message begins that fits, and another one follows
+            while (at := data.find(b"D", resumed + 2)) >= 0 and at + 3 <= len(data):
+                resumed = at - 2
+                size, number = (data[i] | data[i + 1] << 8 for i in (resumed, at + 1))
+                topic, behind = current.get(number), resumed + 3 + size
+                fits = topic is not None and topic.length <= size - 2 <= topic.length + _SPARE
+                if fits and behind <= len(data) and _follows(data, behind, _DATA):
+                    break
+                resumed += 1
+            else:
+                resumed = len(data)
             if resumed == len(data) and after > limit and kind in _KINDS:
                 break
             skipped.append((place, resumed))
@@ -153,19 +168,6 @@ def _follows(data: bytes, after: int, kind: int) -> bool:
     return kind in _KINDS and (after + 3 > len(data) or data[after + 2] in _KINDS)
 
 
-def _resumed(data: bytes, place: int, messages: _Messages) -> int:
-    """Where the next data message begins that fits its topic and that another one follows."""
-    while (kind := data.find(b"D", place + 2)) >= 0 and kind + 3 <= len(data):
-        place = kind - 2
-        size, number = (data[at] | data[at + 1] << 8 for at in (place, kind + 1))
-        topic, after = messages.current.get(number), place + 3 + size
-        fits = topic is not None and topic.length <= size - 2 <= topic.length + _SPARE
-        if fits and after <= len(data) and _follows(data, after, _DATA):
-            return place
-        place += 1
-    return len(data)
-
-
 _BASIC = {
     "int8_t": "i1", "uint8_t": "u1", "int16_t": "<i2", "uint16_t": "<u2", "int32_t": "<i4",
     "uint32_t": "<u4", "int64_t": "<i8", "uint64_t": "<u8", "float": "<f4", "double": "<f8",
@@ -175,11 +177,7 @@ _FIELD = re.compile(r"(\w+)(?:\[(\d{1,9})\])? (\w+)", re.ASCII)
 
 
 def _layout(name: str, formats: Formats, offset: int, most: int) -> np.dtype:
-    """The bytes of one message as columns; those of a nested format are `field.column`.
-
-    Padding at the end is left out, as the logger leaves it out. Raises ReadError, also for
-    more than `most` columns.
-    """
+    """The bytes of a message as at most so many columns, those of a nested one `field.column`."""
     fields: list[tuple[str, str]] = []
     size = 0
     for column, kind in _columns(name, "", formats, offset, 0):
@@ -188,7 +186,7 @@ def _layout(name: str, formats: Formats, offset: int, most: int) -> np.dtype:
         if size > _LARGEST or len(fields) > most:
             raise ReadError(f"the format {name!r} is implausibly long", offset=offset)
     while fields and fields[-1][0].rpartition(".")[2].startswith("_padding"):
-        fields.pop()
+        fields.pop()  # as the logger leaves it out
     if len({column for column, _ in fields}) < max(1, len(fields)):
         raise ReadError(
             f"the format {name!r} has no field, or two with the same name", offset=offset
@@ -216,11 +214,10 @@ def _columns(
                 yield from _columns(field.kind, f"{column}[{i}].", formats, offset, depth + 1)
 
 
-_RATES = ("roll", "pitch", "yaw")
-_KNOWN = {
+_UNITS = {
     "vehicle_angular_velocity": {"xyz": "rad/s", "xyz_derivative": "rad/s^2"},
     "vehicle_angular_acceleration": {"xyz": "rad/s^2"},
-    "vehicle_rates_setpoint": dict.fromkeys(_RATES, "rad/s"),
+    "vehicle_rates_setpoint": dict.fromkeys(("roll", "pitch", "yaw"), "rad/s"),
     "vehicle_attitude": {"rollspeed": "rad/s", "pitchspeed": "rad/s", "yawspeed": "rad/s"},
     "vehicle_attitude_setpoint": {"roll_body": "rad", "pitch_body": "rad", "yaw_body": "rad"},
     "vehicle_acceleration": {"xyz": "m/s^2"},
@@ -239,10 +236,7 @@ _NUMBERS = {"float": "<f", "int32_t": "<i", "uint32_t": "<I", "uint64_t": "<Q", 
 
 
 def _interpret(kind: int, body: bytes, place: int, messages: _Messages) -> None:
-    """Interpret one message that is not data; a damaged one is left out with a remark.
-
-    Raises ReadError for a file that needs a newer reader.
-    """
+    """Interpret one message that is not data; a damaged one is left out with a remark."""
     letter = chr(kind)
     if letter == "B":
         if len(body) < 40:
@@ -270,7 +264,22 @@ def _interpret(kind: int, body: bytes, place: int, messages: _Messages) -> None:
             if messages.formats.setdefault(name, fields) != fields:
                 raise ReadError(f"the format {name!r} is defined twice, differently", offset=place)
         elif letter == "A":
-            _subscribe(body, place, messages)
+            instance, number = struct.unpack_from("<BH", body)
+            messages.current.pop(number, None)
+            name = body[3:].decode()
+            if name in messages.formats and name not in messages.layouts:
+                most = min(_WIDEST, messages.columns_left)
+                messages.columns_left -= most  # What fails has cost as much time as a wide one.
+                messages.layouts[name] = _layout(name, messages.formats, place, most)
+                messages.columns_left += most - len(messages.layouts[name].names or ())
+            if name not in messages.layouts:
+                raise ReadError(f"the format {name!r} is not defined", offset=place)
+            dtype = messages.layouts[name]
+            columns = dtype.names or ()
+            if "timestamp" not in columns or dtype["timestamp"] != np.dtype("<u8"):
+                raise ReadError(f"the format {name!r} has no timestamp", offset=place)
+            label = f"{name}[{instance}]" if instance else name
+            messages.current[number] = messages.topics.setdefault(label, _Topic(name, dtype))
         elif letter == "R":
             messages.current.pop(*struct.unpack_from("<H", body), None)
         elif letter in "IP":
@@ -291,28 +300,3 @@ def _interpret(kind: int, body: bytes, place: int, messages: _Messages) -> None:
         if len(messages.notes) < _MOST_NOTES:
             reason = str(error).rstrip(".")
             messages.notes.append(f"message {letter} at byte {place} was left out: {reason}")
-
-
-def _subscribe(body: bytes, place: int, messages: _Messages) -> None:
-    instance, number = struct.unpack_from("<BH", body)
-    messages.current.pop(number, None)
-    name = body[3:].decode()
-    if name in messages.formats and name not in messages.layouts:
-        most = min(_WIDEST, messages.columns_left)
-        messages.columns_left -= most  # What fails has cost as much time as what is too wide.
-        dtype = _layout(name, messages.formats, place, most)
-        messages.columns_left += most - len(dtype.names or ())
-        messages.layouts[name] = dtype
-    if name not in messages.layouts:
-        raise ReadError(f"the format {name!r} is not defined", offset=place)
-    dtype = messages.layouts[name]
-    if "timestamp" not in (dtype.names or ()) or dtype["timestamp"] != np.dtype("<u8"):
-        raise ReadError(f"the format {name!r} has no timestamp", offset=place)
-    label = f"{name}[{instance}]" if instance else name
-    units = dict(_KNOWN.get(name, {}))  # by topic, else by the ending of a column's name
-    for column in dtype.names or ():
-        for ending, unit in _ENDINGS.items():
-            if column.endswith(ending):
-                units.setdefault(column, unit)
-    topic = _Topic(dtype, units)
-    messages.current[number] = messages.topics.setdefault(label, topic)

@@ -1,1 +1,0 @@
-"""ArduPilot (Copter): `_log` says what its channels mean, `_law` and `_firmware` what it flies."""

@@ -1,1 +1,0 @@
-"""The Crazyflie: `_log` says what its channels mean, `_firmware` what it flies."""

@@ -1,0 +1,392 @@
+"""What a Betaflight log says for its proposed ADRC: the report, and the files to load."""
+
+import dataclasses
+import shlex
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from jaxquad._core import announce, plain_content, write_file
+from jaxquad.identify import GainBand, GainOverThrottle
+from jaxquad.plot import StepBand, ThrottleCurve
+from jaxquad.records import AXES
+from jaxquad.report import Headline, Provenance, provenance, Table, write_json
+
+from .._files import change_table, parameter_file, ParameterChange, propose_changes, WordChange
+from .._filters import FilterChain, PT2
+from .._flight_channels import FlightChannels
+from .._page import (
+    B0Section,
+    Chains,
+    chains_of,
+    change_rows,
+    logged_terms,
+    motor_rows,
+    PilotPage,
+    VERDICTS,
+    write_pilot_page,
+)
+from .._parameters import find_parameter
+from .._rate_loops import StepGrid
+from .._reproduce_flight import Reproduction
+from .._stages import DesignSettings, Kind
+from ._betaflight_adrc import adrc_loops, adrc_parameters, b0_law, Flown, FlownADRC
+from ._betaflight_adrc_design import ADRCProposal
+
+
+_BUILD = (2026, 6)  # whose names a file of the ADRC has
+_STEM = "proposal"
+
+
+@dataclasses.dataclass(frozen=True)
+class ADRCAutopilot:
+    """What `autopilot` found in a log, and what it proposes for the ADRC; `str()` is its report.
+
+    **Attributes:**
+
+    - `kind`, `verdict`: as of an `AutopilotProposal`.
+    - `path`: of the log; `version`: of its firmware; `values`: its header's lines.
+    - `flown`: the loop that flew, PID or ADRC.
+    - `plant`: its gain over the throttle; None where no level of throttle determines it.
+    - `reproductions`: the flown loop compared with the flight, by the throttle of each level.
+    - `proposal`: of `propose_adrc`; None where the log cannot tell.
+    - `flight`: the channels that were read.
+    """
+
+    kind: Kind
+    verdict: str
+    settings: DesignSettings
+    path: Path
+    axis: str
+    version: tuple[int, ...]
+    values: Mapping[str, str]
+    flown: Flown
+    plant: GainOverThrottle | None = None
+    reproductions: Mapping[float, Reproduction] = dataclasses.field(default_factory=dict)
+    proposal: ADRCProposal | None = None
+    flight: FlightChannels | None = None
+
+    @property
+    def flew_adrc(self) -> bool:
+        """Whether the ADRC flew, and not the PID."""
+        return isinstance(self.flown, FlownADRC)
+
+    @property
+    def new(self) -> dict[str, float]:
+        """The parameters that are proposed; empty where nothing is."""
+        return {} if self.proposal is None else dict(self.proposal.parameters)
+
+    @property
+    def old(self) -> dict[str, float]:
+        """What the firmware held of these; its defaults where the log does not say it."""
+        flown = adrc_parameters(self.values)
+        default = lambda name: float(find_parameter("betaflight", name).default)
+        return {name: flown.get(name, default(name)) for name in self.new}
+
+    @property
+    def changes(self) -> tuple[ParameterChange, ...]:
+        """From what the firmware held to the proposal; where the PID flew all, changed or not."""
+        return self._changes(1.0)
+
+    def _changes(self, share: float) -> tuple[ParameterChange, ...]:
+        old, new, reasons = self.old, self.new, {}
+        if self.proposal is not None:
+            after, before = self.proposal.stage, self.proposal.stages["what flew"]
+            tuned = (
+                f"effect of torque {after.rejection:.2f} and command noise {after.noise:.2f} of "
+                f"what flew; Ms {before.peak:.2f} -> {after.peak:.2f}"
+            )
+            kept = "the certificate is of this value"
+            reasons = {name: tuned if name.endswith(self.axis) else kept for name in new}
+        if self.flew_adrc:
+            return propose_changes("betaflight", old, new, share=share, reasons=reasons)
+        return tuple(
+            ParameterChange(find_parameter("betaflight", name), old[name], value, reasons[name])
+            for name, value in new.items()
+        )
+
+    @property
+    def words(self) -> tuple[WordChange, ...]:
+        """What switches from the PID to the ADRC; empty where the ADRC flew."""
+        if self.flew_adrc or self.proposal is None or not self.new:
+            return ()
+        law = self.proposal.schedule.law
+        off = {} if self.proposal.scaled is None else self.proposal.scaled.deviations
+        why = (
+            f"nearest to the gain over the throttle: off by {100 * off[law]:.0f} % at most"
+            if off else "the firmware's default: the log does not show b0 over the throttle"
+        )  # fmt: skip
+        return (
+            WordChange("adrc_b0_law", b0_law(self.values) or "SQRT", law, why),
+            WordChange("pid_type", "CLASSIC", "ADRC", "the ADRC of pull request 15400 flies"),
+        )
+
+    def content(self) -> dict[str, object]:
+        """All of it, for JSON."""
+        content = {
+            "kind": self.kind,
+            "verdict": self.verdict,
+            "firmware": "betaflight",
+            "version": self.version,
+            "axis": self.axis,
+            "law": "adrc",
+            "flown_law": "adrc" if self.flew_adrc else "pid",
+            "flown": self.flown.parameters(),
+            "unmodelled": self.flown.unmodelled,
+            "old": self.old,
+            "new": self.new,
+            "words": [x._asdict() for x in self.words],
+            "proposal": None if self.proposal is None else self.proposal.content(),
+            "reproduction": [
+                {"throttle": throttle} | loop.to_dict()
+                for throttle, loop in self.reproductions.items()
+            ],
+            "plant": None if self.plant is None else self.plant.to_dict(),
+            "remarks": self.remarks,
+            "settings": self.settings.content(),
+        }
+        return {key: plain_content(value) for key, value in content.items()}
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """What a pilot has to know before the file is loaded."""
+        remarks = []
+        if self.words and "pid_type" not in self.values:
+            version = ".".join(map(str, self.version))
+            remarks.append(
+                f"the firmware of the log, Betaflight {version}, has no ADRC: only a build of "
+                "Betaflight's pull request 15400 with adrc_b0_law understands the file"
+            )
+        elif self.words and b0_law(self.values) is None:
+            remarks.append(
+                "the build of the log has no adrc_b0_law, and b0 follows the square of the "
+                "throttle there: load the file into one that has it"
+            )
+        if self.words:
+            others = " and ".join(axis for axis in AXES if axis != self.axis)
+            remarks += [
+                "pid_type, adrc_hover_throttle and adrc_b0_law are those of all three axes: before "
+                f"a flight tune {others}, too, from logs of their own with the same hover throttle "
+                f"({self.new['adrc_hover_throttle']:.0f} %), and load all three files",
+                "there is no file for a third of the way, because between PID and ADRC there is "
+                "none; the file that reverts it switches back to the PID",
+            ]
+        if self.words and not adrc_parameters(self.values):
+            remarks.append("the log does not hold the old values: they are the firmware's defaults")
+        if (linear := float(self.values.get("thrust_linear", 0.0))) > 0:
+            remarks.append(
+                f"thrust_linear {linear:g} flew and stays: the gain over the throttle is that with "
+                "it, taken as a straight line"
+            )
+        if self.proposal is not None and self.plant is not None:
+            remarks += _remarks_on_b0(self.plant, self.proposal, self.flew_adrc)
+        return tuple(remarks)
+
+    def write(self, folder: str | Path) -> list[Path]:
+        """Write the page, `autopilot.json`, and parameter files: without a proposal what flew.
+
+        **Returns:** their paths.
+        """
+        announce("parameter files")
+        folder = Path(folder)
+        stated = {k: v for k, v in self.settings.content().items() if v is not None}
+        words = ["jaxquad", "autopilot", str(self.path), *self.settings.words()]
+        origin = provenance(self.path, command=shlex.join(words), settings=stated)
+        content = self.content() | {"provenance": origin.content()}
+        stored = write_json(folder / "autopilot.json", content)
+        announce("the page")
+        page = write_pilot_page(folder / "autopilot.html", adrc_page(self, origin))
+        return [page, stored, *(write_file(folder / k, text) for k, text in self._texts().items())]
+
+    def _texts(self) -> dict[str, str]:
+        """The parameter files, and the table of what changes; without a proposal what flew."""
+        if not self.new:
+            start = ("adrc_wc", "adrc_wo", "adrc_b0") if self.flew_adrc else ("p", "i", "d")
+            flown, version = self.flown.parameters(), self.version or (2025, 12)
+            names = [f"{name}_{self.axis}" for name in start]
+            rows = [(find_parameter("betaflight", name), flown[name]) for name in names]
+            text = parameter_file(
+                "betaflight", [ParameterChange(row, x, x) for row, x in rows], revert=True,
+                version=version, profile=None, title="what flew",
+                raised=[axis for axis in AXES if f"d_max_{axis}" in flown],
+            )  # fmt: skip
+            return {f"{_STEM}_revert.txt": text}
+        texts, table = {}, []
+        file = lambda changes, title, revert=False: parameter_file(
+            "betaflight", changes, revert=revert, version=_BUILD, profile=None, words=self.words,
+            title="\n".join([title, *self.remarks]),
+        )  # fmt: skip
+        for percent in (33, 100) if self.flew_adrc else (100,):
+            changes = self._changes(1.0 if percent == 100 else 1 / 3)
+            title = f"{percent} % of the way from what flew to the proposal"
+            texts[f"{_STEM}_{percent:03d}.txt"] = file(changes, title)
+            table.append(f"## {title}\n\n{change_table(changes, self.words)}")
+        texts[f"{_STEM}_revert.txt"] = file(self.changes, "what flew", True)
+        return texts | {f"{_STEM}.md": "\n".join(table)}
+
+    @property
+    def shown_again(self) -> Mapping[float, Reproduction]:
+        """The flown loop again by throttle, without what the verdict says of it."""
+        doubted = doubted_throttle(self.reproductions)
+        if doubted is None:
+            return self.reproductions
+        said = self.reproductions[doubted].verdict
+        return {x: again for x, again in self.reproductions.items() if again.verdict != said}
+
+    def __str__(self) -> str:
+        version, law = ".".join(map(str, self.version)), "ADRC" if self.flew_adrc else "PID"
+        lines = [
+            f"betaflight {version}, rate loop of {self.axis}: the {law} flew".replace(" ,", ",")
+        ]
+        of_axis = {k: x for k, x in self.flown.parameters().items() if k.endswith(f"_{self.axis}")}
+        lines += [f"  {name} = {value:.6g}" for name, value in of_axis.items()]
+        if isinstance(self.flown, FlownADRC):
+            schedule = self.flown.schedule
+            lines.append(f"  adrc_b0_law = {schedule.law}, hover {100 * schedule.hover:.0f} %")
+        lines += [f"  not modelled: {x}" for x in self.flown.unmodelled]
+        lines += ["", str(self.plant)] if self.plant is not None else []
+        again = [
+            f"flown loop at {throttle:.2f} throttle: {loop.verdict}"
+            for throttle, loop in self.shown_again.items()
+        ]
+        lines += ["", *again] if again else []
+        if self.proposal is not None:
+            lines += ["", self.proposal.table()]
+        if self.new:
+            lines += ["", change_table(self.changes, self.words).rstrip()]
+        lines += ["", *(f"! {x}" for x in self.remarks)] if self.remarks else []
+        return "\n".join([*lines, "", self.verdict])
+
+
+def doubted_throttle(again: Mapping[float, Reproduction]) -> float | None:
+    """Where the flown loop is not reproduced; None where it is at one level, and off at none."""
+    off = [throttle for throttle, check in again.items() if check.kind == "not flown"]
+    blind = all(check.kind == "unknown" for check in again.values())
+    return next(iter(off or (again if blind else ())), None)
+
+
+def _remarks_on_b0(plant: GainOverThrottle, proposal: ADRCProposal, flew: bool) -> list[str]:
+    schedule, scaled = proposal.schedule, proposal.scaled
+    if scaled is None:
+        return [
+            f"b0 over the throttle is not known, and adrc_b0_law {schedule.law} is "
+            f"{'what flew' if flew else 'the default'}: the certificate is of "
+            f"{proposal.throttle[0]:.2f} throttle alone; {plant.what_to_fly()}"
+        ]
+    remarks, most = [], float(schedule.scale(proposal.throttle[-1]))
+    if most >= schedule.high > 1:
+        remarks.append(
+            f"at {proposal.throttle[-1]:.2f} throttle b0 is at adrc_b0_scale_max, {schedule.high:g}"
+        )
+    if flew and scaled.law != schedule.law:
+        off = scaled.deviations
+        remarks.append(
+            f"adrc_b0_law {schedule.law} stays as it flew: it is off by up to "
+            f"{100 * off[schedule.law]:.0f} %, and {scaled.law} by {100 * off[scaled.law]:.0f} %"
+        )
+    if scaled.extrapolated:
+        remarks.append(
+            f"the hover throttle of {scaled.hover:.2f} lies outside of what was flown, "
+            f"{float(plant.low.min()):.2f} to {float(plant.high.max()):.2f}"
+        )
+    return remarks
+
+
+_PLANTS, _SEED = 100, 77  # of the steps' bands
+_POINTS = 60  # of a curve over the throttle
+
+
+def adrc_page(result: ADRCAutopilot, origin: Provenance) -> PilotPage:
+    """All that the page shows."""
+    version, proposal, plant = ".".join(map(str, result.version)), result.proposal, result.plant
+    flown, flight, axis = result.flown, result.flight, AXES.index(result.axis)
+    headlines = [Headline(*VERDICTS[result.kind], result.verdict)]
+    for throttle, again in result.shown_again.items():
+        flew = again.kind == "flown"
+        word = "THE FLOWN LOOP AGAIN" if flew else "THE FLOWN LOOP IS NOT REPRODUCED"
+        level = "good" if flew else "warn" if again.kind == "unknown" else "bad"
+        headlines.append(Headline(level, word, f"at {throttle:.2f} throttle: {again.verdict}"))
+    pid = flown.pid.law if isinstance(flown, FlownADRC) else flown.law
+    chains = chains_of(pid, axis)
+
+    def with_observer(cutoff: float) -> Chains:
+        observer = (FilterChain((PT2(cutoff),), 1 / pid.dt),) if cutoff > 0 else ()
+        return {"gyro": chains["gyro"], "observer": observer}
+
+    filters: dict[str, Chains] = {"flown": chains}
+    if isinstance(flown, FlownADRC):
+        filters = {"flown": with_observer(flown.frame.lowpass_hz)}
+    elif result.new:
+        filters["proposed"] = with_observer(result.new["adrc_gyro_lpf_hz"])
+    steps, b0, stages = {}, None, None
+    if proposal is not None and plant is not None:
+        steps, b0 = _steps_and_b0(result, proposal, plant)
+        stages = stage_table(proposal, result.settings.fresh)
+    return PilotPage(
+        title=f"betaflight {version}, ADRC for {result.axis}".replace(" ,", ","),
+        headlines=headlines,
+        remarks=[*result.remarks, *(f"not modelled: {text}" for text in flown.unmodelled)],
+        filters=filters,
+        steps=steps,
+        b0=b0,
+        terms={} if flight is None or not flight.terms else logged_terms(flight),
+        terms_are="as logged",
+        motors=[] if flight is None else motor_rows(flight),
+        stages=stages,
+        changes=change_rows(result.changes, result.words) if result.new else None,
+        text=str(result),
+        unit="pidsum",
+        provenance=origin,
+    )
+
+
+def _steps_and_b0(
+    result: ADRCAutopilot, proposal: ADRCProposal, plant: GainOverThrottle
+) -> tuple[dict[str, StepBand], B0Section]:
+    """Steps at the middle one of the throttles that were certified, and b0 over all of them."""
+    flown, schedule = result.flown, proposal.schedule
+    middle = proposal.throttle[len(proposal.throttle) // 2]
+    grid, place = StepGrid.of(flown.law.dt), AXES.index(result.axis)
+    seed = result.settings.seed + _SEED
+    loop = adrc_loops(plant, flown, place, middle, proposal.frame, _PLANTS, seed, grid.omega)
+    at = f", {middle:.2f} throttle"
+    steps = {f"{'ADRC' if result.flew_adrc else 'PID'} flown{at}": grid.band(loop.closed(None))}
+    levels = [plant.b0(k) for k in range(plant.throttle.size)]
+    low, high = np.array([level.interval for level in levels]).T
+    measured = GainBand(plant.throttle, np.array([level.value for level in levels]), low, high)
+    throttle, taken = np.linspace(float(plant.low.min()), float(plant.high.max()), _POINTS), {}
+    if isinstance(flown, FlownADRC):
+        b0 = proposal.stages["what flew"].b0 * flown.schedule.scale(throttle)
+        taken["b0 that flew"] = ThrottleCurve(throttle, b0)
+    if result.new:
+        steps[f"ADRC proposed{at}"] = grid.band(loop.closed(np.array(proposal.stage[:3])))
+        b0 = proposal.stage.b0 * schedule.scale(throttle)
+        taken[f"b0 proposed, {proposal.law}"] = ThrottleCurve(throttle, b0)
+    curve = None if proposal.scaled is None else plant.b0_over(throttle)
+    text = plant.what_to_fly() if proposal.scaled is None else f"gain / lag: {proposal.scaled}"
+    more = (
+        " The best b0 is not gain / lag: the motors' own pole 1 / lag is a part of what the "
+        "observer has to follow."
+    )
+    return steps, B0Section(measured, taken, curve, f"{text[0].upper()}{text[1:]}.{more}")
+
+
+def stage_table(proposal: ADRCProposal, fresh: int) -> Table:
+    """What parameters give on fresh plants, for the page."""
+    number = lambda x: "-" if np.isnan(x) else f"{x:.0f}"
+    rows = [
+        [
+            name, number(x.wc), number(x.wo), number(x.b0), f"{100 * x.stable:.1f}",
+            f"{x.peak:.2f}", f"{x.resonance:.2f}", f"{x.crossover / (2 * np.pi):.1f}",
+            f"{x.rejection:.2f}", f"{x.noise:.2f}",
+        ]
+        for name, x in proposal.stages.items()
+    ]  # fmt: skip
+    heads = (
+        "parameters", "wc", "wo", "b0", "stable, %", "worst Ms", "worst peak", "crossover, Hz",
+        "torque", "noise",
+    )  # fmt: skip
+    first, last = proposal.throttle[0], proposal.throttle[-1]
+    where = f"at {first:.2f}" if first == last else f"from {first:.2f} to {last:.2f}"
+    return Table(f"On {fresh} fresh plants, {where} throttle", heads, rows)

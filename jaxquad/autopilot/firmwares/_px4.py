@@ -1,0 +1,293 @@
+"""PX4: its rate and attitude loops, parameters, channels and files."""
+
+import dataclasses
+from collections.abc import Mapping
+from typing import ClassVar
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PyTree
+
+from jaxquad._core import as_float, broadcast_gain, Message, per_member, require_positive
+from jaxquad.control import Reference, Setpoint
+from jaxquad.records import AXES
+
+from .._filters import BandwidthNotch, Butterworth, Filter, FilterChain, PT1, Section
+from .._firmware import (
+    Channels,
+    Firmware,
+    joined_lines,
+    number_text,
+    Numbers,
+    OuterLoop,
+    Parameter,
+    Range,
+    rows_of_axes,
+)
+from .._law import (
+    Advance,
+    AngleLoop,
+    bounded,
+    filter_gyro,
+    FlownLoop,
+    gyro_rest,
+    low_pass_share,
+    Memories,
+    RateLoop,
+    Signal,
+    split_reference,
+    sum_of,
+)
+from ._px4_log import LOG
+
+
+_FADED = np.deg2rad(400.0)  # rad/s of error at which the integral no longer grows
+
+
+class PX4Rate(RateLoop):
+    """PX4's rate loop: rates in rad/s in, the normalised torque set-point out.
+
+        u = K P e + I - K D y' + FF r,    I += (1 - (e / 400 deg/s)^2) K I_gain T e afterwards
+
+    The derivative is taken and low-passed at the gyro's rate, and acts on the measurement alone.
+    The integral stops where the allocator gave less than was asked for (`applied`). Source:
+    docs/autopilots.md.
+
+    !!! example
+
+        ```python
+        law = PX4Rate(p=0.15, i=0.2, d=0.003, gyro=FilterChain((Butterworth(40.0),), 8000.0))
+        ```
+
+    **Arguments:** (each number is a scalar, one value per axis, or `[axes, *ensemble]`)
+
+    - `p`, `i`, `d`, `k`, `ff`: MC_xRATE_P, _I, _D, _K, _FF; ff is not multiplied by k.
+    - `gyro`: filters at the gyro's rate: notches and IMU_GYRO_CUTOFF (40 Hz).
+    - `derivative_hz`: IMU_DGYRO_CUTOFF, 0 is off.
+    - `torque_hz`: MC_YAW_TQ_CUTOFF on yaw (2 Hz), 0 is off and belongs on roll and pitch.
+    - `integral_limit`: MC_xR_INT_LIM.
+    - `dt`: of the rate loop in s, 1/IMU_GYRO_RATEMAX.
+    """
+
+    firmware: ClassVar[str] = "px4"
+    factors: ClassVar[tuple[str, ...]] = ("k",)
+    feed_forward: ClassVar[tuple[str, ...]] = ("ff",)
+    limits: ClassVar[tuple[str, ...]] = ("integral_limit", "derivative_hz", "torque_hz")
+    p: Float[Array, "..."] = per_member(rank=1, converter=as_float)
+    i: Float[Array, "..."] = per_member(rank=1, converter=as_float)
+    d: Float[Array, "..."] = per_member(rank=1, converter=as_float)
+    k: Float[Array, "..."] = per_member(rank=1, converter=as_float, default=1.0)
+    ff: Float[Array, "..."] = per_member(rank=1, converter=as_float, default=0.0)
+    gyro: FilterChain = FilterChain()
+    derivative_hz: Float[Array, "..."] = per_member(rank=1, converter=as_float, default=20.0)
+    torque_hz: Float[Array, "..."] = per_member(rank=1, converter=as_float, default=0.0)
+    integral_limit: Float[Array, "..."] = per_member(rank=1, converter=as_float, default=0.3)
+    dt: float = eqx.field(static=True, default=1 / 400)  # s
+
+    def derivative_chain(self, axis: int) -> FilterChain:
+        cutoff = float(np.broadcast_to(self.derivative_hz, (3,))[axis])
+        return FilterChain((PT1(cutoff),) if cutoff > 0 else (), self.gyro.rate_hz)
+
+    def without_gyro_filters(self) -> "PX4Rate":
+        # The derivative stays at the gyro's rate.
+        open = FilterChain((PT1(0.0),), self.gyro.rate_hz) if self.gyro.filters else FilterChain()
+        return dataclasses.replace(self, gyro=open)
+
+    @property
+    def _sections(self) -> tuple[FilterChain, tuple[Section, ...]]:
+        """The gyro's filters, and the difference at their rate with its low-pass."""
+        gyro = self.gyro if self.gyro.filters else FilterChain((), 1 / self.dt)
+        slope = jnp.full((), gyro.rate_hz, self.p.dtype)
+        difference = Section(slope, -slope, jnp.zeros_like(slope))
+        return gyro, (difference, *PT1(self.derivative_hz).sections(gyro.rate_hz))
+
+    def rest(self, zero: Signal) -> dict[str, PyTree]:
+        gyro, derivative = self._sections
+        return {"gyro": gyro_rest(gyro, zero, *derivative), "integral": zero, "torque": zero}
+
+    def advance(
+        self, memory: Memories, excess: Signal, reference: Reference, measurement: Signal
+    ) -> Advance:
+        at = lambda gain: broadcast_gain(gain, measurement)
+        r, _ = split_reference(reference, measurement, self.dt)
+        chain, derivative = self._sections
+        gyro, (y, slope) = filter_gyro(chain, self.dt, memory["gyro"], measurement, *derivative)
+        error, k, integral = r - y, at(self.k), memory["integral"]
+        terms = {
+            "P": k * at(self.p) * error, "I": integral,
+            "D": -k * at(self.d) * slope, "F": at(self.ff) * r,
+        }  # fmt: skip
+        open = jnp.where(excess > _UNALLOCATED, jnp.minimum(error, 0.0), error)
+        open = jnp.where(excess < -_UNALLOCATED, jnp.maximum(open, 0.0), open)
+        fade = jnp.maximum(0.0, 1 - (open / _FADED) ** 2)
+        grown = integral + fade * k * at(self.i) * open * self.dt
+        share = low_pass_share(self.torque_hz, self.dt, measurement)
+        torque = memory["torque"] + share * (sum_of(terms) - memory["torque"])
+        integral = bounded(grown, self.integral_limit)
+        return {"gyro": gyro, "integral": integral, "torque": torque}, torque, terms
+
+
+_UNALLOCATED = 1e-6  # of the normalised torque, above which the axis counts as saturated
+
+
+class PX4Attitude(AngleLoop):
+    """PX4's attitude loop around a rate loop: angles in rad in, normalised torque out.
+
+    The rate's set-point is `p` times the error of the angle, plus a `Setpoint`'s rate, within
+    `rate_limit`. There is no integral and no derivative of the angle. The rate that the inner loop
+    sees is the difference of the measured angles over a sample. Source: docs/autopilots.md.
+
+    **Arguments:** (each number is a scalar, one value per axis, or `[axes, *ensemble]`)
+
+    - `rate`: the `PX4Rate` inside.
+    - `p`: MC_ROLL_P, MC_PITCH_P, MC_YAW_P in 1/s.
+    - `rate_limit`: MC_xRATE_MAX in rad/s, 220 deg/s by default.
+
+    **Raises:**
+
+    - `ValueError`: `p` or the limit is not above 0.
+    """
+
+    rate: PX4Rate
+    p: Float[Array, "..."] = per_member(rank=1, converter=as_float, default=4.0)
+    rate_limit: Float[Array, "..."] = per_member(
+        rank=1, converter=as_float, default=np.deg2rad(220.0)
+    )
+
+    def __check_init__(self):
+        require_positive("p", self.p, "give 1/s")
+        require_positive("rate_limit", self.rate_limit, "give rad/s")
+
+    def wanted_rate(
+        self, memory: Memories, reference: Reference, angle: Signal, rate: Signal
+    ) -> tuple[dict[str, PyTree], Signal]:
+        aim = reference.angle if isinstance(reference, Setpoint) else reference
+        wanted = broadcast_gain(self.p, angle) * (aim - angle)
+        if isinstance(reference, Setpoint):
+            wanted = wanted + reference.rate
+        return {}, bounded(wanted, self.rate_limit)
+
+
+_of = lambda end: [f"MC_{axis.upper()}RATE_{end}" for axis in AXES]
+
+
+def px4_loop(values: Mapping[str, str], *, gyro_rate_hz: float = 8000.0) -> FlownLoop[PX4Rate]:
+    """The rate loop of PX4's parameters.
+
+    **Arguments:**
+
+    - `values`: the parameters by name.
+    - `gyro_rate_hz`: at which the gyro's filters run, which no parameter says; it is rounded to a
+        multiple of the loop's.
+
+    **Raises:**
+
+    - `ValueError`: a gain is missing.
+    """
+    read = Numbers(values)
+    rate = read.number("IMU_GYRO_RATEMAX", 400.0) or 400.0
+    chain: list[Filter] = [
+        BandwidthNotch(centre, read.number(f"IMU_GYRO_NF{k}_BW", 20.0))
+        for k in (0, 1) if (centre := read.number(f"IMU_GYRO_NF{k}_FRQ", 0.0)) > 0
+    ]  # fmt: skip
+    cutoff = read.number("IMU_GYRO_CUTOFF", 40.0)
+    chain += [Butterworth(cutoff)] if cutoff > 0 else []
+    per_axis = lambda end, default=None: [read.number(name, default) for name in _of(end)]
+    law = PX4Rate(
+        p=per_axis("P"), i=per_axis("I"), d=per_axis("D"), k=per_axis("K", 1.0),
+        ff=per_axis("FF", 0.0),
+        gyro=FilterChain(tuple(chain), rate * max(1, round(gyro_rate_hz / rate))),
+        derivative_hz=read.number("IMU_DGYRO_CUTOFF", 20.0),
+        torque_hz=[0.0, 0.0, read.number("MC_YAW_TQ_CUTOFF", 0.0)],
+        integral_limit=[read.number(f"MC_{x}R_INT_LIM", 0.3) for x in "RPY"], dt=1 / rate,
+    )  # fmt: skip
+    left_out = {
+        "IMU_GYRO_DNF_EN": ("dynamic notches follow motors or spectrum", "notch"),
+        "MC_BAT_SCALE_EN": ("the torque is scaled by the battery's voltage", ""),
+    }
+    return FlownLoop(law, tuple(
+        Message(f"{name}: {what}", kind)
+        for name, (what, kind) in left_out.items() if read.number(name, 0.0) > 0
+    ))  # fmt: skip
+
+
+_ESTIMATE = 0.004  # s, from one attitude estimate to the next
+
+
+_ESTIMATE = 0.004  # s, from one attitude estimate to the next
+_ABOVE: Range = (0, np.inf)
+_ROWS = [
+    *rows_of_axes(_of("P"), "", (0.15, 0.15, 0.2), ((0.01, 0.5), (0.01, 0.6), (0, 0.6)), "p"),
+    *rows_of_axes(_of("I"), "1/s", (0.2, 0.2, 0.1), _ABOVE, "i"),
+    *rows_of_axes(_of("D"), "s", (0.003, 0.003, 0), ((0, 0.01), _ABOVE, _ABOVE), "d"),
+    *rows_of_axes(_of("K"), "", (1, 1, 1), (0.01, 5), "k"),
+    *rows_of_axes(_of("FF"), "", (0, 0, 0), _ABOVE, "ff"),
+    *rows_of_axes([f"MC_{x}R_INT_LIM" for x in "RPY"], "", (0.3,) * 3, _ABOVE, "integral_limit"),
+    *rows_of_axes(
+        [f"MC_{axis.upper()}_P" for axis in AXES], "1/s", (4, 4, 2.8),
+        ((0, 12), (0, 12), (0, 5)), "angle.p",
+    ),
+    *rows_of_axes(_of("MAX"), "deg/s", (220, 220, 200), (0, 1800), ""),
+    Parameter("MC_YAW_TQ_CUTOFF", "Hz", 2, 0, np.inf, False, "torque_hz", 2),
+    Parameter("IMU_GYRO_CUTOFF", "Hz", 40, 0, 1000, False, "gyro"),
+    Parameter("IMU_DGYRO_CUTOFF", "Hz", 20, 0, 1000, False, "derivative_hz"),
+    *(Parameter(f"IMU_GYRO_NF{k}_FRQ", "Hz", 0, 0, np.inf) for k in (0, 1)),
+    *(Parameter(f"IMU_GYRO_NF{k}_BW", "Hz", 20, 0, np.inf) for k in (0, 1)),
+    Parameter("IMU_GYRO_RATEMAX", "Hz", 400, 100, 2000, True),
+    Parameter("THR_MDL_FAC", "", 0, 0, 1),
+    Parameter("MC_AIRMODE", "", 0, 0, 2, True),
+]  # fmt: skip
+
+
+class PX4(Firmware):
+    """PX4, multicopters."""
+
+    log = LOG
+    parameters = {row.name: row for row in _ROWS}
+    unit = "torque set-point"
+    suffix = "params"
+    motor_shares = (np.sqrt(0.5), np.sqrt(0.5), 1.0)
+    averages_gyro = True
+    thrust_curve = "THR_MDL_FAC"
+    weighs_setpoint = True
+    notches = tuple((f"IMU_GYRO_NF{k}_FRQ", f"IMU_GYRO_NF{k}_BW") for k in (0, 1))
+
+    def flown_loop(self, values, version, *, throttle, tracked_hz):
+        return px4_loop(values)
+
+    def channels(self, prefix: str, axis: int) -> Channels:
+        return Channels(
+            unfiltered=[f"sensor_combined.gyro_rad[{k}]" for k in range(3)],
+            motors=[f"actuator_motors.control[{k}]" for k in range(4)],
+            output={f"vehicle_torque_setpoint.xyz[{axis}]": 1.0},
+        )
+
+    def what_to_fly(self, axis: str) -> str:
+        return (
+            "Fly this: SDLOG_PROFILE with high rate, hover high and clear in Position mode, and "
+            f"strong and quick {axis} stick in Acro for 20 s, or the autotune (MC_AT_EN) on this "
+            "axis"
+        )
+
+    def angle_loop(self, values, axis, dt, *, levelled):
+        name = f"MC_{AXES[axis].upper()}_P"
+        return OuterLoop.of(values, name, 1.0, 0.5 * _ESTIMATE + dt, closed=True)
+
+    def notch(self, centre_hz: float, second: float) -> Filter:
+        return BandwidthNotch(centre_hz, second)
+
+    def notch_width(self, centre_hz: float, half_width: float) -> float:
+        return float(np.rint(2 * half_width * centre_hz))
+
+    def parameter_file(self, values, title, *, version, profile, raised, words):
+        rows = [f"# {title}"] if title else []
+        rows += ["#", "# Vehicle-Id Component-Id Name Value Type"]
+        for row, value, other in values:
+            rows.append(f"# {row.name} was {number_text(other, row.integer)}")
+            kind = 6 if row.integer else 9  # int32, float
+            rows.append(f"1\t1\t{row.name}\t{number_text(value, row.integer)}\t{kind}")
+        return joined_lines(rows)
+
+
+FIRMWARE = PX4()

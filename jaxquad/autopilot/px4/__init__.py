@@ -1,1 +1,0 @@
-"""PX4: `_log` says what its channels mean, `_firmware` what it flies."""
