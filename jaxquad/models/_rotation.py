@@ -60,9 +60,7 @@ def quaternion_from_euler(euler: Float[Array, " 3 *ensemble"]) -> Float[Array, "
     )
 
 
-def euler_from_quaternion(
-    quaternion: Float[Array, " 4 *ensemble"],
-) -> Float[Array, " 3 *ensemble"]:
+def euler_from_quaternion(quaternion: Float[Array, " 4 *ensemble"]) -> Float[Array, " 3 *ensemble"]:
     """ZYX Euler angles in rad of a unit `quaternion`, with a finite gradient at every attitude."""
     w, x, y, z = quaternion
     limit = 1 - jnp.finfo(quaternion.dtype).eps  # arcsin has an infinite slope at 1
