@@ -87,11 +87,11 @@ class ADRCStage(NamedTuple):
 
     def cells(self) -> list[str]:
         """The numbers as both tables print them, the crossover in Hz."""
-        whole = ["-" if np.isnan(x) else f"{x:.0f}" for x in self[:3]]
+        integers = ["-" if np.isnan(x) else f"{x:.0f}" for x in self[:3]]
         hertz = self.crossover / (2 * np.pi)
         ends = [f"{x:.2f}" for x in (self.rejection, self.noise)]
         share = f"{100 * self.stable:.1f}"
-        return [*whole, share, f"{self.peak:.2f}", f"{self.resonance:.2f}", f"{hertz:.1f}", *ends]
+        return [*integers, share, f"{self.peak:.2f}", f"{self.resonance:.2f}", f"{hertz:.1f}", *ends]
 
 
 @dataclasses.dataclass(frozen=True)
