@@ -87,11 +87,10 @@ class ADRCStage(NamedTuple):
 
     def cells(self) -> list[str]:
         """The numbers as both tables print them, the crossover in Hz."""
-        integers = ["-" if np.isnan(x) else f"{x:.0f}" for x in self[:3]]
+        tuned = ["-" if np.isnan(x) else f"{x:.0f}" for x in self[:3]]
+        peaks, ends = ([f"{x:.2f}" for x in part] for part in (self[4:6], self[7:]))
         hertz = self.crossover / (2 * np.pi)
-        ends = [f"{x:.2f}" for x in (self.rejection, self.noise)]
-        share = f"{100 * self.stable:.1f}"
-        return [*integers, share, f"{self.peak:.2f}", f"{self.resonance:.2f}", f"{hertz:.1f}", *ends]
+        return [*tuned, f"{100 * self.stable:.1f}", *peaks, f"{hertz:.1f}", *ends]
 
 
 @dataclasses.dataclass(frozen=True)
