@@ -92,16 +92,12 @@ class Settings:
         Raises SettingsError for an unknown key, with the most similar known one, for a required
         key that is missing, and for values that cannot be.
         """
+        fields = dataclasses.fields(cls)  # pyright: ignore[reportArgumentType]
+        required = [x.name for x in fields if x.default is x.default_factory is _REQUIRED]
         try:
             check_keys(content, cls.options())
-            missing = [
-                field.name
-                for field in dataclasses.fields(cls)  # pyright: ignore[reportArgumentType]
-                if field.default is field.default_factory is _REQUIRED and field.name not in content
-            ]
-            if missing:
-                keys = " and ".join(f"`{key}`" for key in missing)
-                raise SettingsError(f"{keys} must be given")
+            if missing := [f"`{key}`" for key in required if key not in content]:
+                raise SettingsError(f"{' and '.join(missing)} must be given")
             return cls(**content)
         except SettingsError as error:
             raise within_file(where, error) from error
@@ -280,12 +276,11 @@ def _band(value: object) -> Pair:
 def _segments(value: object) -> tuple[Pair, ...]:
     if not _is_list(value):
         raise ValueError("give a list of [start, stop], in s")
-    spans = []
-    for part in value:
-        if (span := _span(part)) is None:
+    spans = [_span(part) for part in value]
+    for part, span in zip(value, spans, strict=True):
+        if span is None:
             raise ValueError(f"{part!r} is no START:STOP in s: write 22:30.5, the start first")
-        spans.append(span)
-    return tuple(spans)
+    return tuple(filter(None, spans))
 
 
 def _by_name(value: object, advice: str) -> list[tuple[object, Any, Any]]:
