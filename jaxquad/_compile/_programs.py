@@ -195,14 +195,25 @@ class _Program:
 
     def _find(self, arrays: Sequence[Numbers], folder: Path) -> _Call:
         """From the disk or the compiler; by `jax.jit` where it has no name."""
-        name = self._name(arrays)
+        structure, others = self._settings
+        args = jax.tree.unflatten(structure, _together(arrays, others))
+        name = _name(self._function, self._options(), args)
         if name is None:
             return self._by_jit
         path = folder / name
         program = _read(path, len(arrays)) if path.is_file() else None
         if program is not None:
             return program
-        lowered, form = self._lower(name, arrays)
+        forms: list[_Form] = []
+
+        def traced(arrays: Sequence[Any]) -> list[Any]:
+            results, form = self._run(arrays)
+            forms.append(form)
+            return results
+
+        traced.__name__ = _stem(name)  # JAX's own files of a program begin with it
+        jit = jax.jit(traced, compiler_options=self._options() or None)
+        lowered, [form, *_] = jit.lower(list(arrays)), forms
         _remove_of_jax(name)  # what JAX takes from its own files cannot be written again
         run = lowered.compile()
         _remove_of_jax(name)
@@ -213,22 +224,99 @@ class _Program:
         results, form = self.plain(arrays)
         return form.filled(results)
 
-    def _lower(self, name: str, arrays: Sequence[Numbers]) -> tuple[jax.stages.Lowered, _Form]:
-        forms: list[_Form] = []
 
-        def run(arrays: Sequence[Any]) -> list[Any]:
-            results, form = self._run(arrays)
-            forms.append(form)
-            return results
+def _is_outermost(leaves: list) -> bool:
+    return get_opaque_trace_state() == _OUTSIDE and not any(isinstance(x, Tracer) for x in leaves)
 
-        run.__name__ = _stem(name)  # JAX's own files of a program begin with it
-        jit = jax.jit(run, compiler_options=self._options() or None)
-        return jit.lower(list(arrays)), forms[0]
 
-    def _name(self, arrays: Sequence[Numbers]) -> str | None:
-        structure, others = self._settings
-        args = jax.tree.unflatten(structure, _together(arrays, others))
-        return _name(self._function, self._options(), args)
+with jax.ensure_compile_time_eval():  # whatever is traced while this is imported
+    _OUTSIDE = get_opaque_trace_state()
+
+
+_RAISED = "_EquinoxRuntimeError: "  # in the message of what `eqx.error_if` has raised
+_CALLBACKS = logging.getLogger("jax._src.callback")
+
+
+class _Silence:
+    """JAX logs what a callback raises, beside raising it."""
+
+    def __enter__(self) -> None:
+        _CALLBACKS.addFilter(self)
+
+    def __exit__(self, *_: object) -> None:
+        _CALLBACKS.removeFilter(self)
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        return False
+
+
+def _folder() -> Path | None:
+    """Where programs are kept; None without `enable_compile_cache`, and but for a single CPU."""
+    folder = own_folder()
+    alone = folder is not None and jax.default_backend() == "cpu" and jax.device_count() == 1
+    return folder if alone else None
+
+
+def _remove_of_jax(name: str) -> None:
+    folder = jax.config.values["jax_compilation_cache_dir"]
+    for path in Path(folder).glob(f"jit_{_stem(name)}-*") if folder else ():
+        path.unlink(missing_ok=True)
+
+
+def _stem(name: str) -> str:
+    """The name of a function whose program is kept in the file of that name."""
+    return name.removesuffix("-cache").replace("-", "_")
+
+
+class _Place(int):
+    """Of an array among a program's results."""
+
+
+_LAPACK = "lapack_"  # in the names of its functions, which only a process that traces them loads
+
+
+def _write(path: Path, run: jax.stages.Compiled, form: _Form) -> None:
+    """The folder is this process's own; others get the file whole."""
+    try:
+        if _LAPACK in (run.as_text() or ""):
+            return
+        content, *_ = serialize(run)
+        count = run.out_tree.num_leaves
+        path.write_bytes(pickle.dumps((content, count, form.filled([*map(_Place, range(count))]))))
+    except Exception as error:  # JAX calls its own interface experimental
+        warnings.warn(f"a program is not kept for the next process: {error}", stacklevel=2)
+
+
+def _read(path: Path, arguments: int) -> _Call | None:
+    try:
+        content, count, result = pickle.loads(path.read_bytes())
+        taken = jax.tree.structure((([0] * arguments,), {}))
+        results = jax.tree.structure([0] * count)
+        run = deserialize_and_load(content, taken, results, None, jax.devices()[:1])
+    except Exception as error:  # damaged, or of another making
+        warnings.warn(f"{path.name} cannot be read ({error}): it is compiled anew", stacklevel=2)
+        return None
+    leaves, structure = jax.tree.flatten(result)
+    others = tuple([None if isinstance(x, _Place) else (type(x), x) for x in leaves])
+    form = _Form(structure, others)
+    return lambda arrays: form.filled(run(list(arrays)))
+
+
+def _kinds(arrays: Sequence[Numbers]) -> tuple:
+    """What tells programs of the same settings apart."""
+    return tuple(map(_kind, arrays)), thread_settings(), compilers().switches()
+
+
+def _kind(array: Any) -> tuple:
+    """Of an array, all but its numbers."""
+    kind = jax.typeof(array)
+    return kind.shape, kind.dtype, kind.weak_type
+
+
+def _name(self, arrays: Sequence[Numbers]) -> str | None:
+    structure, others = self._settings
+    args = jax.tree.unflatten(structure, _together(arrays, others))
+    return _name(self._function, self._options(), args)
 
 
 def _is_outermost(leaves: list) -> bool:
@@ -332,7 +420,15 @@ def _name(function: Callable[..., PyTree], options: dict, args: PyTree) -> str |
     settings = sorted((k, v) for k, v in jax.config.values.items() if "cache" not in k)
     prefixes = ("XLA_", "JAXQUAD_K")
     environment = sorted((k, v) for k, v in os.environ.items() if k.startswith(prefixes))
-    kinds = jax.tree.map(_written, args), thread_settings(), compilers().switches()
+
+    def written(leaf: object) -> object:
+        """In words, for a file's name."""
+        if not isinstance(leaf, _ARRAYS):
+            return type(leaf), leaf
+        shape, dtype, weak = _kind(leaf)
+        return shape, str(dtype), weak
+
+    kinds = jax.tree.map(written, args), thread_settings(), compilers().switches()
     what = kinds, sorted(options.items()), settings, environment
     with io.BytesIO() as file:
         try:
