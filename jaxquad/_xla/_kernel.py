@@ -168,10 +168,8 @@ def _owner(x: ir.Value) -> Op | ir.Block:
 
 
 def _forward_passes(call: Op, program: mlir.ModuleContext) -> Iterator[Op]:
-    """The calls whose results a call takes, without their marks where nothing else was asked of.
-
-    What is in a function takes them as its arguments; its forward pass is in one written before.
-    """
+    """The calls whose results a call takes. What is in a function takes them as its arguments; its
+    forward pass is in one written before."""
     owners = [_owner(operand) for operand in call.operands]
     yield from filter(_is_plain_call, owners)
     alone = isinstance(program.axis_context, mlir.ShardingContext)  # then all functions are for one
