@@ -74,10 +74,10 @@ class Settings:
             texts[key] = flag, " ".join(text.split()), group
         options = {}
         for one in dataclasses.fields(cls):  # pyright: ignore[reportArgumentType]
-            if hasattr(one.type, "__metadata__"):
+            for kind in getattr(one.type, "__metadata__", ()):
                 flag, text, group = texts.get(one.name, ("", "", ""))
                 flag = flag or f"--{one.name.replace('_', '-')}"
-                options[one.name] = Option(one.type.__metadata__[0], text, group, flag)
+                options[one.name] = Option(kind, text, group, flag)
         return options
 
     @classmethod
@@ -212,8 +212,9 @@ def _one_of(*choices: str) -> Kind:
 
 
 def _is_number(value: object) -> TypeGuard[float | int]:
-    is_real = isinstance(value, int | float) and not isinstance(value, bool)
-    return is_real and math.isfinite(value)
+    if not isinstance(value, int | float) or isinstance(value, bool):
+        return False
+    return math.isfinite(value)
 
 
 def _is_list(value: object) -> TypeGuard[Sequence[Any]]:
