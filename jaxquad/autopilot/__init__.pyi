@@ -7,6 +7,7 @@ from ._files import (
     WordChange as WordChange,
     write_parameter_files as write_parameter_files,
 )
+from ._filter_bank import filter_choices as filter_choices
 from ._filters import (
     ardupilot_notch as ardupilot_notch,
     BandwidthNotch as BandwidthNotch,
@@ -36,6 +37,7 @@ from ._firmware import (
     rows_of_axes as rows_of_axes,
 )
 from ._flight_channels import (
+    best_filters as best_filters,
     FlightChannels as FlightChannels,
     FlownAutopilot as FlownAutopilot,
     read_channels_if_any as read_channels_if_any,
@@ -43,7 +45,6 @@ from ._flight_channels import (
     settings_of as settings_of,
 )
 from ._flown_law import (
-    best_filters as best_filters,
     flown_law as flown_law,
     FlownLaw as FlownLaw,
     loop_of_law as loop_of_law,
@@ -83,7 +84,6 @@ from ._page import (
 from ._parameters import (
     change_filters as change_filters,
     check_ranges as check_ranges,
-    filter_choices as filter_choices,
     find_parameter as find_parameter,
     firmware_of as firmware_of,
     flown_loop as flown_loop,

@@ -6,22 +6,14 @@ from typing import TypeVar
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
 from jaxquad._core import Number
 from jaxquad.records import AXES
 from jaxquad.records.firmware import firmware_names
 
-from ._filters import Butterworth, Filter
-from ._firmware import (
-    cutoff_of,
-    FilterChoice,
-    FilterOption,
-    Firmware,
-    firmware_named,
-    LowPass,
-    Parameter,
-)
+from ._filters import Butterworth
+from ._firmware import firmware_named, Parameter
 from ._law import AngleLoop, FirmwareLoop, FlownLoop, RateLoop
 
 
@@ -29,16 +21,16 @@ Law = TypeVar("Law", bound=FirmwareLoop)
 
 
 class _Tables(Mapping[str, Mapping[str, Parameter]]):
-    def __getitem__(self, name: str) -> Mapping[str, Parameter]:
-        if name not in firmware_names():
-            raise KeyError(name)
-        return firmware_named(name).parameters
-
     def __iter__(self) -> Iterator[str]:
         return iter(firmware_names())
 
     def __len__(self) -> int:
         return len(firmware_names())
+
+    def __getitem__(self, name: str) -> Mapping[str, Parameter]:
+        if name not in firmware_names():
+            raise KeyError(name)
+        return firmware_named(name).parameters
 
 
 PARAMETERS: Mapping[str, Mapping[str, Parameter]] = _Tables()
@@ -58,11 +50,7 @@ def find_parameter(firmware: str, name: str) -> Parameter:
 
 
 def store_parameters(firmware: str, values: Mapping[str, Number]) -> dict[str, float]:
-    """What the firmware stores of these values: whole numbers, or single precision.
-
-    **Arguments:**
-
-    - `values`: by the parameters' names.
+    """What the firmware stores of values by their names: whole numbers, or single precision.
 
     **Raises:**
 
@@ -82,8 +70,8 @@ def check_ranges(firmware: str, values: Mapping[str, Number]) -> tuple[str, ...]
     beyond = []
     for name, value in values.items():
         row = find_parameter(firmware, name)
+        unit = f" {row.unit}" if row.unit else ""
         if not row.low * (1 - 1e-6) <= value <= row.high * (1 + 1e-6):
-            unit = f" {row.unit}" if row.unit else ""
             beyond.append(
                 f"{name} is {value:g}{unit}, beyond its documented range of {row.low:g} to "
                 f"{row.high:g}{unit}."
@@ -97,11 +85,10 @@ def firmware_of(law: FirmwareLoop) -> str:
 
 
 def list_parameters(law: FirmwareLoop, *, axes: Sequence[str] = AXES) -> dict[str, float]:
-    """The parameters that a law amounts to, not rounded.
+    """The parameters that a law amounts to, not rounded: gains, filters, those of an angle loop.
 
-    Gains and filters of a law, and the angle loop's where it has one; parameters of all axes, such
-    as a gyro filter, too. Not listed: Betaflight's filters, because their parameters are ranges
-    over the throttle.
+    Parameters of all axes, such as a gyro filter, are listed, too. Not listed: Betaflight's
+    filters, because their parameters are ranges over the throttle.
 
     **Arguments:**
 
@@ -195,11 +182,6 @@ def _replaced(law: Law, field: str, value: Array) -> Law:
     return dataclasses.replace(law, **{first: part})
 
 
-_STEPS = 8  # of a cutoff, to either side of the one that flew
-_HIGHEST = 0.45  # of the rate at which a filter runs
-_WIDTHS = (0.1, 0.2)  # half of a notch, of its centre
-
-
 def flown_loop(
     firmware: str,
     values: Mapping[str, str],
@@ -212,7 +194,6 @@ def flown_loop(
 
     **Arguments:**
 
-    - `firmware`: "betaflight", "px4", "ardupilot", or one that is registered.
     - `values`, `version`: as `jq.records.read_settings` returns them.
     - `throttle`: 0 to 1, at which Betaflight's dynamic cutoffs and ArduPilot's notches are.
     - `tracked_hz`: as in `ardupilot_loop`.
@@ -226,94 +207,55 @@ def flown_loop(
     )
 
 
-def filter_choices(
-    firmware: str,
-    values: Mapping[str, str],
-    version: Sequence[int] = (),
-    *,
-    axis: int = 0,
-    throttle: float = 0.3,
-    change: float = 3.0,
-    line_hz: float | None = None,
-) -> tuple[FilterChoice, ...]:
-    """The low-passes of gyro and D term that are on, and a notch at a line of the gyro's noise.
-
-    Their kinds stay. A dynamic low-pass is moved as a whole, its lowest and its highest cutoff by
-    one factor. A notch is offered where one of the firmware's static notches is off.
-
-    **Arguments:**
-
-    - `firmware`, `values`, `version`, `throttle`: as in `flown_loop`.
-    - `axis`: 0, 1 or 2 for roll, pitch or yaw, whose own filters are offered.
-    - `change`: factor by which a cutoff may rise or fall, within its documented range.
-    - `line_hz`: of the line; None offers no notch.
-    """
-    kind = firmware_named(firmware)
-    loop = flown_loop(firmware, values, version, throttle=throttle)
-    choices = [
-        _low_pass_choice(firmware, low_pass, change)
-        for low_pass in kind.low_passes(loop, values, version, axis, throttle)
-    ]
-    if line_hz is not None:
-        choices += _notch_choices(kind, values, kind.notch_rate_hz(loop), line_hz)
-    return tuple(choice for choice in choices if len(choice.options) > 1)
-
-
-def _low_pass_choice(firmware: str, low_pass: LowPass, change: float) -> FilterChoice:
-    """Cutoffs that the firmware can store: whole numbers, or three digits in single precision."""
-    stage, flown, filter, rate_hz, shared = low_pass
-    cutoff, reach = cutoff_of(filter), np.linspace(0.0, np.log(change), _STEPS + 1)[1:]
-    options: dict[tuple[float, ...], FilterOption] = {}
-    for factor in [*np.exp(-reach[::-1]), 1.0, *np.exp(reach)]:
-        if factor == 1:
-            options[tuple(flown.values())] = FilterOption(dict(flown), filter)
-            continue
-        wanted = {name: float(f"{factor * value:.3g}") for name, value in flown.items()}
-        stored = store_parameters(firmware, wanted)
-        scaled = sum(stored.values()) / sum(flown.values()) * cutoff
-        rows = [find_parameter(firmware, name) for name in stored]
-        inside = all(
-            max(row.low, 1.0) <= value <= row.high
-            for row, value in zip(rows, stored.values(), strict=True)
-        )
-        if inside and scaled < _HIGHEST * rate_hz:
-            assert dataclasses.is_dataclass(filter) and not isinstance(filter, type)
-            moved = dataclasses.replace(filter, **{"cutoff_hz": scaled})
-            assert isinstance(moved, Filter)
-            options[tuple(stored.values())] = FilterOption(dict(stored), moved)
-    at = [*options].index(tuple(flown.values()))
-    return FilterChoice(stage, shared, rate_hz, tuple(options.values()), at)
-
-
-def _notch_choices(
-    firmware: Firmware, values: Mapping[str, str], rate_hz: float, line_hz: float
-) -> list[FilterChoice]:
-    """A static notch that is off, on the line: narrow or wide."""
-    line = float(np.rint(line_hz))
-    flown = zip(firmware.notches, firmware.flown_notches(values), strict=False)
-    free = [(names, second) for names, (centre, second) in flown if centre == 0]
-    if not free or line >= _HIGHEST * rate_hz:
-        return []
-    names, second = free[0]
-    options = [FilterOption(dict(zip(names, (0.0, second), strict=True)), None)]
-    for half_width in _WIDTHS:
-        pair = line, firmware.notch_width(line, half_width)
-        options.append(FilterOption(dict(zip(names, pair, strict=True)), firmware.notch(*pair)))
-    return [FilterChoice("gyro", True, rate_hz, tuple(options), 0)]
-
-
 def change_filters(
     firmware: str, values: Mapping[str, str], parameters: Mapping[str, Number]
 ) -> dict[str, str]:
-    """The values of a log as they would be with other filters.
-
-    **Arguments:**
-
-    - `firmware`, `values`: as in `flown_loop`.
-    - `parameters`: new cutoffs and notches by their names in `PARAMETERS`.
+    """The values of a log as they would be with other cutoffs and notches, by their names.
 
     **Raises:**
 
     - `ValueError`: Betaflight's header has no line for one of them.
     """
     return firmware_named(firmware).change_filters(values, parameters)
+
+
+FIELDS = ("p", "i", "d")
+Gains = Float[np.ndarray, " gains"]
+
+
+def names_by_field(firmware: str, axis: int) -> dict[str, str]:
+    """The parameters of one axis, by the field of the law that each sets."""
+    return {row.field: row.name for row in PARAMETERS[firmware].values() if row.axis == axis}
+
+
+def gains_of(law: RateLoop, axis: int) -> Gains:
+    """P, I and D of one axis."""
+    return np.array([float(np.broadcast_to(vars(law)[name], (3,))[axis]) for name in FIELDS])
+
+
+def gains_in(law: RateLoop, axis: int, parameters: Mapping[str, Number]) -> Gains:
+    """P, I and D of parameters; those that are not named stay."""
+    gains, names = gains_of(law, axis), names_by_field(law.firmware, axis)
+    for k, field in enumerate(FIELDS):
+        gains[k] = parameters.get(names.get(field, ""), gains[k])
+    return gains
+
+
+def parameters_of(law: RateLoop, axis: int, gains: Gains) -> dict[str, float]:
+    """The parameters that stand for these gains; a ceiling of D rises with D."""
+    names = names_by_field(law.firmware, axis)
+    flown = zip(FIELDS, gains, gains_of(law, axis), strict=True)
+    values = {names[field]: float(gain) for field, gain, old in flown if old > 0}
+    if (ceiling := law.d_ceiling(axis)) > 1:
+        values[names["d_max.ceiling"]] = ceiling * float(gains[2])
+    return store_parameters(law.firmware, values)
+
+
+def ceiling_in(law: RateLoop, axis: int, designs: Sequence[Mapping[str, Number]]) -> float:
+    """The most by which D can rise in flight under one of these stored sets of parameters."""
+    name, most = names_by_field(law.firmware, axis).get("d_max.ceiling", ""), law.d_ceiling(axis)
+    for design in designs:
+        base = gains_in(law, axis, design)[2]
+        if (top := design.get(name)) and base > 0:
+            most = max(most, float(top / base))
+    return most

@@ -83,20 +83,15 @@ def replay_terms(
 
     - `ValueError`: the log's interval is below the loop's.
     """
-    law = flown.law
-    if dt < 0.5 * law.interval():
+    if dt < 0.5 * flown.law.interval():
         raise ValueError(
-            f"the log's interval is {dt:g} s, below the loop's {law.interval():g} s: read the log "
-            "at the loop's rate or below"
+            f"the log's interval is {dt:g} s, below the loop's {flown.law.interval():g} s: read "
+            "the log at the loop's rate or below"
         )
-    grid = _Grid(len(setpoint), dt, law.interval())
-    r = grid.fine(setpoint, late)
-    speed = _speed(flown, grid, r, feed_forward)
-    rows = _rows(
-        r, speed, grid.fine(gyro),
-        *_moments(flown, grid, throttle, mixer_range),
-        *_restarts(grid, setpoint, integral, restart),
-    )  # fmt: skip
+    grid = _Grid(flown, len(setpoint), dt)
+    rows = grid.rows(
+        setpoint, throttle, late, feed_forward, grid.fine(gyro), mixer_range, integral, restart
+    )
     terms = _replayed(flown.without_gyro_filters(), rows)
     return {name: grid.coarse(np.asarray(term)) for name, term in terms.items()}
 
@@ -124,79 +119,72 @@ def fly_again(
 
     **Returns:** the rate before the gyro's filters in rad/s, at the log's samples.
     """
-    law = flown.law
-    grid = _Grid(len(setpoint), dt, law.interval())
-    r = grid.fine(setpoint, late)[:, None]
-    forward = None if feed_forward is None else np.asarray(feed_forward)[:, None]
-    added = np.zeros_like(r) if injected is None else grid.fine(injected, late)[:, None]
-    rows = _rows(
-        r, _speed(flown, grid, r, forward), added, *_moments(flown, grid, throttle, None),
-        np.zeros_like(r), np.zeros(len(r), bool),
-    )  # fmt: skip
-    wait = max(int(np.floor(plant.delay / law.interval() + 1e-9)), 0)
-    rates = _flown_again(flown, _held_step(plant, law.interval()), wait, rows)
-    return grid.coarse(np.asarray(rates)[:, 0])
+    from scipy.linalg import expm
+
+    dt_loop = flown.law.interval()
+    grid, column = _Grid(flown, len(setpoint), dt), lambda x: np.asarray(x)[:, None]
+    added = np.zeros_like(setpoint) if injected is None else injected
+    forward = None if feed_forward is None else column(feed_forward)
+    rows = grid.rows(column(setpoint), throttle, late, forward, grid.fine(column(added), late))
+    # Exactly over a sample, with its part by which the command comes late: torque, rate, command.
+    lag, late_part = max(plant.lag, 1e-3 * dt_loop), plant.delay % dt_loop
+    generator = np.zeros((3, 3))
+    generator[0, 0], generator[0, 2] = -1 / lag, plant.gain / lag
+    generator[1, 0], generator[1, 1] = 1.0, -plant.damping
+    over = lambda span: expm(span * generator)
+    rest = over(dt_loop - late_part)
+    before = rest[:2, :2] @ over(late_part)[:2, 2]
+    step = _Step(over(dt_loop)[:2, :2], before, rest[:2, 2])
+    wait = max(int(np.floor(plant.delay / dt_loop + 1e-9)), 0)
+    return grid.coarse(np.asarray(_flown_again(flown, step, wait, rows))[:, 0])
 
 
 class _Grid:
     """The loop's samples in the span of a log, and signals on either."""
 
-    def __init__(self, count: int, dt: float, interval: float):
-        self.log = dt * np.arange(count)
-        self.interval = interval
-        self.loop = interval * np.arange(int(np.floor(self.log[-1] / interval + 1e-6)) + 1)
+    def __init__(self, flown: FlownLoop, count: int, dt: float):
+        self.flown, self.log, self.interval = flown, dt * np.arange(count), flown.law.interval()
+        size = int(np.floor(self.log[-1] / self.interval + 1e-6)) + 1
+        self.loop = self.interval * np.arange(size)
 
     def fine(self, signal: Samples | Series, late: float = 0.0) -> np.ndarray:
         """At the loop's samples; what is `late` acts so long after its stamp."""
-        at, signal = self.loop - late, np.asarray(signal, float)
-        if signal.ndim == 1:
-            return np.interp(at, self.log, signal)
-        return np.stack([np.interp(at, self.log, column) for column in signal.T], axis=1)
+        return _straight(self.loop - late, self.log, np.asarray(signal, float))
 
     def coarse(self, signal: np.ndarray) -> np.ndarray:
         """At the log's samples, of a series that may have been padded."""
-        signal = signal[: self.loop.size]
-        if signal.ndim == 1:
-            return np.interp(self.log, self.loop, signal)
-        return np.stack([np.interp(self.log, self.loop, column) for column in signal.T], axis=1)
+        return _straight(self.log, self.loop, signal[: self.loop.size])
+
+    def rows(
+        self, setpoint: Samples, throttle: Series, late: float, feed_forward: Samples | None,
+        rate: np.ndarray, mixer_range: Series | None = None, integral: Samples | None = None,
+        restart: float = 1.0,
+    ) -> "_Row":  # fmt: skip
+        """What the law sees, up to a whole number of blocks by the last samples."""
+        flown, r = self.flown, self.fine(setpoint, late)
+        speed = np.diff(r, axis=0, prepend=r[:1]) / self.interval
+        if feed_forward is not None:
+            speed = flown.setpoint_speed(speed, self.fine(feed_forward))
+        # Throttle, anti-gravity's surge and the integral's share are of the loop before.
+        before, surge = self.fine(throttle, self.interval), flown.surge(self.fine(throttle))
+        share = np.ones_like(before)
+        if mixer_range is not None:
+            share = flown.integral_share(self.fine(mixer_range, self.interval))
+        start, anew = np.zeros_like(r), np.zeros(len(r), bool)
+        if integral is not None:
+            start = self.fine(integral, self.interval)  # what the law adds to at this sample
+            anew = np.arange(len(r)) % max(1, round(restart / self.interval)) == 0
+        surge = np.concatenate([[0.0], surge[:-1]])
+        more = -(-len(r) // _BLOCK) * _BLOCK - len(r)
+        pad = lambda x: jnp.asarray(np.concatenate([x, np.repeat(x[-1:], more, axis=0)]))
+        return _Row(*map(pad, (r, speed, rate, before, surge, share, start, anew)))
 
 
-def _speed(
-    flown: FlownLoop, grid: _Grid, r: np.ndarray, feed_forward: Samples | None
-) -> np.ndarray:
-    """The set-point's speed in rad/s^2."""
-    slope = np.diff(r, axis=0, prepend=r[:1]) / grid.interval
-    return slope if feed_forward is None else flown.setpoint_speed(slope, grid.fine(feed_forward))
-
-
-def _moments(
-    flown: FlownLoop, grid: _Grid, throttle: Series, mixer_range: Series | None
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Throttle, anti-gravity's surge and the integral's share: of the loop before, as they act."""
-    x = grid.fine(throttle, grid.interval)
-    surge = flown.surge(grid.fine(throttle))
-    share = np.ones_like(x)
-    if mixer_range is not None:
-        share = flown.integral_share(grid.fine(mixer_range, grid.interval))
-    return x, np.concatenate([[0.0], surge[:-1]]), share
-
-
-def _restarts(
-    grid: _Grid, like: Samples, integral: Samples | None, restart: float
-) -> tuple[np.ndarray, np.ndarray]:
-    if integral is None:
-        return np.zeros((grid.loop.size, *np.shape(like)[1:])), np.zeros(grid.loop.size, bool)
-    every = max(1, round(restart / grid.interval))
-    before = grid.fine(integral, grid.interval)  # what the law adds to at this sample
-    return before, np.arange(grid.loop.size) % every == 0
-
-
-def _rows(*series: np.ndarray) -> _Row:
-    """The series of a `_Row`, up to a whole number of blocks by their last samples."""
-    count = len(series[0])
-    more = -(-count // _BLOCK) * _BLOCK - count
-    pad = lambda x: np.concatenate([x, np.repeat(x[-1:], more, axis=0)])
-    return _Row(*(jnp.asarray(pad(x)) for x in series))
+def _straight(at: np.ndarray, time: np.ndarray, signal: np.ndarray) -> np.ndarray:
+    """A series, or each column of one, at other times."""
+    if signal.ndim == 1:
+        return np.interp(at, time, signal)
+    return np.stack([np.interp(at, time, column) for column in signal.T], axis=1)
 
 
 @eqx.filter_jit
@@ -220,21 +208,6 @@ class _Step(NamedTuple):
     state: Float[np.ndarray, "2 2"]
     before: Float[np.ndarray, " 2"]
     now: Float[np.ndarray, " 2"]
-
-
-def _held_step(plant: HeldPlant, dt: float) -> _Step:
-    """Exactly, with the part of a sample by which the command comes late."""
-    from scipy.linalg import expm
-
-    lag = max(plant.lag, 1e-3 * dt)
-    generator = np.zeros((3, 3))  # torque, rate, command
-    generator[0, 0], generator[0, 2] = -1 / lag, plant.gain / lag
-    generator[1, 0], generator[1, 1] = 1.0, -plant.damping
-    late = plant.delay % dt
-    over = lambda span: expm(span * generator)
-    sample, rest = over(dt), over(dt - late)
-    before = rest[:2, :2] @ over(late)[:2, 2]
-    return _Step(sample[:2, :2], before, rest[:2, 2])
 
 
 @eqx.filter_jit

@@ -9,15 +9,7 @@ from jaxquad.excitation import check_lines, Excitation, harmonics
 from jaxquad.identify import Free, select_parameters
 
 from ._prediction import check_distinct, Noise, Prediction, unit_information
-from ._search import (
-    Criterion,
-    DOptimal,
-    gather_limits,
-    multisine_signals,
-    Plan,
-    search,
-    Trial,
-)
+from ._search import Criterion, DOptimal, gather_limits, multisine_signals, Plan, search, Trial
 
 
 class Design(eqx.Module):

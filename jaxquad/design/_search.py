@@ -163,11 +163,7 @@ def multisine_signals(
 
 
 def _log_norm(
-    phase: Lines,
-    orders: Orders,
-    amplitudes: Amplitudes,
-    points: int,
-    norm: int,
+    phase: Lines, orders: Orders, amplitudes: Amplitudes, points: int, norm: int
 ) -> tuple[float, Lines]:
     """Logarithm of the norm over all signals and points, and its gradient."""
     turned = amplitudes * np.exp(1j * phase)

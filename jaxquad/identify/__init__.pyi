@@ -100,6 +100,7 @@ from .output_error._verify import (
     Verification as Verification,
     verify as verify,
 )
+from .uncertainty._assess import MISFIT as MISFIT
 from .uncertainty._curves import (
     model_response as model_response,
     ResponseBand as ResponseBand,
@@ -118,7 +119,6 @@ from .uncertainty._draw_models import (
     known_covariance as known_covariance,
 )
 from .uncertainty._error_budget import Discrepancy as Discrepancy
-from .uncertainty._fit_remarks import MISFIT as MISFIT
 from .uncertainty._verdict import (
     Bound as Bound,
     Combination as Combination,

@@ -8,7 +8,7 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 from jaxtyping import Bool, Float
 
-from ._clock import dates_in_seconds, FEWEST
+from ._channel import dates_in_seconds, FEWEST
 from ._errors import printable, ReadError
 
 

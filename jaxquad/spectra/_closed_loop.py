@@ -13,23 +13,20 @@ from jaxquad._core import Message
 from jaxquad.models import Model
 from jaxquad.records import Record
 
-from ._checks import check_compatible, check_references, in_hertz
+from ._checks import check_compatible, check_references, COHERENT, Grid, in_hertz, Remark
 from ._estimators import Welch
 from ._frequency_response import FrequencyResponse
-from ._remarks import Remark
 from ._welch import spectral_density
 
 
 _LINES = 40  # frequencies, log-spaced
 _CYCLES = 4  # of the lowest frequency in a window
 _WINDOWS = 10  # that a record is cut into, about
-_COHERENT = 0.6  # magnitude-squared coherence from which a frequency counts
 
 _AMPLIFIED = 10.0  # factor on the relative error from which a remark is made
 _SIGNIFICANT = 0.02  # share of noise in the input from which the joint estimate is recommended
 
 Entry = Literal["set-point", "plant input"]
-_Grid = Float[np.ndarray, " frequencies"]
 
 
 class BrokenLoop(NamedTuple):
@@ -43,10 +40,10 @@ class BrokenLoop(NamedTuple):
     - `coherence`: of the reference with what it was estimated from.
     """
 
-    omega: _Grid
+    omega: Grid
     response: Complex[np.ndarray, " frequencies"]
-    error: _Grid
-    coherence: _Grid
+    error: Grid
+    coherence: Grid
 
     @property
     def crossover(self) -> float:
@@ -80,7 +77,7 @@ class BrokenLoop(NamedTuple):
         gain = level[k] + share * (level[k + 1] - level[k])
         return float(np.exp(-gain)), float(np.exp(place[k] + share * (place[k + 1] - place[k])))
 
-    def _crossing(self, level: _Grid) -> tuple[float, int, float]:
+    def _crossing(self, level: Grid) -> tuple[float, int, float]:
         falls = np.flatnonzero((level[:-1] > 0) & (level[1:] <= 0))
         if not falls.size:
             return float("nan"), 0, 0.0
@@ -148,7 +145,7 @@ def estimate_broken_loop(
             parts.append(_average(one[:, bins], other[:, bins], fine[bins]))
     table = np.array(parts, complex).reshape(-1, 4).T
     omega, closed, error, coherence = table[0].real, table[1], table[2].real, table[3].real
-    kept = (coherence >= _COHERENT) & (closed != 0) & (closed != 1)
+    kept = (coherence >= COHERENT) & (closed != 0) & (closed != 1)
     omega, closed, error, coherence = (x[kept] for x in (omega, closed, error, coherence))
     if entry == "set-point":
         loop, size = closed / (1 - closed), error / np.abs(1 - closed)
@@ -158,7 +155,7 @@ def estimate_broken_loop(
 
 
 def _average(
-    one: np.ndarray, other: np.ndarray, omega: _Grid
+    one: np.ndarray, other: np.ndarray, omega: Grid
 ) -> tuple[float, complex, float, float]:
     """Over windows and neighbours, at the frequency where the reference has its power."""
     powers = np.abs(one) ** 2

@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 
 from jaxquad._core import pytree_node
 
-from ._windows import coefficients, Layout
+from ._fourier_sums import coefficients, Layout
 
 
 _POINTS = 32  # times to the shortest window, on which overlaps are summed

@@ -7,7 +7,7 @@ from jaxtyping import ArrayLike, Float
 from jaxquad._core import Message
 from jaxquad.records import Record
 
-from ._windows import window
+from ._fourier_sums import window
 
 
 class LocalPolynomial(eqx.Module):
@@ -260,3 +260,6 @@ class JointInputOutput(eqx.Module):
     """
 
     spectra: Welch | Composite | LocalPolynomial | Periodic = LocalPolynomial()
+
+
+Estimator = Welch | Composite | LocalPolynomial | Periodic | JointInputOutput

@@ -3,19 +3,27 @@
 import functools as ft
 import itertools
 from collections.abc import Callable, Sequence
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Complex, Float, Int
+from jaxtyping import Complex, Float, Int
 
 from jaxquad.records import Record
 
-from ._checks import in_hertz
-from ._error_covariance import ErrorCovariance
-from ._remarks import DOMINATED, EARLY, Remark
+from ._checks import (
+    COHERENT,
+    DOMINATED,
+    EARLY,
+    Grid,
+    in_hertz,
+    Method,
+    Remark,
+    Response,
+    Where,
+)
+from ._frequency_response import Estimate
 
 
-COHERENT = 0.6  # magnitude-squared coherence from which a frequency is commonly used
 _CHANCE = 1.35e-3  # of calling the phase of any pair rising: 3 standard errors of a single slope
 _FALLS = 0.35  # rad over the top of the coherent band: less than an actuator's phase falls there
 _LESS = 0.05  # power of 1/omega by which a lag's magnitude falls there
@@ -23,8 +31,6 @@ _NEARLY_ALL, _MORE = 0.9, 0.5  # median shares of the input's power, output firs
 _FEWEST = 8  # frequencies for a slope
 _TOP = 4.0  # ratio of frequencies, at the top of the coherent band, over which the phase must fall
 
-Grid = Float[np.ndarray, " frequencies"]
-Pairs = Float[np.ndarray, "frequencies outputs inputs"]
 Covariance = Callable[[], Complex[np.ndarray, "frequencies frequencies"]]
 
 _RISES = (
@@ -48,37 +54,40 @@ _FED_BACK = (
 
 
 def remarks_on_feedback(
-    records: Sequence[Record],
-    method: Literal["direct", "joint"],
-    omega: Grid,
-    response: Complex[np.ndarray, "frequencies outputs inputs"],
-    error: Pairs,
-    coherence: Pairs,
-    direct: Pairs,
-    names: tuple[Sequence[str], Sequence[str]],
-    errors: ErrorCovariance | None = None,
+    records: Sequence[Record], method: Method, estimate: Estimate
 ) -> tuple[Remark, ...]:
-    """Remarks on feedback that a user of the response has to know; `names` of outputs and inputs.
+    """Remarks on feedback that a user of the response has to know.
 
-    `direct` is the coherence from input to output, `coherence` that of the estimate, `errors` those
-    of the response; without them, its points count as independent.
+    Points of a response whose errors overlapping windows correlate count as independent.
     """
     from scipy.special import ndtri
 
-    remarks, clear = [], float(ndtri(1 - _CHANCE / (len(names[0]) * len(names[1]))))
-    for (o, output), (i, source) in itertools.product(*map(enumerate, names)):
-        pair = output, source
-        if method == "joint":
-            remarks += _explained_by_reference(omega, coherence[:, o, i], direct[:, o, i], pair)
-        finite = np.isfinite(response[:, o, i])
-        values = np.where(finite, response[:, o, i], 1.0)
-        doubt = np.where(finite, error[:, o, i], np.inf)
-        coherent = np.where(finite, coherence[:, o, i], 0.0)
+    outputs, inputs, omega = records[0].output_names, records[0].input_names, estimate.omega
+    remarks, clear = [], float(ndtri(1 - _CHANCE / (len(outputs) * len(inputs))))
+    for (o, output), (i, source) in itertools.product(enumerate(outputs), enumerate(inputs)):
+        pair, place = (output, source), (slice(None), o, i)
+        direct, finite = estimate.direct_coherence[place], np.isfinite(estimate.response[place])
+        dominated = dominated_by_feedback(direct, estimate.coherence[place])
+        if method == "joint" and 2 * np.sum(dominated) > np.sum(direct >= COHERENT):
+            text = (
+                "feedback-dominated: input and output are coherent at "
+                f"{np.sum(direct >= COHERENT)} frequencies, but at {np.sum(dominated)} of them, "
+                f"{in_hertz(omega[dominated])}, the reference explains neither. There the "
+                "controller feeds back noise, and the record holds no information on the plant. "
+                "Excite these frequencies by the reference"
+            )
+            remarks.append(Remark(text, pair=pair, kind=DOMINATED))
+        values = np.where(finite, estimate.response[place], 1.0)
+        doubt = np.where(finite, estimate.random_error[place], np.inf)
+        coherent = np.where(finite, estimate.coherence[place], 0.0)
         slope = phase_slope(omega, values, doubt, coherent)
         if slope is None:
             continue
         # What the phase at the top of the coherent band says, where it falls as no actuator's does.
-        covariance = None if errors is None else ft.partial(errors.between, (o, i), (o, i))
+        errors = estimate.errors
+        covariance = (
+            None if errors.windows is not None else ft.partial(errors.between, (o, i), (o, i))
+        )
         rises, lead = slope.rises(values, covariance, clear), 1e3 * slope.value
         used = omega[coherent >= COHERENT]
         if method == "joint":
@@ -86,7 +95,17 @@ def remarks_on_feedback(
             continue
         signals = [np.stack([x.outputs[:, o], x.inputs[:, i]]) for x in records]
         share = share_from_output(signals, records[0].dt, used)
-        by_controller = _is_made_by_controller(omega, values, doubt, coherent, share)
+        # Whether the output makes nearly all of the input at most of the coherent frequencies. The
+        # same holds of a plant whose answer is logged beside its cause, as far as nothing else
+        # moves either. It lags: where the output makes the input, its phase and magnitude fall.
+        # Where they do, the input's past must follow the output's, too.
+        by_controller = np.median(share.output_first) > _NEARLY_ALL
+        if by_controller and np.median(share.input_first) <= _MORE:
+            level = np.zeros(omega.size)
+            level[coherent >= COHERENT] = share.output_first > _NEARLY_ALL
+            moved = phase_slope(omega, values, doubt, level)
+            by_controller = moved is not None and moved.value * moved.span >= -_FALLS
+            by_controller = by_controller and moved.order >= -_LESS
         if rises:
             where = used if by_controller else omega[slope.top]
             remarks.append(Remark(_RISES.format(lead=lead), where, pair, DOMINATED))
@@ -97,22 +116,7 @@ def remarks_on_feedback(
     return tuple(dict.fromkeys(remarks))
 
 
-def _explained_by_reference(
-    omega: Grid, coherence: Grid, direct: Grid, pair: tuple[str, str]
-) -> list[Remark]:
-    dominated = dominated_by_feedback(direct, coherence)
-    if 2 * np.sum(dominated) <= np.sum(direct >= COHERENT):
-        return []
-    text = (
-        f"feedback-dominated: input and output are coherent at {np.sum(direct >= COHERENT)} "
-        f"frequencies, but at {np.sum(dominated)} of them, {in_hertz(omega[dominated])}, the "
-        "reference explains neither. There the controller feeds back noise, and the record holds "
-        "no information on the plant. Excite these frequencies by the reference"
-    )
-    return [Remark(text, pair=pair, kind=DOMINATED)]
-
-
-def dominated_by_feedback(direct: Grid, by_reference: Grid) -> Bool[np.ndarray, " frequencies"]:
+def dominated_by_feedback(direct: Grid, by_reference: Grid) -> Where:
     """Where input and output are coherent although the reference explains neither."""
     return (direct >= COHERENT) & (by_reference < COHERENT)
 
@@ -129,7 +133,7 @@ class PhaseSlope(NamedTuple):
 
     def rises(
         self,
-        response: Complex[np.ndarray, " frequencies"],
+        response: Response,
         covariance: Covariance | None = None,
         clear: float = 3.0,
     ) -> bool:
@@ -148,9 +152,7 @@ class PhaseSlope(NamedTuple):
         return bool(self.value > clear * np.sqrt(variance))
 
 
-def phase_slope(
-    omega: Grid, response: Complex[np.ndarray, " frequencies"], error: Grid, coherence: Grid
-) -> PhaseSlope | None:
+def phase_slope(omega: Grid, response: Response, error: Grid, coherence: Grid) -> PhaseSlope | None:
     """At the highest coherent frequency that has enough others below it; `None` without any."""
     good, top = np.flatnonzero(coherence >= COHERENT), np.zeros(0, int)
     for end in range(len(good), _FEWEST - 1, -1):
@@ -172,29 +174,6 @@ def phase_slope(
     span = float(omega[top[-1]] - omega[top[0]])
     order = np.polyfit(np.log(omega[top]), np.log(np.abs(response[top])), 1, w=np.sqrt(weight))[0]
     return PhaseSlope(top, pull, slope, float(variance), span, float(order))
-
-
-def _is_made_by_controller(
-    omega: Grid,
-    response: Complex[np.ndarray, " frequencies"],
-    error: Grid,
-    coherence: Grid,
-    share: "Share",
-) -> bool:
-    """Whether the output makes nearly all of the input at most of the coherent frequencies.
-
-    The same holds of a plant whose answer is logged beside its cause, as far as nothing else moves
-    either. It lags: where the output makes the input, its phase and magnitude fall. Where they do,
-    the input's past must follow the output's, too.
-    """
-    if np.median(share.output_first) <= _NEARLY_ALL:
-        return False
-    if np.median(share.input_first) > _MORE:
-        return True
-    level = np.zeros(omega.size)
-    level[coherence >= COHERENT] = share.output_first > _NEARLY_ALL
-    slope = phase_slope(omega, response, error, level)
-    return slope is not None and slope.value * slope.span >= -_FALLS and slope.order >= -_LESS
 
 
 _ORDER = 12  # samples of both that the model remembers
@@ -253,7 +232,19 @@ def share_from_output(
         if samples >= _ENOUGH:
             products = sum(lagged_products(x) for x in slow) / samples
             products += _ROUNDING * np.diag(np.tile(np.diag(products)[:2], _ORDER + 1))
-            shares.append(_share_at(products, omega * dt * every))
+            # By the model's response, from the innovations of output and input to the input.
+            past = np.linalg.solve(products[2:, 2:], products[2:, :2])
+            new = products[:2, :2] - products[:2, 2:] @ past
+            if not new[0, 0] > _EXACT * products[0, 0]:
+                shares.append(shares[0])
+                continue
+            late = np.exp(-1j * (omega * dt * every)[:, None] * np.arange(1, _ORDER + 1))
+            taken = np.einsum("fk,kij->fji", late, past.reshape(_ORDER, 2, 2))
+            from_output, from_input = paths = np.linalg.inv(np.eye(2) - taken)[:, 1].T
+            power = np.maximum(np.einsum("if,ij,jf->f", paths.conj(), new, paths).real, 1e-300)
+            both = new[0, 0] * np.abs(from_output + new[1, 0] / new[0, 0] * from_input) ** 2
+            alone = max(new[0, 0] - new[0, 1] ** 2 / max(new[1, 1], 1e-300), 0.0)
+            shares.append(Share(both / power, alone * np.abs(from_output) ** 2 / power))
     medians = [float(np.median(share.output_first)) for share in shares]
     best, quickest = int(np.argmax(medians)), min(1, len(shares) - 1)
     return shares[best if medians[quickest] > _CONFIRMED * medians[best] else quickest]
@@ -272,19 +263,3 @@ def lagged_products(x: Float[np.ndarray, "2 samples"]) -> Float[np.ndarray, "lag
         blocks[1:] += np.cumsum(entering - leaving, axis=0)
         sums[i, :, i + k], sums[i + k, :, i] = blocks, blocks.transpose(0, 2, 1)
     return sums.reshape(2 * p + 2, 2 * p + 2)
-
-
-def _share_at(products: Float[np.ndarray, "lags lags"], angle: Grid) -> Share:
-    """By the model's response at these angles per sample."""
-    past = np.linalg.solve(products[2:, 2:], products[2:, :2])
-    new = products[:2, :2] - products[:2, 2:] @ past
-    if not new[0, 0] > _EXACT * products[0, 0]:
-        return Share(np.zeros(angle.size), np.zeros(angle.size))
-    # From the innovations of output and input to the input.
-    late = np.exp(-1j * angle[:, None] * np.arange(1, _ORDER + 1))
-    taken = np.einsum("fk,kij->fji", late, past.reshape(_ORDER, 2, 2))
-    from_output, from_input = paths = np.linalg.inv(np.eye(2) - taken)[:, 1].T
-    power = np.maximum(np.einsum("if,ij,jf->f", paths.conj(), new, paths).real, 1e-300)
-    both = new[0, 0] * np.abs(from_output + new[1, 0] / new[0, 0] * from_input) ** 2
-    alone = max(new[0, 0] - new[0, 1] ** 2 / max(new[1, 1], 1e-300), 0.0)
-    return Share(both / power, alone * np.abs(from_output) ** 2 / power)

@@ -11,9 +11,7 @@ from jaxtyping import Bool, Complex, Float, Int
 
 from jaxquad.records import Record
 
-
-Grid = Float[np.ndarray, " frequencies"]
-Edges = Int[np.ndarray, " frequencies"]
+from ._checks import adjoint, diagonal, Grid, Levels, Pairs, Places, Responses, Where
 
 
 class Bins(NamedTuple):
@@ -87,50 +85,10 @@ def transformed_columns(record: Record, n: int) -> Float[np.ndarray, "samples ch
     return np.hstack([record.inputs[centre], outputs, record.references[centre]])
 
 
-def window_slices(omega: Grid, half_width: Grid, bins: Bins) -> tuple[Edges, Edges]:
+def window_slices(omega: Grid, half_width: Grid, bins: Bins) -> tuple[Places, Places]:
     """First bin, and one past the last, of every window."""
     first = np.searchsorted(bins.omega, omega - half_width, "left")
     return first, np.searchsorted(bins.omega, omega + half_width, "right")
-
-
-def check_bins(omega: Grid, bins: Bins, columns: int, transient: int, freedom: int) -> None:
-    """Raise `ValueError` where the records hold too few bins, or do not cover `omega`."""
-    counts = np.bincount(bins.record, minlength=bins.records)
-    spare = int(np.sum(np.maximum(counts - transient, 0)))
-    if spare < columns + freedom:
-        raise ValueError(
-            f"the records have {counts.tolist()} Fourier bins, {spare} more than their transients "
-            f"need; the local fit needs {columns + freedom}. Record longer, or use a lower order"
-        )
-    if not (omega.size and np.all(np.diff(omega) > 0)):
-        raise ValueError(
-            f"{omega.size} frequencies: give one or more, in increasing order, in rad/s"
-        )
-    if omega[0] < 0.999 * bins.omega[0] or omega[-1] > 1.001 * bins.omega[-1]:
-        raise ValueError(
-            f"the frequencies run from {omega[0]:.4g} to {omega[-1]:.4g} rad/s, but the records "
-            f"hold one cycle of {bins.omega[0]:.4g} rad/s and reach {bins.omega[-1]:.4g} rad/s. "
-            "Keep the frequencies within, or record longer"
-        )
-
-
-def smallest_widths(omega: Grid, bins: Bins, columns: int, transient: int, freedom: int) -> Grid:
-    """Half-widths in rad/s of the smallest windows with `freedom` more bins than coefficients.
-
-    `columns` is the number of coefficients of the response, `transient` that of each record.
-    """
-    least, most = np.zeros_like(omega), np.full_like(omega, bins.omega[-1])
-    grids = [bins.omega[bins.record == r] for r in range(bins.records)]
-    for _ in range(40):
-        middle = (least + most) / 2
-        spare = np.zeros(omega.size, int)
-        for grid in grids:
-            first = np.searchsorted(grid, omega - middle, "left")
-            last = np.searchsorted(grid, omega + middle, "right")
-            spare += np.maximum(last - first - transient, 0)
-        enough = spare >= columns + freedom
-        least, most = np.where(enough, least, middle), np.where(enough, middle, most)
-    return most * (1 + 1e-9)
 
 
 _UNEXCITED = 1e-12  # of an input's largest bin: below, it is rounding errors
@@ -157,25 +115,25 @@ class LocalFit(NamedTuple):
     fields are nan.
     """
 
-    response: Complex[np.ndarray, "frequencies outputs inputs"]
+    response: Responses
     effect: Complex[np.ndarray, "frequencies inputs window"]
-    boost: Float[np.ndarray, "frequencies outputs"]
-    gain: Float[np.ndarray, "frequencies outputs inputs"]  # mean squared error for unit noise
-    first: Int[np.ndarray, " frequencies"]
+    boost: Levels
+    gain: Pairs  # mean squared error for unit noise
+    first: Places
     scatter: Complex[np.ndarray, "frequencies outputs outputs"]  # residual products over freedom
-    freedom: Float[np.ndarray, " frequencies"]  # complex degrees of freedom
+    freedom: Grid  # complex degrees of freedom
     power: Complex[np.ndarray, "frequencies inputs inputs"]  # of the inputs, mean over the window
 
     @property
-    def determined(self) -> Bool[np.ndarray, " frequencies"]:
+    def determined(self) -> Where:
         """Whether the inputs determine the response."""
         return np.isfinite(self.response[:, 0, 0])
 
-    def rows(self, rows: Bool[np.ndarray, " frequencies"]) -> "LocalFit":
+    def rows(self, rows: Where) -> "LocalFit":
         """The fit at some of its frequencies."""
         return LocalFit(*(field[rows] for field in self))
 
-    def replace_rows(self, rows: Bool[np.ndarray, " frequencies"], part: "LocalFit") -> "LocalFit":
+    def replace_rows(self, rows: Where, part: "LocalFit") -> "LocalFit":
         """The fit with the frequencies `rows` replaced by `part`."""
         longest = max(self.effect.shape[2], part.effect.shape[2])
         old, new = (
@@ -286,7 +244,7 @@ def _excited(
     effect: Float[np.ndarray, "frequencies inputs"],
     u: Inputs,
     largest: Float[np.ndarray, " inputs"],
-) -> Bool[np.ndarray, " frequencies"]:
+) -> Where:
     """Whether each input's power in the window is near that which determines its response.
 
     Beyond the end of a sweep the input's transform is what the ends of the record leak, as smooth
@@ -307,12 +265,12 @@ def _products(x: Outputs) -> Complex[np.ndarray, "frequencies channels channels"
 class Solution(NamedTuple):
     """Response at place 0, how the noise of each bin enters it, and the residual."""
 
-    response: Complex[np.ndarray, "frequencies outputs inputs"]
+    response: Responses
     effect: Complex[np.ndarray, "frequencies inputs window"]
-    boost: Float[np.ndarray, "frequencies outputs"]  # of the effect on each output
+    boost: Levels  # of the effect on each output
     residual: Outputs
-    freedom: Float[np.ndarray, " frequencies"]  # complex
-    fine: Bool[np.ndarray, " frequencies"]  # whether the window determines the response
+    freedom: Grid  # complex
+    fine: Where  # whether the window determines the response
 
 
 def solve_polynomial(place: Places, u: Inputs, y: Outputs, owner: Owner, order: int) -> Solution:
@@ -383,15 +341,15 @@ class Normal(NamedTuple):
     columns: Columns
     adjoint: Complex[np.ndarray, "frequencies columns window"]
     inverse: Complex[np.ndarray, "frequencies columns columns"]
-    independent: Bool[np.ndarray, " frequencies"]
-    count: Int[np.ndarray, " frequencies"]  # of the columns that are not empty
+    independent: Where
+    count: Places  # of the columns that are not empty
 
     @classmethod
     def of(cls, columns: Columns) -> "Normal":
         """A record without bins here has empty columns, which take no part."""
-        adjoint = np.conj(np.swapaxes(columns, 1, 2))
-        gram = adjoint @ columns
-        length = np.sqrt(np.real(np.diagonal(gram, axis1=1, axis2=2)))
+        turned = adjoint(columns)
+        gram = turned @ columns
+        length = np.sqrt(diagonal(gram))
         empty = length == 0
         length = np.where(empty, 1.0, length)
         area = length[:, :, None] * length[:, None, :]
@@ -403,7 +361,7 @@ class Normal(NamedTuple):
         if not np.all(independent):
             value = np.linalg.eigvalsh(unit[~independent])
             independent[~independent] = value[:, 0] > _DEPENDENT**2 * value[:, -1]
-        return cls(columns, adjoint, inverse / area, independent, np.sum(~empty, axis=1))
+        return cls(columns, turned, inverse / area, independent, np.sum(~empty, axis=1))
 
     def left(self, y: Outputs) -> Outputs:
         """What the columns do not explain of `y`."""

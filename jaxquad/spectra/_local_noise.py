@@ -1,4 +1,4 @@
-"""Errors and coherence of local fits, from the noise that they leave."""
+"""Errors and coherence of local fits, from the noise that they leave; the plant by references."""
 
 import dataclasses
 from typing import NamedTuple
@@ -6,9 +6,10 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
 
+from ._checks import adjoint, diagonal, Grid, Levels, Pairs, Places, Where
 from ._error_covariance import ErrorCovariance, reach_of
 from ._local_fit import Bins, LocalFit
-from ._noise import Noise
+from ._noise import Noise, smooth_noise
 
 
 _CHANCE = 1e-5  # of calling a residual a misfit
@@ -17,11 +18,9 @@ _HARMLESS = 1e-4  # share of the moved channel's power
 _FAR_OFF = 10.0  # residual power over that of the noise from which a response is unresolved
 _UNKNOWN = 1e60  # error of what is not determined: infinity, but products with zero are zero
 _TOGETHER = 1024  # bins whose drives are taken at a time: those of a long record are many
+_DEPENDENT = 1e-6  # smallest singular value of the responses of the inputs, to the largest
+DIVISIBLE = 0.15  # largest random error of an input's response to the references
 
-Grid = Float[np.ndarray, " frequencies"]
-Places = Int[np.ndarray, " frequencies"]  # of each frequency in the grid of the noise
-Levels = Float[np.ndarray, "frequencies outputs"]
-Pairs = Float[np.ndarray, "frequencies outputs inputs"]
 Left = Complex[np.ndarray, "frequencies outputs moved"]
 
 
@@ -154,7 +153,7 @@ def partial_coherence(fit: LocalFit, noise: Levels) -> Pairs:
 def power_alone(fit: LocalFit) -> Float[np.ndarray, "frequencies inputs"]:
     """Power of each input that no other input explains; 1 where nothing is determined."""
     power = np.where(fit.determined[:, None, None], fit.power, np.eye(fit.power.shape[1]))
-    return 1 / np.real(np.diagonal(np.linalg.inv(power), axis1=1, axis2=2))
+    return 1 / diagonal(np.linalg.inv(power))
 
 
 def multiple_coherence(fit: LocalFit, noise: Levels) -> Levels:
@@ -167,7 +166,7 @@ def multiple_coherence(fit: LocalFit, noise: Levels) -> Levels:
 
 def unresolved(
     omega: Grid, fit: LocalFit, noise: Noise, at: Places, bins: Bins, moved: slice
-) -> Bool[np.ndarray, " frequencies"]:
+) -> Where:
     """Where `fit` leaves residuals far above the noise, seldom by chance in a whole record.
 
     Residuals of less than a hundredth of what `moved` in the window do no harm.
@@ -179,7 +178,7 @@ def unresolved(
     inside = np.any(fit.effect != 0, axis=1)[:, :, None]
     values = np.abs(bins.values[:, moved]) ** 2
     power = np.sum(values[_window_places(fit, bins)] * inside, axis=1) / np.sum(inside, axis=1)
-    left = np.real(np.diagonal(fit.scatter, axis1=1, axis2=2))
+    left = diagonal(fit.scatter)
     large = (ratio > _FAR_OFF) & (left > _HARMLESS * power)
     return fit.determined & np.any(large, axis=1)
 
@@ -197,6 +196,89 @@ def _misfit(
     inside = np.any(fit.effect != 0, axis=1)
     count = np.maximum(np.sum(inside, axis=1), 1)[:, None]
     expected = noise.power[at] * np.sum(colour * inside[:, :, None], axis=1) / count
-    left = np.real(np.diagonal(fit.scatter, axis1=1, axis2=2)) / expected
+    left = diagonal(fit.scatter) / expected
     freedom = 2 * np.maximum(fit.freedom, 1.0), 2 * np.maximum(noise.freedom[at], 1.0)
     return np.where(left > fdtri(*freedom, 1 - chance)[:, None], left, 1.0)
+
+
+def joint_factors(fit: LocalFit, inputs: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Where T_ru has an inverse, [-G, 1], and that inverse: dG = [-G, 1] dT T_ru^-1."""
+    invertible = fit.determined
+    through = np.where(invertible[:, None, None], fit.response[:, :inputs], np.eye(inputs))
+    strength = np.linalg.svd(through, compute_uv=False)
+    invertible &= strength[:, -1] > _DEPENDENT * strength[:, 0]
+    back = np.linalg.inv(np.where(invertible[:, None, None], through, np.eye(inputs)))
+    response = fit.response[:, inputs:] @ back
+    outputs = response.shape[1]
+    ones = np.broadcast_to(np.eye(outputs), (len(back), outputs, outputs))
+    return invertible, np.concatenate([-response, ones], axis=2), back
+
+
+def joint_fit(fit: LocalFit, inputs: int) -> LocalFit:
+    """The fit of the plant, G = T_ry T_ru^-1, from that of the references to [inputs, outputs].
+
+    Its error is (dT_ry - G dT_ru) T_ru^-1: the noise is v = y - G u, and the effect that of the
+    references taken through T_ru^-1. Source: Pintelon and Schoukens, System Identification,
+    2nd ed., section 2.6 (several inputs: 7.2.7).
+    """
+    invertible, left, back = joint_factors(fit, inputs)
+    through, response = fit.response[:, :inputs], -left[:, :, :inputs]
+    blank = np.where(invertible, 1.0, np.nan)[:, None, None]
+    effect = np.swapaxes(back, 1, 2) @ fit.effect * blank
+    scatter = left @ fit.scatter @ adjoint(left) * blank
+    boosted = left * fit.boost[:, None, :]
+    boosted = diagonal(boosted @ fit.scatter @ adjoint(boosted))
+    boost = np.sqrt(boosted / np.maximum(diagonal(scatter), 1e-300))
+    gain = boost[:, :, None] ** 2 * np.vecdot(effect, effect).real[:, None, :]
+    power = through @ fit.power @ adjoint(through)
+    freedom = np.where(invertible, fit.freedom, 0.0)
+    return LocalFit(response * blank, effect, boost, gain, fit.first, scatter, freedom, power)
+
+
+def coherence_of_references(
+    omega: Grid,
+    half_width: Grid,
+    fit: LocalFit,
+    inputs: int,
+) -> Pairs:
+    """Partial coherence of the joint estimate: the smaller of the shares of input and output.
+
+    Of the input, what the references move of it and of no other input; of the output, what
+    responds to that, beside the noise. Source: Bendat and Piersol, Random Data, ch. 7.
+    """
+    noise = smooth_noise(omega, half_width, fit.scatter, fit.freedom)
+    moved = noise.power[:, None, :inputs]
+    plant = joint_fit(fit, inputs)
+    alone = power_alone(plant)[:, None, :]
+    through = partial_coherence(plant, noise.power[:, inputs:])
+    return np.minimum(through, alone / (alone + moved))
+
+
+def share_of_inputs(
+    left: Left,
+    noise: Noise,
+    at: Places,
+    inputs: int,
+) -> Pairs:
+    """Share of a joint estimate's squared error that the noise of T_ru makes, and not of T_ry.
+
+    `left` is [-G, 1]; half of what both make together counts.
+    """
+    root = noise.root()[at]
+    total = left @ root
+    of_inputs = left[:, :, :inputs] @ root[:, :inputs]
+    power = np.vecdot(total, total).real
+    mine = np.sum(np.real(of_inputs * np.conj(total)), axis=2)
+    share = np.clip(mine / np.maximum(power, 1e-300), 0.0, 1.0)
+    return np.repeat(share[:, :, None], inputs, axis=2)
+
+
+def find_unmoved(moved: LocalFit, noise: Noise, at: Places, inputs: int) -> Where:
+    """Where the references move an input too little to divide by.
+
+    There the joint ratio is that of two noises: -1 over the controller, with hardly any residual.
+    """
+    invertible, _, back = joint_factors(moved, inputs)
+    effect = np.sum(np.abs(np.swapaxes(back, 1, 2) @ moved.effect) ** 2, axis=2)
+    relative = np.sqrt(noise.power[at][:, :inputs] * effect / 2)
+    return invertible & np.any(relative > DIVISIBLE, axis=1)

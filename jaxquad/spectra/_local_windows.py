@@ -4,10 +4,11 @@ from collections.abc import Callable, Sequence
 from typing import Literal, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
+from ._checks import diagonal, Grid, Places, Where
 from ._estimators import LocalPolynomial
-from ._local_fit import Bins, check_bins, LocalFit, smallest_widths, window_slices
+from ._local_fit import Bins, LocalFit, window_slices
 from ._noise import Noise
 
 
@@ -27,8 +28,6 @@ _ACCURATE = 0.1  # largest relative error of a rational function that is used
 _DOMINATED = 30.0  # ratio of input powers from which a window's side outweighs its centre
 _STEP = 1.3  # of the half-widths that are tried
 
-Grid = Float[np.ndarray, " frequencies"]
-Where = Bool[np.ndarray, " frequencies"]
 Shape = Literal["polynomial", "rational"]
 Respond = Callable[[Grid, Grid, Shape], LocalFit]
 
@@ -63,12 +62,29 @@ def make_windows(
 ) -> Windows:
     """Around increasing `omega`. Raises `ValueError` where the bins are too few."""
     coefficients, transients = inputs * (options.order + 1), options.order + 1
-    check_bins(omega, bins, coefficients, transients, _FREEDOM)
+    counts = np.bincount(bins.record, minlength=bins.records)
+    spare = int(np.sum(np.maximum(counts - transients, 0)))
+    if spare < coefficients + _FREEDOM:
+        raise ValueError(
+            f"the records have {counts.tolist()} Fourier bins, {spare} more than their transients "
+            f"need; the local fit needs {coefficients + _FREEDOM}. Record longer, or use a lower "
+            "order"
+        )
+    if not (omega.size and np.all(np.diff(omega) > 0)):
+        raise ValueError(
+            f"{omega.size} frequencies: give one or more, in increasing order, in rad/s"
+        )
+    if omega[0] < 0.999 * bins.omega[0] or omega[-1] > 1.001 * bins.omega[-1]:
+        raise ValueError(
+            f"the frequencies run from {omega[0]:.4g} to {omega[-1]:.4g} rad/s, but the records "
+            f"hold one cycle of {bins.omega[0]:.4g} rad/s and reach {bins.omega[-1]:.4g} rad/s. "
+            "Keep the frequencies within, or record longer"
+        )
     first, last = max(omega[0] / 2, bins.omega[0]), min(omega[-1] * 2, bins.omega[-1])
     steps = _PER_OCTAVE * np.log2([first, last])
     octaves = np.arange(np.ceil(steps[0]), np.floor(steps[1]) + 1) / _PER_OCTAVE
     grid = np.union1d(omega, 2**octaves)
-    least = smallest_widths(grid, bins, coefficients, transients, _FREEDOM)
+    least = _smallest_widths(grid, bins, coefficients, transients)
     # Windows that reach half of the way to the next frequency leave nothing of a record out.
     density = bins.omega.size / (bins.omega[-1] - bins.omega[0])
     gaps = np.diff(grid)
@@ -76,6 +92,25 @@ def make_windows(
     most = np.maximum(least, np.maximum(spacing, _MOST / density) / 2)
     narrow = np.clip(_NARROW * grid, least, most)
     return Windows(grid, np.searchsorted(grid, omega), least, narrow, most)
+
+
+def _smallest_widths(omega: Grid, bins: Bins, columns: int, transient: int) -> Grid:
+    """Half-widths in rad/s of the smallest windows with enough more bins than coefficients.
+
+    `columns` is the number of coefficients of the response, `transient` that of each record.
+    """
+    least, most = np.zeros_like(omega), np.full_like(omega, bins.omega[-1])
+    grids = [bins.omega[bins.record == r] for r in range(bins.records)]
+    for _ in range(40):
+        middle = (least + most) / 2
+        spare = np.zeros(omega.size, int)
+        for grid in grids:
+            first = np.searchsorted(grid, omega - middle, "left")
+            last = np.searchsorted(grid, omega + middle, "right")
+            spare += np.maximum(last - first - transient, 0)
+        enough = spare >= columns + _FREEDOM
+        least, most = np.where(enough, least, middle), np.where(enough, middle, most)
+    return most * (1 + 1e-9)
 
 
 def choose_widths(
@@ -125,7 +160,7 @@ def _resonant(fits: Sequence[LocalFit], sharp: LocalFit, noise: Noise) -> Where:
     The error of a rational function is linear in the noise only while it is small.
     """
     pairs = noise.power.shape[1] * sharp.response.shape[2]
-    left = np.real(np.diagonal(fits[0].scatter, axis1=1, axis2=2)) / noise.power
+    left = diagonal(fits[0].scatter) / noise.power
     wrong = np.any(left > _quantile(fits[0].freedom, noise, _CHANCE_ALONE)[:, None], axis=1)
     for wide in fits[1:2]:
         statistic, count = _differences(wide, fits[0], noise)
@@ -140,7 +175,7 @@ def _widest_unbiased(
     widths: Float[np.ndarray, "steps frequencies"],
     fits: Sequence[LocalFit],
     noise: Noise,
-) -> Int[np.ndarray, " frequencies"]:
+) -> Places:
     step, going = np.zeros(omega.size, int), np.ones(omega.size, bool)
     kernel = np.exp(-0.5 * ((np.log(omega)[:, None] - np.log(omega)) / _SMOOTHING) ** 2)
     pairs = noise.power.shape[1] * fits[0].response.shape[2]

@@ -15,16 +15,13 @@ from jaxquad.autopilot import (
     ADRCTargets,
     AutopilotProposal,
     AxesProposal,
-    best_filters,
     betaflight_adrc_loop,
     betaflight_loop,
-    check_law,
     check_loop,
     design_gains,
     doubted_throttle,
     FilterChain,
     firmware_named,
-    FlightChannels,
     Flown,
     FlownADRC,
     FlownAutopilot,
@@ -142,51 +139,35 @@ class _ReadAxis(NamedTuple):
     record: IdentifySettings
     proposal: Proposal
     flown: FlownAutopilot
-    flight: FlightChannels | None
 
 
 def _read_axis(path: Path, settings: AutopilotSettings) -> _ReadAxis:
-    """The loop that flew, at the throttle of the log, and the channels beside the record's."""
     announce("gains and filters that flew")
     record, proposal = _channels_of(path, settings)
-    flight = read_channels_if_any(path, proposal, record, settings_of(path, proposal).values)
-    throttle = settings.throttle
-    if throttle is None and flight is not None:
-        throttle = flight.middle
-    flown = read_flown(path, proposal, throttle, {} if flight is None else flight.tracked_hz)
-    chains = tuple(chain for chain in flown.law.gyro_chains() if chain.filters)
-    filters, text = best_filters(chains, flown.unmodelled, flight, flown.axis)
-    flown = dataclasses.replace(flown, filters=filters, filters_text=text)
-    return _ReadAxis(path, settings, record, proposal, flown, flight)
+    flown = read_flown(path, proposal, record, settings.throttle)
+    return _ReadAxis(path, settings, record, proposal, flown)
 
 
 def _tune_axis(axis: _ReadAxis, filters: Mapping[str, float]) -> AutopilotProposal:
     """The gains of one axis, with `filters` that are changed already."""
-    path, settings, record, proposal, flown, flight = axis
+    path, settings, record, proposal, flown = axis
     plant = identify_plant(path, record, proposal, flown.filters)
-    result = (settings, plant, flown)
-    unsure = lambda why, again: AutopilotProposal("cannot tell", why, *result, again, flight=flight)
+    unsure = lambda why, again: AutopilotProposal("cannot tell", why, settings, plant, flown, again)
     recipe = firmware_named(flown.firmware).what_to_fly(AXES[flown.axis])
     if not plant.fit.identifiable:
         summary = plant.fit.verdict.summary
         return unsure(Message(f"this log cannot tell: «plant|{summary}». {recipe}"), None)
-    if flight is None:
+    if flown.flight is None:
         return unsure(_NO_SETPOINT, None)
     announce("the flown loop again")
-    law = check_law(flown.loop, flown.axis, flight)
-    again = check_loop(plant, flown, flight, law)
+    again = check_loop(plant, flown)
     if again.kind == "unknown":
         return unsure(f"this log cannot tell: {again.verdict}. {recipe}", again)
     if again.kind != "flown":
         return unsure(f"this log cannot tell: {again.verdict}", again)
     read = lambda inputs: read_records(path, plant.settings, further_inputs=inputs)
     throttle = study_throttle(plant, proposal, flown, read)
-    design = design_gains(settings, plant, flown, flight, throttle, filters)
-    return AutopilotProposal(
-        design.kind, design.verdict, *result, again, design.stages,
-        design.new if design.kind == "proposed" else {}, design.filters, design.noise, flight,
-        throttle,
-    )  # fmt: skip
+    return design_gains(dataclasses.replace(unsure("", again), throttle=throttle), filters)
 
 
 _NO_SETPOINT = (
@@ -239,7 +220,8 @@ def _tune_adrc(
         throttle = {"throttle": dict(proposal.setup.throttle)}
         records = list(read_records(path, record, further_inputs=throttle))
     announce("the gain over the throttle")
-    band = None if settings.band is None else tuple(2 * np.pi * x for x in settings.band)
+    low, high = settings.band or (0.0, 0.0)
+    band = None if settings.band is None else (2 * np.pi * low, 2 * np.pi * high)
     unsure = lambda error: dataclasses.replace(
         result, verdict=Message(f"this log cannot tell: {marked_text(error)}")
     )

@@ -21,11 +21,10 @@ from jaxquad._core import (
     require_positive,
 )
 from jaxquad.control import Reference, Setpoint
-from jaxquad.identify import CurveFirmware
 from jaxquad.records import AXES
 
 from .._filters import Butterworth, FilterChain, Notch, PT1, Section
-from .._firmware import Channels, Firmware, LowPass, Numbers, OuterLoop, Parameter, rows_of_axes
+from .._firmware import Channels, Firmware, Numbers, OuterLoop, Parameter, rows_of_axes
 from .._law import (
     Advance,
     AngleLoop,
@@ -124,8 +123,7 @@ class ArduPilotAttitude(AngleLoop):
 
     The rate's target is `p` times the error of the angle, beyond a_max/p^2 the root of it that a
     deceleration a_max needs, plus the rate of a `Setpoint` (what input shaping gives); it is used
-    one loop later. The rate that the inner loop sees is the difference of the measured angles over
-    a sample. Source: docs/autopilots.md.
+    one loop later. Source: docs/autopilots.md.
 
     **Arguments:** (each number is a scalar, one value per axis, or `[axes, *ensemble]`)
 
@@ -134,9 +132,7 @@ class ArduPilotAttitude(AngleLoop):
     - `acceleration_limit`: half of ATC_ACCEL_x_MAX in rad/s^2; the default is 550 deg/s^2.
     - `rate_limit`: ATC_RATE_x_MAX in rad/s; inf is none.
 
-    **Raises:**
-
-    - `ValueError`: `p` or a limit is not above 0.
+    **Raises:** `ValueError`: `p` or a limit is not above 0.
     """
 
     rate: ArduPilotRate
@@ -196,9 +192,7 @@ class HarmonicNotch(eqx.Module):
     - `harmonics`: multiples of the centre that have notches.
     - `notches`: 1, 2, 3 or 5 at each harmonic.
 
-    **Raises:**
-
-    - `ValueError`: centre or quality is not above 0, or a multiple is below 1.
+    **Raises:** `ValueError`: centre or quality is not above 0, or a multiple is below 1.
     """
 
     centre_hz: Float[Array, "..."] = per_member(rank=1, converter=as_float)
@@ -361,9 +355,7 @@ def ardupilot_loop(
     - `tracked_hz`: what harmonic notches follow that go by an RPM sensor (2, 5), ESC telemetry (3)
         or the gyro's spectrum (4), in Hz: by INS_HNTCH_MODE, with a number for each source.
 
-    **Raises:**
-
-    - `ValueError`: a gain is missing.
+    **Raises:** `ValueError`: a gain is missing.
     """
     read = Numbers(values)
     rate = read.number("SCHED_LOOP_RATE", 400.0)
@@ -479,21 +471,6 @@ class ArduPilot(Firmware):
 
     def angle_loop(self, values, axis, dt, *, levelled):
         return OuterLoop.of(values, f"ATC_ANG_{_SHORT[axis]}_P", 1.0, dt, closed=True)
-
-    def low_passes(self, loop, values, version, axis, throttle):
-        law, of_axis = loop.law, lambda x: float(np.broadcast_to(x, (3,))[axis])
-        for x in (x for x in law.gyro.filters if isinstance(x, Butterworth)):
-            yield LowPass("gyro", {"INS_GYRO_FILTER": float(x.cutoff_hz)}, x, law.gyro.rate_hz)
-        slope = of_axis(law.derivative_hz)
-        if slope > 0 and of_axis(law.d) > 0:
-            flown = {f"ATC_RAT_{_SHORT[axis]}_FLTD": slope}
-            yield LowPass("derivative", flown, PT1(slope), 1 / law.dt, shared=False)
-
-    def curve_kind(self, version: Sequence[int]) -> CurveFirmware:
-        return "ardupilot"
-
-    def angle_parameters(self, axis: str, p: float) -> dict[str, float]:
-        return {f"ATC_ANG_{_SHORT[AXES.index(axis)]}_P": p}
 
 
 FIRMWARE = ArduPilot()

@@ -1,27 +1,35 @@
 """What a Betaflight log says for its proposed ADRC: the report, and the files to load."""
 
 import dataclasses
-import shlex
 from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 
-from jaxquad._core import announce, plain_content, write_file
+from jaxquad._core import plain_content, write_file
 from jaxquad.identify import GainBand, GainOverThrottle
 from jaxquad.plot import StepBand, ThrottleCurve
 from jaxquad.records import AXES
-from jaxquad.report import Headline, Provenance, provenance, Table, write_json
+from jaxquad.report import Headline, Provenance, Table
 
 from .._files import change_table, parameter_file, ParameterChange, propose_changes, WordChange
 from .._filters import FilterChain, PT2
 from .._flight_channels import FlightChannels
-from .._identified import DesignSettings
-from .._page import B0Section, Chains, PilotPage, write_pilot_page
+from .._page import (
+    B0Section,
+    Chains,
+    chains_of,
+    change_rows,
+    logged_terms,
+    motor_rows,
+    PilotPage,
+    VERDICTS,
+)
 from .._parameters import find_parameter
-from .._pilot_page import chains_of, change_rows, logged_terms, motor_rows, StepGrid, VERDICTS
-from .._rate_design import Kind
+from .._proposal import write_result
+from .._rate_loops import StepGrid
 from .._reproduce_flight import Reproduction
+from .._stages import DesignSettings, Kind
 from ._betaflight_adrc import adrc_loops, adrc_parameters, b0_law, Flown, FlownADRC
 from ._betaflight_adrc_design import ADRCProposal
 
@@ -179,16 +187,10 @@ class ADRCAutopilot:
 
         **Returns:** their paths.
         """
-        announce("parameter files")
-        folder = Path(folder)
-        stated = {k: v for k, v in self.settings.content().items() if v is not None}
-        words = ["jaxquad", "autopilot", str(self.path), *self.settings.words()]
-        origin = provenance(self.path, command=shlex.join(words), settings=stated)
-        content = self.content() | {"provenance": origin.content()}
-        stored = write_json(folder / "autopilot.json", content)
-        announce("the page")
-        page = write_pilot_page(folder / "autopilot.html", adrc_page(self, origin))
-        return [page, stored, *(write_file(folder / k, text) for k, text in self._texts().items())]
+        path = Path(folder)
+        files = lambda: [write_file(path / name, text) for name, text in self._texts().items()]
+        pages = lambda origin: [adrc_page(self, origin)]
+        return write_result(path, self.path, self.settings, self.content(), files, pages)
 
     def _texts(self) -> dict[str, str]:
         """The parameter files, and the table of what changes; without a proposal what flew."""
@@ -290,7 +292,7 @@ _POINTS = 60  # of a curve over the throttle
 
 def adrc_page(result: ADRCAutopilot, origin: Provenance) -> PilotPage:
     """All that the page shows."""
-    version, proposal, plant = ".".join(map(str, result.version)), result.proposal, result.plant
+    version, proposal = ".".join(map(str, result.version)), result.proposal
     flown, flight, axis = result.flown, result.flight, AXES.index(result.axis)
     headlines = [Headline(*VERDICTS[result.kind], result.verdict)]
     for throttle, again in result.shown_again.items():
@@ -298,22 +300,16 @@ def adrc_page(result: ADRCAutopilot, origin: Provenance) -> PilotPage:
         word = "THE FLOWN LOOP AGAIN" if flew else "THE FLOWN LOOP IS NOT REPRODUCED"
         level = "good" if flew else "warn" if again.kind == "unknown" else "bad"
         headlines.append(Headline(level, word, f"at {throttle:.2f} throttle: {again.verdict}"))
-    pid = flown.pid.law if isinstance(flown, FlownADRC) else flown.law
-    chains = chains_of(pid, axis)
-
-    def with_observer(cutoff: float) -> Chains:
-        observer = (FilterChain((PT2(cutoff),), 1 / pid.dt),) if cutoff > 0 else ()
-        return {"gyro": chains["gyro"], "observer": observer}
-
-    filters: dict[str, Chains] = {"flown": chains}
+    pid, cutoff = flown, result.new.get("adrc_gyro_lpf_hz", 0.0)
     if isinstance(flown, FlownADRC):
-        filters = {"flown": with_observer(flown.frame.lowpass_hz)}
-    elif result.new:
-        filters["proposed"] = with_observer(result.new["adrc_gyro_lpf_hz"])
-    steps, b0, stages = {}, None, None
-    if proposal is not None and plant is not None:
-        steps, b0 = _steps_and_b0(result, proposal, plant)
-        stages = stage_table(proposal, result.settings.fresh)
+        pid, cutoff = flown.pid, flown.frame.lowpass_hz
+    chains = chains_of(pid.law, axis)
+    observer = (FilterChain((PT2(cutoff),), 1 / pid.law.dt),) if cutoff > 0 else ()
+    filters: dict[str, Chains] = {"flown": chains}
+    if result.flew_adrc or result.new:
+        design = "flown" if result.flew_adrc else "proposed"
+        filters[design] = {"gyro": chains["gyro"], "observer": observer}
+    steps, b0 = ({}, None) if proposal is None else _steps_and_b0(result, proposal)
     return PilotPage(
         title=f"betaflight {version}, ADRC for {result.axis}".replace(" ,", ","),
         headlines=headlines,
@@ -324,7 +320,7 @@ def adrc_page(result: ADRCAutopilot, origin: Provenance) -> PilotPage:
         terms={} if flight is None or not flight.terms else logged_terms(flight),
         terms_are="as logged",
         motors=[] if flight is None else motor_rows(flight),
-        stages=stages,
+        stages=None if proposal is None else stage_table(proposal, result.settings.fresh),
         changes=change_rows(result.changes, result.words) if result.new else None,
         text=str(result),
         unit="pidsum",
@@ -333,10 +329,12 @@ def adrc_page(result: ADRCAutopilot, origin: Provenance) -> PilotPage:
 
 
 def _steps_and_b0(
-    result: ADRCAutopilot, proposal: ADRCProposal, plant: GainOverThrottle
-) -> tuple[dict[str, StepBand], B0Section]:
+    result: ADRCAutopilot, proposal: ADRCProposal
+) -> tuple[dict[str, StepBand], B0Section | None]:
     """Steps at the middle one of the throttles that were certified, and b0 over all of them."""
-    flown, schedule = result.flown, proposal.schedule
+    flown, schedule, plant = result.flown, proposal.schedule, result.plant
+    if plant is None:
+        return {}, None
     middle = proposal.throttle[len(proposal.throttle) // 2]
     grid, place = StepGrid.of(flown.law.dt), AXES.index(result.axis)
     seed = result.settings.seed + _SEED
@@ -365,15 +363,7 @@ def _steps_and_b0(
 
 def stage_table(proposal: ADRCProposal, fresh: int) -> Table:
     """What parameters give on fresh plants, for the page."""
-    number = lambda x: "-" if np.isnan(x) else f"{x:.0f}"
-    rows = [
-        [
-            name, number(x.wc), number(x.wo), number(x.b0), f"{100 * x.stable:.1f}",
-            f"{x.peak:.2f}", f"{x.resonance:.2f}", f"{x.crossover / (2 * np.pi):.1f}",
-            f"{x.rejection:.2f}", f"{x.noise:.2f}",
-        ]
-        for name, x in proposal.stages.items()
-    ]  # fmt: skip
+    rows = [[name, *stage.cells()] for name, stage in proposal.stages.items()]
     heads = (
         "parameters", "wc", "wo", "b0", "stable, %", "worst Ms", "worst peak", "crossover, Hz",
         "torque", "noise",

@@ -375,9 +375,9 @@ def dynamic_cutoff(
 class BetaflightAngle(AngleLoop):
     """Betaflight's angle mode around a rate loop: angles in rad in, pidsum units out.
 
-    The rate's set-point is level/10 times the error of the angle, through a pt3 at 50 Hz. Feed-
-    forward is off, and the relaxation of the integral begins at 8 deg/s. The rate that the inner
-    loop sees is the difference of the measured angles over a sample. Source: docs/autopilots.md.
+    The rate's set-point is level/10 times the error of the angle, through a pt3 at 50 Hz.
+    Feed-forward is off, and the relaxation of the integral begins at 8 deg/s. Source:
+    docs/autopilots.md.
 
     **Arguments:**
 
@@ -385,9 +385,7 @@ class BetaflightAngle(AngleLoop):
     - `level`: angle_p_gain, 50 is 5 1/s.
     - `smooth`: the filters of the rate's set-point; None is a pt3 at 50 Hz.
 
-    **Raises:**
-
-    - `ValueError`: the level is not above 0.
+    **Raises:** `ValueError`: the level is not above 0.
     """
 
     outer: ClassVar[tuple[str, ...]] = ("level",)

@@ -1,7 +1,7 @@
 """PX4: its rate and attitude loops, parameters, channels and files."""
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import ClassVar
 
 import equinox as eqx
@@ -11,7 +11,6 @@ from jaxtyping import Array, Float, PyTree
 
 from jaxquad._core import as_float, broadcast_gain, Message, per_member, require_positive
 from jaxquad.control import Reference, Setpoint
-from jaxquad.identify import CurveFirmware
 from jaxquad.records import AXES
 
 from .._filters import BandwidthNotch, Butterworth, Filter, FilterChain, PT1, Section
@@ -19,7 +18,6 @@ from .._firmware import (
     Channels,
     Firmware,
     joined_lines,
-    LowPass,
     number_text,
     Numbers,
     OuterLoop,
@@ -137,8 +135,7 @@ class PX4Attitude(AngleLoop):
     """PX4's attitude loop around a rate loop: angles in rad in, normalised torque out.
 
     The rate's set-point is `p` times the error of the angle, plus a `Setpoint`'s rate, within
-    `rate_limit`. There is no integral and no derivative of the angle. The rate that the inner loop
-    sees is the difference of the measured angles over a sample. Source: docs/autopilots.md.
+    `rate_limit`. There is no integral and no derivative of the angle. Source: docs/autopilots.md.
 
     **Arguments:** (each number is a scalar, one value per axis, or `[axes, *ensemble]`)
 
@@ -146,9 +143,7 @@ class PX4Attitude(AngleLoop):
     - `p`: MC_ROLL_P, MC_PITCH_P, MC_YAW_P in 1/s.
     - `rate_limit`: MC_xRATE_MAX in rad/s, 220 deg/s by default.
 
-    **Raises:**
-
-    - `ValueError`: `p` or the limit is not above 0.
+    **Raises:** `ValueError`: `p` or the limit is not above 0.
     """
 
     rate: PX4Rate
@@ -183,9 +178,7 @@ def px4_loop(values: Mapping[str, str], *, gyro_rate_hz: float = 8000.0) -> Flow
     - `gyro_rate_hz`: at which the gyro's filters run, which no parameter says; it is rounded to a
         multiple of the loop's.
 
-    **Raises:**
-
-    - `ValueError`: a gain is missing.
+    **Raises:** `ValueError`: a gain is missing.
     """
     read = Numbers(values)
     rate = read.number("IMU_GYRO_RATEMAX", 400.0) or 400.0
@@ -276,25 +269,11 @@ class PX4(Firmware):
         name = f"MC_{AXES[axis].upper()}_P"
         return OuterLoop.of(values, name, 1.0, 0.5 * _ESTIMATE + dt, closed=True)
 
-    def low_passes(self, loop, values, version, axis, throttle):
-        law = loop.law
-        for x in (x for x in law.gyro.filters if isinstance(x, Butterworth)):
-            yield LowPass("gyro", {"IMU_GYRO_CUTOFF": float(x.cutoff_hz)}, x, law.gyro.rate_hz)
-        slope = {"IMU_DGYRO_CUTOFF": float(law.derivative_hz)}
-        if law.derivative_hz > 0 and np.any(np.asarray(law.d) > 0):
-            yield LowPass("derivative", slope, PT1(law.derivative_hz), law.gyro.rate_hz)
-
     def notch(self, centre_hz: float, second: float) -> Filter:
         return BandwidthNotch(centre_hz, second)
 
     def notch_width(self, centre_hz: float, half_width: float) -> float:
         return float(np.rint(2 * half_width * centre_hz))
-
-    def curve_kind(self, version: Sequence[int]) -> CurveFirmware:
-        return "px4"
-
-    def angle_parameters(self, axis: str, p: float) -> dict[str, float]:
-        return {f"MC_{axis.upper()}_P": p}
 
     def parameter_file(self, values, title, *, version, profile, raised, words):
         rows = [f"# {title}"] if title else []

@@ -14,7 +14,6 @@ from jaxquad.records.firmware import (
     moves,
     Selection,
     Setup,
-    Signals,
     with_injections,
 )
 
@@ -34,7 +33,10 @@ _STICKS = {
 def px4_setup(log: Log, wanted: Selection) -> Setup:
     """The set-up for autotune's excitation; without it, with the set-point if flown in acro."""
     signals, axis = flattened(log), wanted.axis
-    rates = {x: _rate(signals, i) for i, x in enumerate(AXES)}
+    names = ("vehicle_angular_velocity.xyz", "sensor_combined.gyro_rad")
+    rates = {
+        x: first_logged(signals, [f"{name}[{i}]" for name in names]) for i, x in enumerate(AXES)
+    }
     if not any(rates.values()):
         raise RecordError(
             "the log has no vehicle_angular_velocity. Choose a logging profile that has it."
@@ -55,13 +57,24 @@ def px4_setup(log: Log, wanted: Selection) -> Setup:
         reference = f"{_AUTOTUNE}.rate_sp[{i}]"
         setup = Setup(axis, {command: 1.0}, rates[axis], reference, injected_at="rate")
         return with_injections(setup, tuned[axis], "autotune's steps on the rate set-point")
-    return _untuned(log, signals, axis, command, rates[axis])
-
-
-def _rate(signals: Signals, i: int) -> str:
-    return first_logged(
-        signals, [f"vehicle_angular_velocity.xyz[{i}]", f"sensor_combined.gyro_rad[{i}]"]
-    )
+    setpoint, status = f"{_RATE_SETPOINT}.{axis}", log.tables.get("vehicle_status")
+    states = None if status is None else status.columns.get("nav_state")
+    always_acro = states is not None and states.size > 0 and bool((states == _ACRO).all())
+    if always_acro and moves(signals, setpoint):
+        remark = "flown in acro throughout, where the rate set-point comes from the pilot only"
+        return Setup(axis, {command: 1.0}, rates[axis], setpoint, remarks=(remark,))
+    remarks = [
+        f"{setpoint} is computed by the attitude loop: it contains feedback and cannot be the "
+        f"external reference",
+        "for an external reference, run autotune, or inject a sweep and log it",
+    ]
+    stick = first_logged(signals, _STICKS[axis])
+    if stick and moves(signals, stick):
+        remarks.append(
+            f"in manual flight the stick is not affected by feedback: use --reference {stick} if "
+            f"it moved enough"
+        )
+    return Setup(axis, {command: 1.0}, rates[axis], remarks=tuple(remarks))
 
 
 def _autotuned(log: Log) -> dict[str, list[Injection]]:
@@ -80,31 +93,6 @@ def _autotuned(log: Log) -> dict[str, list[Injection]]:
             ends = (table.time[part[[0, -1]]].tolist() for part in parts)
             runs[axis] = [Injection(start, stop) for start, stop in ends]
     return runs
-
-
-def _untuned(log: Log, signals: Signals, axis: str, command: str, rate: str) -> Setup:
-    setpoint = f"{_RATE_SETPOINT}.{axis}"
-    if _always_acro(log) and moves(signals, setpoint):
-        remark = "flown in acro throughout, where the rate set-point comes from the pilot only"
-        return Setup(axis, {command: 1.0}, rate, setpoint, remarks=(remark,))
-    remarks = [
-        f"{setpoint} is computed by the attitude loop: it contains feedback and cannot be the "
-        f"external reference",
-        "for an external reference, run autotune, or inject a sweep and log it",
-    ]
-    stick = first_logged(signals, _STICKS[axis])
-    if stick and moves(signals, stick):
-        remarks.append(
-            f"in manual flight the stick is not affected by feedback: use --reference {stick} if "
-            f"it moved enough"
-        )
-    return Setup(axis, {command: 1.0}, rate, remarks=tuple(remarks))
-
-
-def _always_acro(log: Log) -> bool:
-    table = log.tables.get("vehicle_status")
-    states = table.columns.get("nav_state") if table is not None else None
-    return states is not None and states.size > 0 and bool((states == _ACRO).all())
 
 
 LOG = FirmwareLog(

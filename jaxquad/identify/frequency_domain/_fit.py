@@ -12,11 +12,10 @@ from jaxquad._core import Message, one_blas_thread, require_x64
 from jaxquad.models import LaggedIntegrator, with_arrays
 from jaxquad.spectra import FrequencyResponse
 
-from ..uncertainty._assess import assess, unfitted
+from ..uncertainty._assess import assess, DOUBT, unfitted
 from ..uncertainty._error_budget import Weighting, weighting_at
-from ..uncertainty._fit_remarks import DOUBT
 from ..uncertainty._verdict import Verdict, without_numbers
-from ._bounds import settle_at_bounds, solve_within_bounds
+from ..uncertainty._zero_bounds import settle_at_bounds, solve_within_bounds
 from ._cost import (
     Band,
     Cost,
@@ -260,11 +259,7 @@ def _solve_reweighted(
 
 
 def _solve_with_floor(
-    problem: Problem,
-    points: Sequence[Points],
-    solution: Solution,
-    options: Options,
-    rounds: int,
+    problem: Problem, points: Sequence[Points], solution: Solution, options: Options, rounds: int
 ) -> tuple[Problem, Solution, Weighting]:
     """Solve again with what the model leaves unexplained as a floor on the random error.
 
@@ -272,8 +267,8 @@ def _solve_with_floor(
     """
     cost, lifted = options.cost, False
     weighting = weighting_at(problem, points, solution)
-    for _ in range(rounds if weighting.mixtures[0].none < DOUBT else 0):
-        floor = weighting.mixtures[0].amplitude
+    for _ in range(rounds if weighting.budget.mixtures[0].none < DOUBT else 0):
+        floor = weighting.budget.mixtures[0].amplitude
         raised = [replace(one, floor=np.full(one.used.shape, floor)) for one in points]
         weights = _weights(cost, raised, _ratios(solution))
         if _are_close([np.asarray(old) for old in problem.weights], weights, _SETTLED):
@@ -284,8 +279,7 @@ def _solve_with_floor(
         weighting = weighting_at(problem, points, solution)
     if lifted:
         plain = _weights(cost, points, _ratios(solution))
-        mixings = _mixings(cost, points, plain)
-        weighting = weighting._replace(weights=plain, mixings=mixings)
+        weighting = weighting._replace(by_noise=_weighted(problem, cost, points, plain))
     return problem, solution, weighting
 
 

@@ -14,7 +14,6 @@ from jaxquad.records import Record
 from ..output_error._noise import NoiseModel
 from ..output_error._simulated import linear_model
 from ..output_error._verify import Verification, verify
-from ..uncertainty._accuracy import Matrix
 from ..uncertainty._curves import (
     fitted_response,
     fitted_step_response,
@@ -24,7 +23,7 @@ from ..uncertainty._curves import (
 )
 from ..uncertainty._derived import derive, Tied, tied_parameters
 from ..uncertainty._draw_models import draw_models, known_covariance
-from ..uncertainty._error_budget import Discrepancy
+from ..uncertainty._error_budget import Discrepancy, Matrix
 from ..uncertainty._verdict import (
     Combination,
     pooled_freedom,
@@ -131,11 +130,7 @@ class Fit:
         return self.names.index(name)
 
     def __call__(
-        self,
-        record: Record,
-        *,
-        band: tuple[float, float] | None = None,
-        hold: str | None = None,
+        self, record: Record, *, band: tuple[float, float] | None = None, hold: str | None = None
     ) -> Verification:
         """Simulate the model on a record and compare: `jq.verify(fit, record)`.
 

@@ -11,6 +11,8 @@ from jaxquad._core import Message, pytree_node
 from jaxquad.models import evaluate_response, imaginary
 from jaxquad.spectra import FrequencyResponse
 
+from ._parameters import namespace_of, Numbers
+
 
 _COUNTS = (16, 64)  # aliases to either side
 _NODES = (6, 12)  # frequencies between which the sum over the aliases is interpolated
@@ -18,9 +20,6 @@ _TRIED = 32  # frequencies at which the two are chosen
 _TOLERANCE = 1e-8  # of the response, to which they are chosen
 _FLAT = 0.3  # of the sum, over which its window stays at 1
 _SECOND = 0.7  # length of a second window over that of the first
-
-
-Numbers = Array | np.ndarray
 
 
 @pytree_node
@@ -43,8 +42,8 @@ class Aliases:
     @property
     def omega(self) -> Float[Numbers, " others"]:
         """All frequencies at which the model is needed beside those of the response, in rad/s."""
-        joined = self.upper.reshape(-1), self.lower.reshape(-1)
-        return np.concatenate(joined) if _is_numpy(self.upper) else jnp.concatenate(joined)
+        both = [self.upper.reshape(-1), self.lower.reshape(-1)]
+        return namespace_of(self.upper).concatenate(both)
 
     def total(
         self,
@@ -61,6 +60,81 @@ class Aliases:
         aliased = self.spread @ at_nodes.reshape(len(at_nodes), -1)
         direct = self.direct.reshape(-1, *columns).astype(direct.dtype) * direct
         return direct + aliased.reshape(direct.shape)
+
+
+def _imaginary(omega: Float[Numbers, "..."]) -> Complex[Numbers, "..."]:
+    return 1j * omega if isinstance(omega, np.ndarray) else imaginary(omega)
+
+
+def _aliases_at(omega, hold: float, count: int, nodes: np.ndarray | None = None) -> Aliases:
+    """The aliases of all frequencies, or of the nodes between which they are interpolated."""
+    at = (omega if nodes is None else nodes)[:, None]
+    steps = 2 * np.pi / hold * np.arange(1, count + 1)[None]
+    turn = (1 - namespace_of(omega).exp(-hold * _imaginary(omega))) / hold
+    across = np.eye(len(omega))
+    if nodes is not None:  # from values at the nodes to the polynomial through them
+        middle, half = 0.5 * (nodes[-1] + nodes[0]), 0.5 * (nodes[-1] - nodes[0])
+        basis = lambda x: np.polynomial.chebyshev.chebvander((x - middle) / half, nodes.size - 1)
+        across = np.linalg.solve(basis(nodes).T, basis(np.asarray(omega)).T).T
+
+    def window(place: Float[np.ndarray, " aliases"]) -> Float[np.ndarray, " aliases"]:
+        """From 1 to 0 at 1, with all derivatives."""
+        x = np.clip((place - _FLAT) / (1 - _FLAT), 0, 1)
+        with np.errstate(divide="ignore", over="ignore"):
+            rise, fall = np.exp(-1 / x), np.exp(-1 / (1 - x))
+        return fall / (rise + fall)
+
+    # A smooth end makes the rest of a sum that turns with a delay vanish faster than any power; of
+    # one that does not turn it is a series in 1 / count, of which two lengths cancel the first term
+    # (Richardson's extrapolation).
+    place = np.arange(1, count + 1) / (count + 1)
+    weights = (window(place) - _SECOND * window(place / _SECOND)) / (1 - _SECOND)
+    spread = turn[:, None] * across.astype(turn.dtype)
+    return Aliases(turn / _imaginary(omega), spread, at + steps, steps - at, weights)
+
+
+@eqx.filter_jit
+def _evaluate(model, omega, others):
+    return evaluate_response(model, jnp.concatenate([omega, others]))
+
+
+def plan_aliases(model: PyTree, frf: FrequencyResponse) -> Aliases:
+    """As many aliases and as few nodes as the response of this model needs, and ones near it."""
+    hold, omega = hold_of(frf), np.asarray(frf.omega)
+    tried = omega[np.unique(np.linspace(0, omega.size - 1, _TRIED).round().astype(int))]
+    aliases = _aliases_at(tried, hold, _COUNTS[-1])
+    response = np.asarray(_evaluate(model, tried, aliases.omega))
+    bad = ~np.isfinite(response).all(axis=tuple(range(1, response.ndim)))
+    if bad.any():
+        first = np.concatenate([tried, np.ravel(aliases.omega)])[int(np.argmax(bad))]
+        raise ValueError(
+            Message(
+                "the response of the model is not finite at its starting values, first at "
+                f"{first:.4g} rad/s: «start from other values»"
+            )
+        )
+    direct, others = response[: tried.size], response[tried.size :]
+    others = others.reshape(2, *aliases.upper.shape, *direct.shape[1:])
+
+    def total(count: int, nodes: np.ndarray | None) -> np.ndarray:
+        """The response from fewer aliases, and interpolated between some of the frequencies."""
+        some = others[:, slice(None) if nodes is None else nodes, :count]
+        plan = _aliases_at(tried, hold, count, None if nodes is None else tried[nodes])
+        return np.asarray(plan.total(direct, some.reshape(-1, *direct.shape[1:])))
+
+    best = total(_COUNTS[-1], None)
+    close = lambda *plan: bool(np.all(np.abs(total(*plan) - best) <= _TOLERANCE * abs(best)))
+    count = next(count for count in _COUNTS if close(count, None))
+    for number in _NODES if omega.size > _NODES[-1] else ():
+        # The frequencies nearest to Chebyshev's points between the first and the last.
+        turns = np.cos(np.pi * (np.arange(number) + 0.5) / number)
+        left = list(range(tried.size))
+        for target in tried[0] + (tried[-1] - tried[0]) * (1 - turns) / 2:
+            left.remove(min(left, key=lambda k: abs(tried[k] - target)))
+        nodes = np.setdiff1d(np.arange(tried.size), left)
+        if close(count, nodes):
+            return _aliases_at(omega, hold, count, tried[nodes])
+    return _aliases_at(omega, hold, count)
 
 
 def evaluate_sampled(
@@ -140,95 +214,3 @@ def remarks_on_hold(
             )
             return [Message(text, "hold")]
     return []
-
-
-def plan_aliases(model: PyTree, frf: FrequencyResponse) -> Aliases:
-    """As many aliases and as few nodes as a model's response needs, whose input was held.
-
-    **Arguments:**
-
-    - `model`: near the ones that are to be evaluated.
-    - `frf`: the measured response that they are compared with.
-    """
-    hold, omega = hold_of(frf), np.asarray(frf.omega)
-    tried = omega[np.unique(np.linspace(0, omega.size - 1, _TRIED).round().astype(int))]
-    aliases = _aliases_at(tried, hold, _COUNTS[-1])
-    response = np.asarray(_evaluate(model, tried, aliases.omega))
-    bad = ~np.isfinite(response).all(axis=tuple(range(1, response.ndim)))
-    if bad.any():
-        first = np.concatenate([tried, np.ravel(aliases.omega)])[int(np.argmax(bad))]
-        raise ValueError(
-            Message(
-                "the response of the model is not finite at its starting values, first at "
-                f"{first:.4g} rad/s: «start from other values»"
-            )
-        )
-    direct, others = response[: tried.size], response[tried.size :]
-    others = others.reshape(2, *aliases.upper.shape, *direct.shape[1:])
-
-    def total(count: int, nodes: np.ndarray | None) -> np.ndarray:
-        """The response from fewer aliases, and interpolated between some of the frequencies."""
-        some = others[:, slice(None) if nodes is None else nodes, :count]
-        plan = _aliases_at(tried, hold, count, None if nodes is None else tried[nodes])
-        return np.asarray(plan.total(direct, some.reshape(-1, *direct.shape[1:])))
-
-    best = total(_COUNTS[-1], None)
-    close = lambda *plan: bool(np.all(np.abs(total(*plan) - best) <= _TOLERANCE * abs(best)))
-    count = next(count for count in _COUNTS if close(count, None))
-    for number in _NODES if omega.size > _NODES[-1] else ():
-        # The frequencies nearest to Chebyshev's points between the first and the last.
-        turns = np.cos(np.pi * (np.arange(number) + 0.5) / number)
-        left = list(range(tried.size))
-        for target in tried[0] + (tried[-1] - tried[0]) * (1 - turns) / 2:
-            left.remove(min(left, key=lambda k: abs(tried[k] - target)))
-        nodes = np.setdiff1d(np.arange(tried.size), left)
-        if close(count, nodes):
-            return _aliases_at(omega, hold, count, tried[nodes])
-    return _aliases_at(omega, hold, count)
-
-
-def _is_numpy(x: Numbers) -> bool:
-    """Whether to plan in NumPy: one-off arithmetic that JAX would compile piece by piece."""
-    return isinstance(x, np.ndarray)
-
-
-def _imaginary(omega: Float[Numbers, "..."]) -> Complex[Numbers, "..."]:
-    return 1j * omega if _is_numpy(omega) else imaginary(omega)
-
-
-@eqx.filter_jit
-def _evaluate(model, omega, others):
-    return evaluate_response(model, jnp.concatenate([omega, others]))
-
-
-def _aliases_at(omega, hold: float, count: int, nodes: np.ndarray | None = None) -> Aliases:
-    """The aliases of all frequencies, or of the nodes between which they are interpolated."""
-    at = (omega if nodes is None else nodes)[:, None]
-    steps = 2 * np.pi / hold * np.arange(1, count + 1)[None]
-    exp = np.exp if _is_numpy(omega) else jnp.exp
-    turn = (1 - exp(-hold * _imaginary(omega))) / hold
-    across = np.eye(len(omega))
-    if nodes is not None:  # from values at the nodes to the polynomial through them
-        middle, half = 0.5 * (nodes[-1] + nodes[0]), 0.5 * (nodes[-1] - nodes[0])
-        basis = lambda x: np.polynomial.chebyshev.chebvander((x - middle) / half, nodes.size - 1)
-        across = np.linalg.solve(basis(nodes).T, basis(np.asarray(omega)).T).T
-    # A smooth end makes the rest of a sum that turns with a delay vanish faster than any power; of
-    # one that does not turn it is a series in 1 / count, of which two lengths cancel the first term
-    # (Richardson's extrapolation).
-    place = np.arange(1, count + 1) / (count + 1)
-    weights = (_step(place) - _SECOND * _step(place / _SECOND)) / (1 - _SECOND)
-    return Aliases(
-        direct=turn / _imaginary(omega),
-        spread=turn[:, None] * across.astype(turn.dtype),
-        upper=at + steps,
-        lower=steps - at,
-        weights=weights,
-    )
-
-
-def _step(place: Float[np.ndarray, " aliases"]) -> Float[np.ndarray, " aliases"]:
-    """From 1 to 0 at 1, with all derivatives."""
-    x = np.clip((place - _FLAT) / (1 - _FLAT), 0, 1)
-    with np.errstate(divide="ignore", over="ignore"):
-        rise, fall = np.exp(-1 / x), np.exp(-1 / (1 - x))
-    return fall / (rise + fall)

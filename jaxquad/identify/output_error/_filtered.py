@@ -26,7 +26,7 @@ from jaxquad.models import sample_rational, TransferFunction
 
 from ..frequency_domain._parameters import Numbers
 from ..frequency_domain._solve import evaluate, Frame, take_apart
-from ..uncertainty._accuracy import row_products
+from ._coloured_noise import row_products
 from ._problem import Evaluation, insert_parameters, OutputError, RecordTerm
 from ._simulated import band_filter, linear_model
 
@@ -241,7 +241,7 @@ def _point(problem: OutputError, programs: list[Program], z: np.ndarray) -> Filt
     misfits, slopes = np.zeros(0), np.zeros((0, z.size))
     if problem.base.quantities:
         [priors] = evaluate(problem.base, z)
-        misfits, slopes = priors.misfits, priors.slopes.T[:, : z.size]
+        misfits, slopes = priors.prior_misfits, priors.prior_slopes[:, : z.size]
     return FilteredPoint(problem, programs, z, records, misfits, slopes)
 
 

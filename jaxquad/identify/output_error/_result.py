@@ -11,27 +11,26 @@ from jaxquad._core import Message
 from jaxquad.records import Record
 
 from ..frequency_domain._result import Fit
-from ..uncertainty._accuracy import (
-    calibrated_covariance,
-    Matrix,
-    Noise,
-    orthogonal_factors,
-    orthonormal,
-    PriorRows,
-    projected_noise,
-    scaled_inverse,
-)
-from ..uncertainty._assess import identifiability_of, make_fit, ranks_of
-from ..uncertainty._error_budget import prior_rows, rescale, units_of
-from ..uncertainty._fit_remarks import (
+from ..uncertainty._assess import (
     is_unfinished,
+    make_fit,
     no_minimum,
     no_model,
     remarks_on_priors,
     runaways,
 )
-from ..uncertainty._identifiability import Information
-from ..uncertainty._verdict import NO_MINIMUM, Verdict
+from ..uncertainty._error_budget import (
+    calibrated_covariance,
+    Matrix,
+    Noise,
+    prior_rows,
+    PriorRows,
+    rescale,
+    scaled_inverse,
+    units_of,
+)
+from ..uncertainty._verdict import identifiability_of, Information, NO_MINIMUM, Verdict
+from ._coloured_noise import orthogonal_factors, orthonormal, projected_noise
 from ._descent import Descent, with_fixed_slopes
 from ._problem import evaluate_misfits, Evaluation, RecordTerm
 
@@ -178,10 +177,10 @@ def _verdict(
         return Information(
             root=_signed_root(reduced),
             covariance=covariance,
-            names=tuple(place.name for place in places),
+            by_noise=covariance,
+            places=places,
             values=np.asarray(solution.values)[: reduced.aim.size],
             units=units[: reduced.aim.size],
-            order=ranks_of(places),
             same=ft.partial(_same_outputs, descent),
         )
 

@@ -12,7 +12,7 @@ from jaxquad._compile import hasty_options, Jit
 from jaxquad.models import evaluate_response, simulate_linear, TransferFunction
 
 from ..output_error._simulated import linear_model
-from ._accuracy import Matrix
+from ._error_budget import Matrix
 from ._verdict import reach_of_interval
 
 

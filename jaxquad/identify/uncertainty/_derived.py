@@ -12,8 +12,7 @@ from jaxtyping import Array, Complex, Float, PyTree
 from jaxquad.models import TransferFunction
 
 from ..frequency_domain._parameters import number_at, Parameters
-from ._identifiability import LIMIT
-from ._verdict import Combination, reach_of_interval, UndeterminedError, USUAL
+from ._verdict import Combination, LIMIT, reach_of_interval, UndeterminedError, USUAL
 
 
 if TYPE_CHECKING:

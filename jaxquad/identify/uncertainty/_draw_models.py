@@ -11,7 +11,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, PyTree
 from jaxquad._core import as_array
 
 from ..frequency_domain._parameters import Parameters
-from ._accuracy import Matrix
+from ._error_budget import Matrix
 from ._verdict import NO_MINIMUM, UndeterminedError
 
 

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, UInt
 
-from .._clock import unwrap
+from .._channel import unwrap
 from .._errors import ReadError
 from .._log import Log, number_in, Table
 

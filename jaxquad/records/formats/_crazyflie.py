@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from .._clock import unwrap
+from .._channel import unwrap
 from .._errors import ReadError
 from .._log import Log, Table
 

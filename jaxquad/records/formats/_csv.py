@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from .._clock import FEWEST
+from .._channel import FEWEST
 from .._errors import ReadError
 from .._log import columns_of, Log, Table
 
