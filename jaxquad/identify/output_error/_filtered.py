@@ -26,7 +26,7 @@ from jaxquad.models import sample_rational, TransferFunction
 
 from ..frequency_domain._parameters import Numbers
 from ..frequency_domain._solve import evaluate, Frame, take_apart
-from ._coloured_noise import row_products
+from ._noise import row_products
 from ._problem import Evaluation, insert_parameters, OutputError, RecordTerm
 from ._simulated import band_filter, linear_model
 
