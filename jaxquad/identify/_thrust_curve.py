@@ -61,22 +61,10 @@ class FirmwareValue(NamedTuple):
         return content
 
 
-def curve_parameter(firmware: CurveFirmware) -> str:
-    """The name of the parameter; ValueError for another firmware."""
+def _parameter(firmware: CurveFirmware) -> tuple[str, float, float, float]:
     if firmware not in _PARAMETERS:
         raise ValueError(f"firmware is {firmware!r}: use one of {', '.join(_PARAMETERS)}")
-    return _PARAMETERS[firmware][0]
-
-
-def parameter_of_curve(firmware: CurveFirmware, curve: Combination) -> FirmwareValue:
-    """The parameter that inverts this f, with the error of f."""
-    name, factor, least, most = _PARAMETERS[firmware]
-    convert = _cubic if firmware == "betaflight 2025.12" else float
-    slope = (convert(curve.value + 1e-4) - convert(curve.value - 1e-4)) / 2e-4
-    value, error = factor * convert(curve.value), factor * abs(slope) * curve.standard_error
-    reach = reach_of_interval(curve.degrees_of_freedom) * error
-    interval = (value - reach, value + reach)
-    return FirmwareValue(name, float(np.clip(value, least, most)), error, interval)
+    return _PARAMETERS[firmware]
 
 
 def _cubic(curve: float) -> float:
@@ -102,8 +90,7 @@ def curve_of_parameter(firmware: CurveFirmware, value: float | int) -> float:
 
     - `ValueError`: for another firmware.
     """
-    curve_parameter(firmware)
-    share = float(value) / _PARAMETERS[firmware][1]
+    share = float(value) / _parameter(firmware)[1]
     if firmware == "betaflight 2025.12":
         curves = np.linspace(0.0, 1.0, 201)
         return float(np.interp(share, [_cubic(float(curve)) for curve in curves], curves))
@@ -190,7 +177,7 @@ class ThrottleLevels(NamedTuple):
         """In words, for gains at other throttles; empty where there are several levels."""
         if self.throttle.size > 1:
             return ""
-        return _two_more_levels(float(self.throttle[0]), float(self.seconds[0]))
+        return _advise_flight(float(self.throttle[0]), 0.2, float(self.seconds[0]), _AS_WELL)
 
 
 class PlantsOverThrottle(NamedTuple):
@@ -208,6 +195,12 @@ class _Line(NamedTuple):
     weights: Float[np.ndarray, "2 levels"]  # (a, b) is this times the gains
     misfit: float  # chi^2
     probability: float  # that the family has a larger one
+
+    @property
+    def widening(self) -> float:
+        """Of errors by the curve, where the curve itself does not fit."""
+        levels = self.weights.shape[1]
+        return 1.0 if self.probability >= 0.05 else float(np.sqrt(self.misfit / (levels - 2)))
 
 
 class GainOverThrottle(eqx.Module):
@@ -315,7 +308,7 @@ class GainOverThrottle(eqx.Module):
         wide = lambda x: np.broadcast_to(np.asarray(x, float), (plants,))
         change = line.weights @ (np.asarray(models.gain) - self.gain[:, None])
         rows = self._rows(np.atleast_1d(throttle))
-        gain = rows @ (line.ends[:, None] + self._widening(line) * change)
+        gain = rows @ (line.ends[:, None] + line.widening * change)
         return PlantsOverThrottle(gain, wide(models.lag), wide(models.delay))
 
     def firmware_value(self, firmware: CurveFirmware) -> FirmwareValue:
@@ -332,10 +325,15 @@ class GainOverThrottle(eqx.Module):
         - `UndeterminedError`: the record holds too little of the curve; says what to fly.
         - `ValueError`: for another firmware.
         """
-        name, curve = curve_parameter(firmware), self.curve
+        (name, factor, least, most), curve = _parameter(firmware), self.curve
         if curve is None or _reach(curve) > _SHARP:
             raise UndeterminedError(f"{name}: {self.what_to_fly()}")
-        return parameter_of_curve(firmware, curve)
+        convert = _cubic if firmware == "betaflight 2025.12" else float
+        slope = (convert(curve.value + 1e-4) - convert(curve.value - 1e-4)) / 2e-4
+        value, error = factor * convert(curve.value), factor * abs(slope) * curve.standard_error
+        reach = reach_of_interval(curve.degrees_of_freedom) * error
+        interval = (value - reach, value + reach)
+        return FirmwareValue(name, float(np.clip(value, least, most)), error, interval)
 
     def adrc_b0(self, hover: float, *, largest: float = 3.0) -> ScaledB0:
         """adrc_b0 and the law over the throttle of Betaflight's proposed ADRC.
@@ -378,15 +376,15 @@ class GainOverThrottle(eqx.Module):
         if curve is None:
             return (
                 f"the log holds one level of throttle ({first:.2f}), which shows no curve: "
-                f"{_two_more_levels(first, seconds)}"
+                f"{_advise_flight(first, 0.2, seconds, _AS_WELL)}"
             )
         reach = _reach(curve)
         if reach <= _SHARP:
             return f"the log holds enough of the thrust curve ({first:.2f} .. {last:.2f} throttle)"
         wanted = (last - first) * reach / _SHARP
         if wanted <= 0.6:
-            lower, upper = _levels_around((first + last) / 2, wanted)
-            advice = f"fly from {lower:.2f} to {upper:.2f}, {_same_excitation(seconds)}"
+            words = "from {:.2f} to {:.2f}"
+            advice = _advise_flight((first + last) / 2, wanted, seconds, words)
         else:
             advice = (
                 f"fly from 0.20 to 0.80, with {wanted / 0.6:.1f} times the amplitude or "
@@ -504,14 +502,8 @@ class GainOverThrottle(eqx.Module):
         line = self._line()
         slope = np.concatenate([by_gain, [by_lag, 0.0]]) * self.fit.units
         error = float(np.sqrt(slope @ self.fit.relative_covariance @ slope))
-        error *= 1.0 if line is None else self._widening(line)
+        error *= 1.0 if line is None else line.widening
         return Combination(name, value, error, self.fit.freedom_of(slope))
-
-    def _widening(self, line: _Line) -> float:
-        """Of errors by the curve, where the curve itself does not fit."""
-        if line.probability >= 0.05:
-            return 1.0
-        return float(np.sqrt(line.misfit / (self.throttle.size - 2)))
 
     def _by_curve(self, throttle: float, *, over_lag: bool) -> Combination:
         """The gain at a throttle, or gain / lag."""
@@ -539,20 +531,14 @@ class GainOverThrottle(eqx.Module):
             )
 
 
-def _levels_around(middle: float, span: float) -> tuple[float, float]:
-    """A range of throttle of this span that can be flown."""
+def _advise_flight(middle: float, span: float, seconds: float, words: str) -> str:
     lower = float(np.clip(middle - span / 2, 0.15, 0.85 - min(span, 0.7)))
-    return lower, min(lower + span, 0.85)
-
-
-def _two_more_levels(throttle: float, seconds: float) -> str:
-    lower, upper = _levels_around(throttle, 0.2)
-    return f"fly {lower:.2f} and {upper:.2f} as well, {_same_excitation(seconds)}"
-
-
-def _same_excitation(seconds: float) -> str:
     turns = ", in turns of about 8 s, as the vehicle sinks or climbs" if seconds > 10 else ""
-    return f"with the same excitation for {seconds:.0f} s at each{turns}"
+    levels = words.format(lower, min(lower + span, 0.85))
+    return f"fly {levels}, with the same excitation for {seconds:.0f} s at each{turns}"
+
+
+_AS_WELL = "{:.2f} and {:.2f} as well"
 
 
 def _reach(number: Combination) -> float:

@@ -261,8 +261,9 @@ class Projected(NamedTuple):
 
 
 class Reduced(NamedTuple):
-    """In the coordinates of orthonormal combinations of the slopes; free parameters first."""
+    """All records, in orthonormal combinations of their slopes; free parameters first."""
 
+    records: list[Projected]
     root: Float[np.ndarray, "all all"]  # slopes
     aim: Vector  # misfit
     noise: Float[np.ndarray, "all all"]  # covariance of the noise in the misfit
@@ -275,8 +276,8 @@ def assess_output_error(descent: Descent, records: Sequence[Record]) -> Fit:
     base, parameters, count = problem.base, problem.base.parameters, problem.base.parameters.count
     units = units_of(solution)
     scale, prior = rescale(solution, units), prior_rows(solution, units)
-    projected = _project_records(descent, descent.evaluation, scale[:count])
-    reduced = _reduce_rows(projected, problem.terms, count)
+    reduced = _reduce(descent, descent.evaluation, scale[:count])
+    projected = reduced.records
     root, slopes = reduced.root[:, :count], prior.slopes[:, :count]
     bread = root.T @ root + slopes.T @ slopes
     gradient = root.T @ reduced.aim + slopes.T @ prior.misfit
@@ -335,34 +336,26 @@ def assess_output_error(descent: Descent, records: Sequence[Record]) -> Fit:
     )
 
 
-def _project_records(descent: Descent, evaluation: Evaluation, scale: Vector) -> list[Projected]:
-    """Each record with slopes by relative changes, orthogonal to what else is fitted to it.
+def _reduce(descent: Descent, evaluation: Evaluation, scale: Vector) -> Reduced:
+    """Slopes by relative changes, orthogonal to what else is fitted to each record.
 
     That is its initial state, its trim and its noise model: the errors are those of a joint
     estimate, in a closed loop too, where the input depends on the noise.
     """
-    projected, at = [], scale.size
+    projected, at, every = [], scale.size, scale.size
     noises = [noise.slopes for noise in descent.noise] or [None] * len(evaluation.misfits)
-    parts = zip(descent.problem.terms, *evaluation[:3], noises, strict=True)
-    for term, misfit, slopes, columns, noise in parts:
+    terms, count = descent.problem.terms, descent.problem.base.parameters.count
+    for term, misfit, slopes, columns, noise in zip(terms, *evaluation[:3], noises, strict=True):
         slopes, states = np.asarray(slopes), term.start.size
         others = [np.asarray(columns), slopes[:, :, at : at + states], noise]
         others = [part for part in others if part is not None and part.shape[2]]
         basis = orthonormal(others[0] if len(others) == 1 else np.concatenate(others, axis=2))
-        mine = slopes[:, :, : scale.size] * scale
-        rows, flat = mine.reshape(-1, scale.size), basis.reshape(-1, basis.shape[2])
+        mine = slopes[:, :, :every] * scale
+        rows, flat = mine.reshape(-1, every), basis.reshape(-1, basis.shape[2])
         # Series are rows in memory: so are their products.
         left = (rows.T - (rows.T @ flat) @ flat.T).T.reshape(mine.shape)
         projected.append(Projected(np.asarray(misfit), left, basis))
         at += states
-    return projected
-
-
-def _reduce_rows(
-    projected: Sequence[Projected], terms: Sequence[RecordTerm], count: int
-) -> Reduced:
-    """Slopes, misfit, noise and output in one orthonormal basis of the slopes of all records."""
-    every = projected[0].slopes.shape[2]
     stacked = [one.slopes.reshape(-1, every).T for one in projected]
     stacked = np.concatenate([*stacked, np.zeros((every, every))], axis=1)
     basis, root = orthogonal_factors(stacked.T)
@@ -374,14 +367,14 @@ def _reduce_rows(
         output += np.asarray(term.measured).reshape(-1) @ flat
         noise += projected_noise(mine, one.misfit, one.nuisance, count)
         at += one.misfit.size
-    return Reduced(root, aim, noise, output)
+    return Reduced(projected, root, aim, noise, output)
 
 
 def _verdict(
     descent: Descent, reduced: Reduced, prior: PriorRows, covariance: Matrix, units: Vector
 ) -> tuple[Verdict, Verdict]:
     """What data and priors determine; fixed parameters are looked at for names alone."""
-    solution, terms, count = descent.solution, descent.problem.terms, len(covariance)
+    solution, count = descent.solution, len(covariance)
 
     def information(reduced: Reduced) -> Information:
         places = descent.problem.base.parameters.places[: reduced.aim.size]
@@ -399,8 +392,8 @@ def _verdict(
     verdicts = identifiability_of(information(reduced), free)
     if units.size == count or not any(verdict.undetermined for verdict in verdicts):
         return verdicts
-    projected = _project_records(descent, with_fixed_slopes(descent), rescale(solution, units))
-    return identifiability_of(information(_reduce_rows(projected, terms, count)), prior)
+    reduced = _reduce(descent, with_fixed_slopes(descent), rescale(solution, units))
+    return identifiability_of(information(reduced), prior)
 
 
 def _signed_root(reduced: Reduced) -> Float[np.ndarray, "rows all"]:
