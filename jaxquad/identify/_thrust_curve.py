@@ -20,9 +20,8 @@ from ._curve_parameters import (
     FirmwareValue,
     parameter_of_curve,
 )
-from .frequency_domain._fit_content import counted
-from .frequency_domain._result import Fit
-from .uncertainty._draw_models import draw_models
+from .frequency_domain._result import counted, Fit
+from .uncertainty._derived import draw_models
 from .uncertainty._verdict import Combination, UndeterminedError
 
 
