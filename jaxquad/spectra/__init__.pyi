@@ -1,4 +1,3 @@
-from ._checks import DOMINATED as DOMINATED, EARLY as EARLY, Remark as Remark
 from ._closed_loop import (
     BrokenLoop as BrokenLoop,
     deembed as deembed,
@@ -13,10 +12,13 @@ from ._error_covariance import (
 )
 from ._estimators import (
     Composite as Composite,
+    DOMINATED as DOMINATED,
+    EARLY as EARLY,
     Estimator as Estimator,
     JointInputOutput as JointInputOutput,
     LocalPolynomial as LocalPolynomial,
     Periodic as Periodic,
+    Remark as Remark,
     Welch as Welch,
 )
 from ._frequency_response import (

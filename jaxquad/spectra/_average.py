@@ -6,8 +6,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Complex, Float
 
-from ._checks import adjoint, diagonal, Grid, Levels, Pairs, power_of, Responses
 from ._error_covariance import window_products
+from ._estimators import adjoint, diagonal, Grid, Levels, Pairs, power_of, Responses
 from ._fourier_sums import coefficients, Layout
 from ._noise import noise_root, padded, Resolved, Slopes, without_leakage
 

@@ -13,8 +13,7 @@ from jaxquad._core import Message
 from jaxquad.models import Model
 from jaxquad.records import Record
 
-from ._checks import check_compatible, check_references, COHERENT, Grid, in_hertz, Remark
-from ._estimators import Welch
+from ._estimators import check_compatible, check_references, COHERENT, Grid, in_hertz, Remark, Welch
 from ._frequency_response import FrequencyResponse
 from ._welch import spectral_density
 

@@ -10,7 +10,7 @@ from jaxtyping import Complex, Float, Int
 
 from jaxquad.records import Record
 
-from ._checks import (
+from ._estimators import (
     COHERENT,
     DOMINATED,
     EARLY,

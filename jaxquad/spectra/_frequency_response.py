@@ -14,26 +14,31 @@ from jaxtyping import Array, ArrayLike, Bool, Complex, Float
 from jaxquad._core import pytree_node, require_float64, require_x64
 from jaxquad.records import Record
 
-from ._checks import (
+from ._error_covariance import ErrorCovariance, independent_errors
+from ._estimators import (
     check_band,
     check_compatible,
     check_distinct,
     check_excitation,
     check_references,
     COHERENT,
+    Composite,
     DOMINATED,
+    Estimator,
     Grid,
     in_hertz,
+    JointInputOutput,
     Levels,
+    LocalPolynomial,
     Method,
     Pairs,
+    Periodic,
     Remark,
     Remarks,
     Responses,
     Square,
+    Welch,
 )
-from ._error_covariance import ErrorCovariance, independent_errors
-from ._estimators import Composite, Estimator, JointInputOutput, LocalPolynomial, Periodic, Welch
 
 
 class Distortion(eqx.Module):

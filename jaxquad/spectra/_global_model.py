@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
 
-from ._checks import diagonal, Grid
+from ._estimators import diagonal, Grid
 from ._local_fit import Bins, left_power, LocalFit, window_slices
 from ._local_noise import SharedErrors
 from ._noise import Noise

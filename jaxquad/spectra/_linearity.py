@@ -17,7 +17,7 @@ from jaxtyping import Complex, Float, Int, Real
 
 from jaxquad.records import Record
 
-from ._checks import COHERENT, Grid, in_hertz, Method, Remark, Response
+from ._estimators import COHERENT, Grid, in_hertz, Method, Remark, Response
 from ._frequency_response import Estimate
 
 

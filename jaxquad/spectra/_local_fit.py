@@ -11,7 +11,7 @@ from jaxtyping import Bool, Complex, Float, Int
 
 from jaxquad.records import Record
 
-from ._checks import adjoint, diagonal, Grid, Levels, Pairs, Places, Responses, Where
+from ._estimators import adjoint, diagonal, Grid, Levels, Pairs, Places, Responses, Where
 
 
 class Bins(NamedTuple):

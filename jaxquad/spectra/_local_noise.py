@@ -6,8 +6,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
 
-from ._checks import adjoint, diagonal, Grid, Levels, Pairs, Places, Where
 from ._error_covariance import ErrorCovariance, reach_of
+from ._estimators import adjoint, diagonal, Grid, Levels, Pairs, Places, Where
 from ._local_fit import Bins, LocalFit
 from ._noise import Noise, smooth_noise
 

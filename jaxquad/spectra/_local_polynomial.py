@@ -13,8 +13,7 @@ from jaxtyping import Float
 from jaxquad._core import one_blas_thread
 from jaxquad.records import Record
 
-from ._checks import COHERENT, diagonal, Grid, Method, Remark, Where
-from ._estimators import LocalPolynomial
+from ._estimators import COHERENT, diagonal, Grid, LocalPolynomial, Method, Remark, Where
 from ._frequency_response import Estimate
 from ._global_model import (
     highest_looked_at,

@@ -6,8 +6,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from ._checks import diagonal, Grid, Places, Where
-from ._estimators import LocalPolynomial
+from ._estimators import diagonal, Grid, LocalPolynomial, Places, Where
 from ._local_fit import Bins, LocalFit, window_slices
 from ._noise import Noise
 

@@ -16,7 +16,7 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
 
-from ._checks import (
+from ._estimators import (
     adjoint,
     Covariances,
     diagonal,

@@ -13,9 +13,19 @@ from jaxtyping import Bool, Complex, Float, Int
 from jaxquad._core import Message
 from jaxquad.records import Record
 
-from ._checks import adjoint, Covariances, diagonal, Grid, Levels, Method, Remark, Responses, Where
 from ._error_covariance import ErrorCovariance
-from ._estimators import Periodic
+from ._estimators import (
+    adjoint,
+    Covariances,
+    diagonal,
+    Grid,
+    Levels,
+    Method,
+    Periodic,
+    Remark,
+    Responses,
+    Where,
+)
 from ._frequency_response import Distortion, Estimate
 from ._noise import smooth_noise, smoothed
 
