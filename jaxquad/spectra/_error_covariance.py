@@ -124,10 +124,8 @@ class ErrorCovariance:
         drawn: Complex[np.ndarray, "frequencies inputs groups roots columns"],
         columns: Complex[np.ndarray, "frequencies outputs inputs columns"],
     ) -> Iterator[Complex[np.ndarray, "atoms roots_columns"]]:
-        """What noise of unit power does to Re(sum of `conj(columns) dT`), a piece at a time.
-
-        The pieces are some of the times that windows overlap, or some of the atoms.
-        """
+        """What unit noise does to Re(sum of `conj(columns) dT`), by pieces of the times or the
+        atoms."""
         if self.windows is not None:
             along = np.swapaxes(drawn, 1, 2).reshape(-1, drawn.shape[3] * drawn.shape[4])
             for k in range(0, self.windows.times.size, _CHUNK):

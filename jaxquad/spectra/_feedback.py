@@ -56,10 +56,8 @@ _FED_BACK = (
 def remarks_on_feedback(
     records: Sequence[Record], method: Method, estimate: Estimate
 ) -> tuple[Remark, ...]:
-    """Remarks on feedback that a user of the response has to know.
-
-    Points of a response whose errors overlapping windows correlate count as independent.
-    """
+    """Remarks on feedback; points whose errors overlapping windows correlate count as
+    independent."""
     from scipy.special import ndtri
 
     outputs, inputs, omega = records[0].output_names, records[0].input_names, estimate.omega
@@ -137,11 +135,10 @@ class PhaseSlope(NamedTuple):
         covariance: Covariance | None = None,
         clear: float = 3.0,
     ) -> bool:
-        """Whether the phase increases, by `clear` standard errors.
+        """Whether the phase increases by `clear` standard errors, as that of -1/C and of no
+        actuator.
 
-        Every actuator lags, so a plant's phase decreases there. That of -1/C, with a controller
-        that filters and delays, increases. Neighbours share noise, which makes a slope less certain
-        than its many points say: the response's `covariance` is asked for where these say that it
+        Neighbours share noise: the `covariance` is asked for where the points alone say that it
         rises.
         """
         variance, top = self.variance, self.top
@@ -187,9 +184,9 @@ _EXACT = 1e-7  # of its power: new parts of the output below it say nothing
 class Share(NamedTuple):
     """Of the input's power at each frequency, that which the output's innovations make.
 
-    Innovations are what the past of both signals does not predict. What both have in common at one
-    sample counts as the output's in `output_first`, because a plant takes time to answer, and as
-    the input's in `input_first`, because a logger may write an answer beside its cause.
+    What both have in common at one sample is the output's in `output_first`, because a plant takes
+    time to answer, and the input's in `input_first`, because a logger may write an answer beside
+    its cause.
     """
 
     output_first: Grid
@@ -199,17 +196,11 @@ class Share(NamedTuple):
 def share_from_output(
     records: Sequence[Float[np.ndarray, "2 _samples"]], dt: float, omega: Grid
 ) -> Share:
-    """The directed share of Geweke (1982); zero where the records are too short for a model.
+    """The directed share of Geweke (1982) by an autoregressive model; zero for records too short.
 
-    It is that of a joint autoregressive model of both. At which sample rate innovations tell a
-    loop's directions apart depends on its noise: of several rates, the one with the largest median
-    counts. At a rate so slow that a plant answers within one sample, it can be mistaken for its
+    `records` are of output and input. Of several sample rates, the one with the largest median
+    counts. At one so slow that a plant answers within a sample, it can be mistaken for its
     controller: the highest rate has to show half of it, too.
-
-    **Arguments:**
-
-    - `records`: output and input, sampled every `dt` seconds.
-    - `omega`: frequencies in rad/s, increasing.
     """
     flat = []
     for x in records:  # without offset and trend, in units of the standard deviation

@@ -333,10 +333,7 @@ def _like(name: str, numbers: ArrayLike, values: np.ndarray) -> np.ndarray:
 
 
 class Estimate(NamedTuple):
-    """What an estimator makes of records; nan and infinite errors where it is undetermined.
-
-    `remarks` are the estimator's own, made where they are asked for.
-    """
+    """What an estimator makes of records; nan and infinite errors where it is undetermined."""
 
     omega: Grid
     response: Responses

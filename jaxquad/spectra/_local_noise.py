@@ -25,10 +25,10 @@ Left = Complex[np.ndarray, "frequencies outputs moved"]
 
 
 class SharedErrors(NamedTuple):
-    """Errors of real parameters p that the noise at some bins has moved by Re(drive W).
+    """Errors of real parameters that noise W of unit power has moved by Re(drive W), `roots` to a
+    bin.
 
-    W are circular noises of unit power, `roots` to a bin. The drive is that of one noise of unit
-    power times its share of the roots: all of a long record at once would fill the memory.
+    The drive is that of one noise times its share of the roots: all at once would fill the memory.
     """
 
     slopes: Complex[np.ndarray, "frequencies outputs inputs parameters"]
@@ -49,8 +49,7 @@ class SharedErrors(NamedTuple):
     ) -> tuple[np.ndarray, np.ndarray, Int[np.ndarray, " driven"]]:
         """Slopes by the parameters' errors of unit size, their drive by atoms, and which atoms.
 
-        The bins that no local fit reaches are one more atom for each parameter, with the same
-        covariance: their numbers follow those of all bins.
+        The bins that no local fit reaches are one more atom for each parameter, behind all bins.
         """
         level = np.sum(np.abs(self.lines) ** 2, axis=2)
         pairs = zip(self.single, self.line, strict=True)
@@ -83,11 +82,8 @@ def error_covariance(
 ) -> ErrorCovariance:
     """Errors of `fit`, recoloured by `back`; `at` is the place of each frequency in `noise`.
 
-    The atoms are the bins, each with the noise of its own frequency. Where the residual is larger
-    than chance allows, the error is as much larger: it must not shrink below a local misfit.
-    The noise of the fit is `left` times that of the `sources`, with the factor of the fit's own
-    frequency at all its bins. The same noise disturbs the global `models`, whose response is part
-    of that of `fit`.
+    The atoms are the bins, each with its own noise: `left` times that of the `sources`. Where the
+    residual is larger than chance allows, so is the error. The same noise disturbs the `models`.
     """
     colour = _colour_of_noise(sources, left, omega, bins, fit)
     effect = fit.effect * np.exp(0.5 * np.mean(np.log(colour), axis=2))[:, None, :]
@@ -167,10 +163,8 @@ def multiple_coherence(fit: LocalFit, noise: Levels) -> Levels:
 def unresolved(
     omega: Grid, fit: LocalFit, noise: Noise, at: Places, bins: Bins, moved: slice
 ) -> Where:
-    """Where `fit` leaves residuals far above the noise, seldom by chance in a whole record.
-
-    Residuals of less than a hundredth of what `moved` in the window do no harm.
-    """
+    """Where `fit` leaves residuals far above the noise, and more than a hundredth of what
+    `moved`."""
     outputs = fit.response.shape[1]
     left = np.broadcast_to(np.eye(outputs, dtype=complex), (omega.size, outputs, outputs))
     colour = _colour_of_noise(noise, left, omega, bins, fit)
@@ -215,11 +209,10 @@ def joint_factors(fit: LocalFit, inputs: int) -> tuple[np.ndarray, np.ndarray, n
 
 
 def joint_fit(fit: LocalFit, inputs: int) -> LocalFit:
-    """The fit of the plant, G = T_ry T_ru^-1, from that of the references to [inputs, outputs].
+    """G = T_ry T_ru^-1 of the fit from references to [inputs, outputs], with the error of v = y - G
+    u.
 
-    Its error is (dT_ry - G dT_ru) T_ru^-1: the noise is v = y - G u, and the effect that of the
-    references taken through T_ru^-1. Source: Pintelon and Schoukens, System Identification,
-    2nd ed., section 2.6 (several inputs: 7.2.7).
+    Source: Pintelon and Schoukens, System Identification, 2nd ed., section 2.6 and 7.2.7.
     """
     invertible, left, back = joint_factors(fit, inputs)
     through, response = fit.response[:, :inputs], -left[:, :, :inputs]
@@ -243,8 +236,7 @@ def coherence_of_references(
 ) -> Pairs:
     """Partial coherence of the joint estimate: the smaller of the shares of input and output.
 
-    Of the input, what the references move of it and of no other input; of the output, what
-    responds to that, beside the noise. Source: Bendat and Piersol, Random Data, ch. 7.
+    Source: Bendat and Piersol, Random Data, ch. 7.
     """
     noise = smooth_noise(omega, half_width, fit.scatter, fit.freedom)
     moved = noise.power[:, None, :inputs]
@@ -260,10 +252,8 @@ def share_of_inputs(
     at: Places,
     inputs: int,
 ) -> Pairs:
-    """Share of a joint estimate's squared error that the noise of T_ru makes, and not of T_ry.
-
-    `left` is [-G, 1]; half of what both make together counts.
-    """
+    """Share of a joint estimate's squared error by the noise of T_ru, half of what both make
+    included."""
     root = noise.root()[at]
     total = left @ root
     of_inputs = left[:, :, :inputs] @ root[:, :inputs]
@@ -274,10 +264,8 @@ def share_of_inputs(
 
 
 def find_unmoved(moved: LocalFit, noise: Noise, at: Places, inputs: int) -> Where:
-    """Where the references move an input too little to divide by.
-
-    There the joint ratio is that of two noises: -1 over the controller, with hardly any residual.
-    """
+    """Where references hardly move an input: the joint ratio of two noises is -1 over the
+    controller."""
     invertible, _, back = joint_factors(moved, inputs)
     effect = np.sum(np.abs(np.swapaxes(back, 1, 2) @ moved.effect) ** 2, axis=2)
     relative = np.sqrt(noise.power[at][:, :inputs] * effect / 2)

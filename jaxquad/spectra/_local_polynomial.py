@@ -80,9 +80,7 @@ def estimate_local_polynomial(
 ) -> Estimate:
     """Responses of all outputs to all inputs at increasing `omega` in rad/s, from all records.
 
-    Coherence is the share of an output's power near each frequency that an input explains beyond
-    the other inputs; in the joint estimate, the smaller of the shares of input and output that the
-    references explain.
+    Coherence is that near each frequency; of the joint estimate, the smaller of input and output.
     """
     inputs, outputs = records[0].inputs.shape[1], records[0].outputs.shape[1]
     bins, dt = record_bins(records, options.integrators, options.delay), records[0].dt
@@ -231,9 +229,8 @@ class Setup(NamedTuple):
 def _repair_models(setup: Setup, rest: Rest) -> tuple[Rest, LocalFit]:
     """What better models leave where those of `rest` miss the response, and the narrow fits of it.
 
-    A model can fit the loud bins alone: what it leaves of the quiet ones counts as their noise, and
-    they never matter. It may be many times the response there, which biases the local fits. The
-    better models' bins count by the noise of the local fits.
+    A model can fit the loud bins alone, and be many times the response at quiet ones, which biases
+    the local fits. The better models' bins count by the noise of the local fits.
     """
     fit, left = _narrowly(setup, rest)
     for _ in range(_REPAIRS):
@@ -258,8 +255,7 @@ def _repair_models(setup: Setup, rest: Rest) -> tuple[Rest, LocalFit]:
 def _narrowly(setup: Setup, rest: Rest) -> tuple[LocalFit, Float[np.ndarray, " moved"]]:
     """Fits from the sources to what they move, and what models leave, to what the fits leave.
 
-    A window is widened where it determines nothing, as between the lines of a multisine; a rational
-    fit counts where its residual is so much smaller that there must be a resonance.
+    A rational fit counts where its residual is so much smaller that there must be a resonance.
     """
     grid, width = setup.windows.grid, setup.windows.narrow
     respond = setup.to_moved(rest)

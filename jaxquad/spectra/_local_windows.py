@@ -94,10 +94,8 @@ def make_windows(
 
 
 def _smallest_widths(omega: Grid, bins: Bins, columns: int, transient: int) -> Grid:
-    """Half-widths in rad/s of the smallest windows with enough more bins than coefficients.
-
-    `columns` is the number of coefficients of the response, `transient` that of each record.
-    """
+    """Half-widths of the smallest windows with enough more bins than response and transients
+    have."""
     least, most = np.zeros_like(omega), np.full_like(omega, bins.omega[-1])
     grids = [bins.omega[bins.record == r] for r in range(bins.records)]
     for _ in range(40):
@@ -115,15 +113,13 @@ def _smallest_widths(omega: Grid, bins: Bins, columns: int, transient: int) -> G
 def choose_widths(
     omega: Grid, least: Grid, reach: Grid, noise: Noise, respond: Respond
 ) -> tuple[Grid, Where]:
-    """Half-widths from `least` to `reach`, by intersecting confidence intervals.
+    """Half-widths from `least` to `reach`, by intersecting confidence intervals, and where
+    rational.
 
-    Also returns where a rational function is used.
     A wider window is used while its response agrees with those of all narrower ones within the
-    variance of their difference (Goldenshluger and Nemirovski, 1997), at the frequency and on
-    average over its neighbours. This test cannot see a bias of the size of the noise, so the window
-    used is one step smaller, where the bias is about five times smaller. Where the smallest window
-    leaves more than noise, as at a resonance, a rational function replaces the polynomial, if it is
-    accurate there.
+    variance of their difference (Goldenshluger and Nemirovski, 1997), also on average over its
+    neighbours. The test cannot see a bias of the size of the noise: the window is one step smaller,
+    its bias a fifth.
     """
     widest = np.maximum(reach, least)
     steps = int(np.ceil(np.log(np.max(widest / least)) / np.log(_RATIO) - 1e-9)) + 1
@@ -154,10 +150,8 @@ def _without_effect(fit: LocalFit) -> LocalFit:
 
 
 def _resonant(fits: Sequence[LocalFit], sharp: LocalFit, noise: Noise) -> Where:
-    """Where a polynomial is wrong and a rational function accurate.
-
-    The error of a rational function is linear in the noise only while it is small.
-    """
+    """Where a polynomial is wrong and a rational function accurate: its error linear in the
+    noise."""
     pairs = noise.power.shape[1] * sharp.response.shape[2]
     left = diagonal(fits[0].scatter) / noise.power
     wrong = np.any(left > _quantile(fits[0].freedom, noise, _CHANCE_ALONE)[:, None], axis=1)
@@ -215,10 +209,9 @@ def _differences(wide: LocalFit, narrow: LocalFit, noise: Noise) -> tuple[Grid, 
 def reach(omega: Grid, centre: Grid, widest: Grid, bins: Bins, columns: slice) -> Grid:
     """Half-widths in rad/s within which the excitation is even, `widest` at most.
 
-    Beyond the end of a sweep, a window that reaches back into the sweep's band takes the response
-    from there: smooth, with a small error, and wrong. So the mean power of each of the `columns` on
-    one side of `centre` (half-width) must not outweigh that at the centre, unless both sides do, as
-    between the lines of a multisine, where the response is interpolated.
+    Beyond a sweep's end, a window that reaches back takes the response from there: smooth, and
+    wrong. So the mean power on one side of `centre` must not outweigh that at the centre, unless
+    both do.
     """
     running = np.cumsum(np.abs(bins.values[:, columns]) ** 2, axis=0)
     running = np.concatenate([np.zeros((1, running.shape[1])), running])

@@ -62,7 +62,7 @@ def transform_records(
     """Transform all channels of all records; no window spans two records.
 
     With two `derivatives`, behind those of the windows too, from the first length on whose windows
-    can tell leakage from noise: the first on all channels but references, the second on inputs.
+    can tell leakage from noise: the first on inputs and outputs, the second on inputs.
     """
     require_x64("a frequency response")
     first, welch, dt = records[0], members[0], records[0].dt
