@@ -7,13 +7,22 @@ from typing import get_args, Literal, NamedTuple
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import ArrayLike, Complex, Float
+from jaxtyping import ArrayLike, Float
 
 from jaxquad._core import Message
 from jaxquad.models import Model
 from jaxquad.records import Record
 
-from ._estimators import check_compatible, check_references, COHERENT, Grid, in_hertz, Remark, Welch
+from ._estimators import (
+    check_compatible,
+    check_references,
+    COHERENT,
+    Grid,
+    in_hertz,
+    Remark,
+    Response,
+    Welch,
+)
 from ._frequency_response import FrequencyResponse
 from ._welch import spectral_density
 
@@ -40,7 +49,7 @@ class BrokenLoop(NamedTuple):
     """
 
     omega: Grid
-    response: Complex[np.ndarray, " frequencies"]
+    response: Response
     error: Grid
     coherence: Grid
 
@@ -239,14 +248,14 @@ class FeedbackBias(eqx.Module):
     estimated from the parts of input and output that the reference does not explain.
     """
 
-    omega: Float[np.ndarray, " frequencies"]  # rad/s
-    direct: Complex[np.ndarray, " frequencies"]
-    joint: Complex[np.ndarray, " frequencies"]
-    inverse: Complex[np.ndarray, " frequencies"]
-    noise_share: Float[np.ndarray, " frequencies"]  # of the input's power, 0 to 1
+    omega: Grid  # rad/s
+    direct: Response
+    joint: Response
+    inverse: Response
+    noise_share: Grid  # of the input's power, 0 to 1
 
     @property
-    def bias(self) -> Complex[np.ndarray, " frequencies"]:
+    def bias(self) -> Response:
         """Relative error of the direct estimate, H1 / G - 1."""
         return self.direct / self.joint - 1
 

@@ -11,6 +11,7 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 
 from jaxquad._core import pytree_node
 
+from ._estimators import Pairs, Places
 from ._fourier_sums import coefficients, Layout
 
 
@@ -149,7 +150,7 @@ class ErrorCovariance:
                 part[driven[taken] - low] += both.reshape(len(both), part.shape[1])
             yield part
 
-    def variance(self) -> Float[np.ndarray, "frequencies outputs inputs"]:
+    def variance(self) -> Pairs:
         """Mean squared error E|dT|^2 of each response, for independent atoms (no windows)."""
         if self.windows is not None:
             raise ValueError(
@@ -312,8 +313,8 @@ def independent_errors(
 class Reach(NamedTuple):
     """The atoms from `first` to before `last` that have an effect at each frequency."""
 
-    first: Int[np.ndarray, " frequencies"]
-    last: Int[np.ndarray, " frequencies"]
+    first: Places
+    last: Places
 
     def reached(self, count: int) -> Bool[np.ndarray, " count"]:
         """Which of `count` atoms have an effect on any frequency."""

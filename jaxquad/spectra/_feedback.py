@@ -10,17 +10,7 @@ from jaxtyping import Complex, Float, Int
 
 from jaxquad.records import Record
 
-from ._estimators import (
-    COHERENT,
-    DOMINATED,
-    EARLY,
-    Grid,
-    in_hertz,
-    Method,
-    Remark,
-    Response,
-    Where,
-)
+from ._estimators import COHERENT, DOMINATED, EARLY, Grid, in_hertz, Method, Remark, Response, Where
 from ._frequency_response import Estimate
 
 
@@ -130,10 +120,7 @@ class PhaseSlope(NamedTuple):
     order: float  # of the magnitude: -1 where it falls as 1/omega
 
     def rises(
-        self,
-        response: Response,
-        covariance: Covariance | None = None,
-        clear: float = 3.0,
+        self, response: Response, covariance: Covariance | None = None, clear: float = 3.0
     ) -> bool:
         """Whether the phase increases by `clear` standard errors, as that of -1/C and of no
         actuator.

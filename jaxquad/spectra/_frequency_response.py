@@ -198,12 +198,12 @@ class FrequencyResponse:
         )
 
     @property
-    def magnitude_db(self) -> Float[np.ndarray, "frequencies outputs inputs"]:
+    def magnitude_db(self) -> Pairs:
         """20 log10 of the magnitude."""
         return 20 * np.log10(np.abs(np.asarray(self.response)))
 
     @property
-    def phase_deg(self) -> Float[np.ndarray, "frequencies outputs inputs"]:
+    def phase_deg(self) -> Pairs:
         """Phase in degrees, unwrapped along frequency."""
         return np.degrees(np.unwrap(np.angle(np.asarray(self.response)), axis=0))
 
@@ -244,7 +244,7 @@ class FrequencyResponse:
         return covariance / np.outer(response, response.conj())
 
     @property
-    def error_exponent(self) -> Float[np.ndarray, "frequencies outputs inputs"]:
+    def error_exponent(self) -> Pairs:
         """The power p of |measurement / model| in the random error relative to a model.
 
         Noise of a numerator is relative to the measured one: error |measurement| / |model|, p = 1.

@@ -444,11 +444,7 @@ def _mean_of_cycles(phase: Signal, values: Tone | Signal, *, twice: bool = False
 
 
 def _harmonics(
-    record: Record,
-    tone: Tone,
-    omega: Grid,
-    response: OfInputs,
-    pair: tuple[int, int],
+    record: Record, tone: Tone, omega: Grid, response: OfInputs, pair: tuple[int, int]
 ) -> tuple[Complex[np.ndarray, " harmonics"], Float[np.ndarray, " harmonics"]] | None:
     """The harmonics at the plant's input, relative to its fundamental, and their inverse variance.
 

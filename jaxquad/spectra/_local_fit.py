@@ -11,7 +11,18 @@ from jaxtyping import Bool, Complex, Float, Int
 
 from jaxquad.records import Record
 
-from ._estimators import adjoint, diagonal, Grid, Levels, Pairs, Places, Responses, Where
+from ._estimators import (
+    adjoint,
+    Covariances,
+    diagonal,
+    Grid,
+    Levels,
+    Pairs,
+    Places,
+    Response,
+    Responses,
+    Where,
+)
 
 
 class Bins(NamedTuple):
@@ -65,9 +76,7 @@ def record_bins(records: Sequence[Record], integrators: int, delay: float) -> Bi
     return Bins(omega, owner, joined, len(records), largest)
 
 
-def recolour(
-    omega: Grid, integrators: int, delay: float, dt: float
-) -> Complex[np.ndarray, " frequencies"]:
+def recolour(omega: Grid, integrators: int, delay: float, dt: float) -> Response:
     """Factor from a response to the outputs of `record_bins` to one to the recorded outputs."""
     lag = integrators // 2 * dt + delay
     return np.exp(-1j * lag * omega) / (1 - np.exp(-1j * dt * omega)) ** integrators
@@ -114,7 +123,7 @@ class LocalFit(NamedTuple):
     boost: Levels
     gain: Pairs  # mean squared error for unit noise
     first: Places
-    scatter: Complex[np.ndarray, "frequencies outputs outputs"]  # residual products over freedom
+    scatter: Covariances  # residual products over freedom
     freedom: Grid  # complex degrees of freedom
     power: Complex[np.ndarray, "frequencies inputs inputs"]  # of the inputs, mean over the window
 

@@ -228,12 +228,7 @@ def joint_fit(fit: LocalFit, inputs: int) -> LocalFit:
     return LocalFit(response * blank, effect, boost, gain, fit.first, scatter, freedom, power)
 
 
-def coherence_of_references(
-    omega: Grid,
-    half_width: Grid,
-    fit: LocalFit,
-    inputs: int,
-) -> Pairs:
+def coherence_of_references(omega: Grid, half_width: Grid, fit: LocalFit, inputs: int) -> Pairs:
     """Partial coherence of the joint estimate: the smaller of the shares of input and output.
 
     Source: Bendat and Piersol, Random Data, ch. 7.
@@ -246,12 +241,7 @@ def coherence_of_references(
     return np.minimum(through, alone / (alone + moved))
 
 
-def share_of_inputs(
-    left: Left,
-    noise: Noise,
-    at: Places,
-    inputs: int,
-) -> Pairs:
+def share_of_inputs(left: Left, noise: Noise, at: Places, inputs: int) -> Pairs:
     """Share of a joint estimate's squared error by the noise of T_ru, half of what both make
     included."""
     root = noise.root()[at]

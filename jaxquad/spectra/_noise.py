@@ -14,7 +14,7 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple, TypeVar
 
 import numpy as np
-from jaxtyping import Bool, Complex, Float, Int
+from jaxtyping import Bool, Complex, Float
 
 from ._estimators import (
     adjoint,
@@ -22,6 +22,7 @@ from ._estimators import (
     diagonal,
     Grid,
     Levels,
+    Places,
     power_of,
     Responses,
     Square,
@@ -179,9 +180,7 @@ def smoothed(omega: Grid, covariance: Square, weight: Grid) -> Square:
     return lines @ covariance @ lines.T
 
 
-def covariance_of_bands(
-    first: Int[np.ndarray, " frequencies"], last: Int[np.ndarray, " frequencies"], freedom: Grid
-) -> Square:
+def covariance_of_bands(first: Places, last: Places, freedom: Grid) -> Square:
     """Of the logarithm of mean residual powers over bins: bands share as much of it as of their
     bins."""
     count = np.maximum(last - first, 1)
@@ -391,7 +390,7 @@ def _inner(
     return np.vecdot(a.view(float), b.view(float))
 
 
-def _trace(a: Gram, b: Gram) -> Float[np.ndarray, " frequencies"]:
+def _trace(a: Gram, b: Gram) -> Grid:
     """The real part of the trace of the product of `a` with the adjoint of `b`."""
     a, b = (np.ascontiguousarray(part).reshape(len(part), -1) for part in (a, b))
     return _inner(a, b)

@@ -22,6 +22,7 @@ from ._estimators import (
     Levels,
     Method,
     Periodic,
+    Places,
     Remark,
     Responses,
     Where,
@@ -122,9 +123,7 @@ class Scatter(NamedTuple):
         return np.maximum(total - self.noise, 0.0)
 
 
-def estimate_scatter(
-    omega: Grid, fit: Fit, periods: Sequence[Periods], lines: Int[np.ndarray, " frequencies"]
-) -> Scatter:
+def estimate_scatter(omega: Grid, fit: Fit, periods: Sequence[Periods], lines: Places) -> Scatter:
     """Noise between periods, from v = y - G u, and scatter between realisations.
 
     With input noise and feedback, v is what perturbs G (Pintelon and Schoukens, eq. 2-25).

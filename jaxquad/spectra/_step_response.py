@@ -8,6 +8,8 @@ from jaxtyping import Bool, Complex, Float
 from jaxquad._core import Message
 from jaxquad.records import Record
 
+from ._estimators import Grid
+
 
 _LENGTHS = 4  # lengths of the response in a window: what precedes a window then hardly reaches in
 _WINDOWS = 12  # that a record is cut into, at least, for the default length
@@ -245,13 +247,13 @@ def _smooth(values: Float[np.ndarray, "*windows frequencies"]) -> Float[np.ndarr
     return sum(padded[..., k : k + count] for k in range(1, _WIDTH)) + padded[..., :count]
 
 
-def _above_rounding(power: Float[np.ndarray, " frequencies"]) -> Float[np.ndarray, " frequencies"]:
+def _above_rounding(power: Grid) -> Grid:
     """Sums over neighbouring frequencies, no smaller than what rounding makes of the largest."""
     near = _smooth(power)
     return np.maximum(near, max(np.finfo(float).eps * float(np.max(near)), 1e-150))
 
 
-def _noise_over_response(source: _Spectra, answer: _Spectra) -> Float[np.ndarray, " frequencies"]:
+def _noise_over_response(source: _Spectra, answer: _Spectra) -> Grid:
     """The power of noise over that of the response, in units of the reference's power."""
     powers, total = np.abs(source) ** 2, np.sum(np.abs(answer) ** 2, axis=0)
     cross = np.sum(np.conj(source) * answer, axis=0)

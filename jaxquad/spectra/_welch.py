@@ -14,12 +14,7 @@ from jaxtyping import Array, ArrayLike, Complex, Float
 from jaxquad._core import Message, one_blas_thread, require_x64
 from jaxquad.records import Record
 
-from ._average import (
-    average,
-    Averaged,
-    Channels,
-    Segments,
-)
+from ._average import average, Averaged, Channels, Segments
 from ._error_covariance import ErrorCovariance, place_windows
 from ._estimators import (
     adjoint,
