@@ -13,7 +13,7 @@ from jaxtyping import Bool, Complex, Float, Int
 
 from ._estimators import diagonal, Grid
 from ._local_fit import Bins, left_power, LocalFit, window_slices
-from ._local_noise import SharedErrors
+from ._local_windows import SharedErrors
 from ._noise import Noise
 from ._rational_fit import (
     columns_of,
