@@ -123,8 +123,7 @@ class ArduPilotAttitude(AngleLoop):
 
     The rate's target is `p` times the error of the angle, beyond a_max/p^2 the root of it that a
     deceleration a_max needs, plus the rate of a `Setpoint` (what input shaping gives); it is used
-    one loop later. The rate that the inner loop sees is the difference of the measured angles over
-    a sample. Source: docs/autopilots.md.
+    one loop later. Source: docs/autopilots.md.
 
     **Arguments:** (each number is a scalar, one value per axis, or `[axes, *ensemble]`)
 
@@ -133,9 +132,7 @@ class ArduPilotAttitude(AngleLoop):
     - `acceleration_limit`: half of ATC_ACCEL_x_MAX in rad/s^2; the default is 550 deg/s^2.
     - `rate_limit`: ATC_RATE_x_MAX in rad/s; inf is none.
 
-    **Raises:**
-
-    - `ValueError`: `p` or a limit is not above 0.
+    **Raises:** `ValueError`: `p` or a limit is not above 0.
     """
 
     rate: ArduPilotRate
@@ -195,9 +192,7 @@ class HarmonicNotch(eqx.Module):
     - `harmonics`: multiples of the centre that have notches.
     - `notches`: 1, 2, 3 or 5 at each harmonic.
 
-    **Raises:**
-
-    - `ValueError`: centre or quality is not above 0, or a multiple is below 1.
+    **Raises:** `ValueError`: centre or quality is not above 0, or a multiple is below 1.
     """
 
     centre_hz: Float[Array, "..."] = per_member(rank=1, converter=as_float)
@@ -360,9 +355,7 @@ def ardupilot_loop(
     - `tracked_hz`: what harmonic notches follow that go by an RPM sensor (2, 5), ESC telemetry (3)
         or the gyro's spectrum (4), in Hz: by INS_HNTCH_MODE, with a number for each source.
 
-    **Raises:**
-
-    - `ValueError`: a gain is missing.
+    **Raises:** `ValueError`: a gain is missing.
     """
     read = Numbers(values)
     rate = read.number("SCHED_LOOP_RATE", 400.0)

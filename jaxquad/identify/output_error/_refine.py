@@ -21,13 +21,7 @@ from ..frequency_domain._refits import free_again
 from ..frequency_domain._result import Fit
 from ._descent import descend_by_turns, descend_with_noise
 from ._noise import ARMA, AutoRegressive, Noise
-from ._problem import (
-    evaluate_misfits,
-    feedback_response,
-    KnownController,
-    OutputError,
-    RecordTerm,
-)
+from ._problem import evaluate_misfits, feedback_response, KnownController, OutputError, RecordTerm
 from ._result import assess_output_error
 from ._simulated import (
     band_filter,
