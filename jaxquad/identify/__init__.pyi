@@ -99,22 +99,18 @@ from .output_error._verify import (
     verify as verify,
 )
 from .uncertainty._assess import MISFIT as MISFIT
-from .uncertainty._curves import (
+from .uncertainty._derived import (
+    check_drawable as check_drawable,
+    draw_models as draw_models,
+    Factor as Factor,
+    Factors as Factors,
+    factors as factors,
+    known_covariance as known_covariance,
     model_response as model_response,
     ResponseBand as ResponseBand,
     step_response as step_response,
     StepBand as StepBand,
-)
-from .uncertainty._derived import (
-    Factor as Factor,
-    Factors as Factors,
-    factors as factors,
     Tied as Tied,
-)
-from .uncertainty._draw_models import (
-    check_drawable as check_drawable,
-    draw_models as draw_models,
-    known_covariance as known_covariance,
 )
 from .uncertainty._error_budget import Discrepancy as Discrepancy
 from .uncertainty._verdict import (

@@ -88,17 +88,17 @@ class DMax(eqx.Module):
     range: tuple[Filter, ...] | None = None
     smooth: tuple[Filter, ...] | None = None
 
-    def chains(self, rate_hz: float) -> tuple[FilterChain, FilterChain]:
-        """The low-pass of delta and that of the factor, at the loop's rate."""
+    def chains(self, dt: float) -> tuple[FilterChain, FilterChain]:
+        """The low-pass of delta and that of the factor."""
         range = (PT2(85.0),) if self.range is None else self.range
         smooth = (PT2(35.0),) if self.smooth is None else self.smooth
-        return FilterChain(range, rate_hz), FilterChain(smooth, rate_hz)
+        return FilterChain(range, 1 / dt), FilterChain(smooth, 1 / dt)
 
     def factor(
-        self, chains: tuple[FilterChain, FilterChain], memory: tuple[PyTree, PyTree],
-        delta: Signal, speed: Signal, d: Array,
-    ) -> tuple[tuple[PyTree, PyTree], Signal]:  # fmt: skip
+        self, dt: float, memory: tuple[PyTree, PyTree], delta: Signal, speed: Signal, d: Array
+    ) -> tuple[tuple[PyTree, PyTree], Signal]:
         """Of the D gain, 1 or above."""
+        chains = self.chains(dt)
         state, quick = chains[0].step(memory[0], delta)
         base = broadcast_gain(d, delta)
         most = broadcast_gain(self.ceiling, delta) / jnp.where(base > 0, base, 1.0)
@@ -211,7 +211,7 @@ class BetaflightPID(BetaflightRate):
         if self.relax is not None:
             memory["slow"] = zero
         if self.d_max is not None:
-            memory["d_max"] = tuple(x.init(zero) for x in self.d_max.chains(1 / self.dt))
+            memory["d_max"] = tuple(x.init(zero) for x in self.d_max.chains(self.dt))
         return memory
 
     def advance(
@@ -238,8 +238,9 @@ class BetaflightPID(BetaflightRate):
         boost = 1 + at(self.p_boost) / jnp.maximum(jnp.abs(DEGREES * r) / _BOOSTED, 1.0)
         delta, factor = (memory["d"] - next["d"]) / self.dt, jnp.ones_like(y)
         if self.d_max is not None:
+            at_speed = DEGREES * speed
             next["d_max"], factor = self.d_max.factor(
-                self.d_max.chains(1 / self.dt), memory["d_max"], delta, DEGREES * speed, self.d
+                self.dt, memory["d_max"], delta, at_speed, self.d
             )
         terms = {
             "P": next["p"] * boost, "I": next["integral"],
