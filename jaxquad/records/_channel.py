@@ -124,10 +124,7 @@ def nonuniformity(time: Times) -> float:
 
 
 def window(time: Times, start: Number | None, stop: Number | None) -> slice:
-    """The samples from `start` to `stop` (s, both included; None is the end of the record).
-
-    Where the time stamps are dates, both may count from the first of them.
-    """
+    """The samples from `start` to `stop` (s, both included), which may count from a first date."""
     slack = 1e-6 * (time[-1] - time[0]) / (time.size - 1)
     origin = clock_start(time)
     start, stop = in_file_time(start, origin), in_file_time(stop, origin)
@@ -161,11 +158,7 @@ class RepairedTime(NamedTuple):
 
 
 def unwrap(counter: np.ndarray) -> tuple[np.ndarray, int]:
-    """A counter with its overflows undone, and how many there were.
-
-    A 32-bit counter is recognised by its dtype, or by a step from the last hundredth of its range
-    to the first; an int16 or uint16 by its dtype alone.
-    """
+    """A counter with its overflows undone, and how many; seen by its dtype or a step of 32 bits."""
     if counter.dtype.kind in "iu" and counter.dtype.itemsize <= 4:
         span = float(2 ** (8 * counter.dtype.itemsize))
         wraps = np.diff(counter.astype(np.int64)) < -span / 2
@@ -180,10 +173,7 @@ def unwrap(counter: np.ndarray) -> tuple[np.ndarray, int]:
 
 
 def repair_time(time: Times) -> RepairedTime:
-    """Drop time stamps that repeat, go back, jump ahead or are not finite, if they are few.
-
-    Where more than 1 % would have to go, nothing is dropped: `Channel` then refuses the record.
-    """
+    """Drop stamps that repeat, go back, jump ahead or are not finite; none if over 1 % would."""
     good = np.isfinite(time)
     if time.size < FEWEST or (good.all() and (np.diff(time) > 0).all()):
         return RepairedTime(time, None, "")
@@ -222,9 +212,8 @@ def repair_values(
 ) -> tuple[Values, Float[np.ndarray, " repaired"]]:
     """Values without what is missing or out of range, and the times (s) at which they are new.
 
-    Nothing is repaired unless `valid` or `max_gap` asks for it. The interpolation is monotone
-    between neighbours at most `max_gap` (s) apart (Fritsch and Butland 1984). What lies at an end,
-    or in a longer gap, is NaN.
+    Monotone between neighbours at most `max_gap` (s) apart (Fritsch and Butland 1984), else NaN; as
+    they are where neither `valid` nor `max_gap` asks for it.
     """
     good = np.isfinite(values)
     if valid is not None:

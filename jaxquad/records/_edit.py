@@ -164,8 +164,7 @@ def _contiguous_part(
 ) -> Channel:
     """The samples from `begin` to `end` (s), and up to `margin` (s) beyond, without a break.
 
-    A break is a gap longer than `max_gap` (s) or a value that is not finite. Outside of
-    `begin` .. `end` it ends the part; inside it raises RecordError, a GapError where all are gaps.
+    A break is a gap longer than `max_gap` (s) or a value that is not finite: inside it raises.
     """
     time, longest = channel.time, longest_gap(channel.time, max_gap)
     bad = ~np.isfinite(channel.values)

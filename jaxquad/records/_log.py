@@ -45,10 +45,7 @@ class SettingChange(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Log:
-    """The tables of a file by name; the channels of the table `""` have no prefix.
-
-    Each of the `remarks` says what was skipped or repaired, and becomes a RecordWarning.
-    """
+    """The tables of a file by name; the channels of the table `""` have no prefix."""
 
     tables: Mapping[str, Table]
     remarks: tuple[str, ...] = ()
@@ -85,10 +82,7 @@ Stamp = TypeVar("Stamp")
 def changes_of(
     logged: Iterable[tuple[Stamp, str, str]], time_of: Callable[[Stamp], float | None]
 ) -> tuple[SettingChange, ...]:
-    """The changes among settings as they were logged: a stamp, name, value.
-
-    `time_of` a stamp is in s, None where it has none.
-    """
+    """The changes among settings as they were logged, with stamps of which `time_of` gives s."""
     values: dict[str, str] = {}
     changes: list[SettingChange] = []
     for stamp, name, value in logged:
@@ -220,10 +214,9 @@ class Column(NamedTuple):
 
 
 def columns_of(titles: Sequence[str]) -> dict[str, Column]:
-    """The cells of a header, such as `q [deg/s]` and `time (us)`, as names and units.
+    """The cells of a header, such as `q [deg/s]`, as names and units.
 
-    A cell keeps its whole text as a name where it ends in no known unit, and where the name alone
-    would be that of another cell.
+    A cell keeps its whole text where the name alone would be that of another cell.
     """
     parts = {}
     for title in titles:

@@ -118,11 +118,7 @@ Place = tuple[str, int | None]  # an array, and its column
 class Timebases:
     """The channels of a log, `names`, and their time bases, each repaired once.
 
-    The columns of a matrix `x` are `x[0]`, `x[1]`, ... The time base of an array is the first that
-    exists of: its own, `t_<array>`; the one named `time`; t, time, time_s, timestamp, ... or
-    seconds and nanoseconds in the same struct, in those around it, in the whole file; those of its
-    topic (`imu_time` for `imu_x`); the first column of a matrix if that rises in steps of nearly
-    one size. Seconds and nanoseconds are `sec+nsec`.
+    `read` tells how the time base of an array is found. Seconds and nanoseconds are `sec+nsec`.
     """
 
     def __init__(
@@ -193,10 +189,7 @@ class Timebases:
         self._rates: dict[tuple[str, bytes], float] = {}
 
     def channel(self, name: str) -> Channel:
-        """The named channel with its time stamps, in s.
-
-        Warns of time stamps that had to be repaired.
-        """
+        """The named channel with its time stamps, in s; warns of those that were repaired."""
         values, stamps = self.values(name), self._repaired_time(name)[1]
         values = values if stamps.kept is None else values[stamps.kept]
         return Channel(name, stamps.time, values, self.unit(name))
@@ -331,10 +324,7 @@ class Timebases:
         return base
 
     def _count(self, base: str) -> tuple[np.ndarray, int]:
-        """The stamps (s) of arrays that the log does not define as a clock, NaN where blank.
-
-        With them comes how many overflows were undone.
-        """
+        """Stamps (s) that the log does not define as a clock, NaN where blank; overflows undone."""
         parts = self._parts(base)
         if len(parts) == 2:
             places = [self._columns[part] for part in parts]

@@ -124,11 +124,7 @@ def with_injections(setup: Setup, runs: Sequence[Injection], what: str) -> Setup
 
 
 def choose_chirps(chirps: Sequence[NumberedChirp], wanted: Selection) -> list[NumberedChirp]:
-    """The chirp of that number; else the longest within the span and on the axis that are wanted.
-
-    With it come all others on its axis at its place. One that turns no axis is taken where there is
-    no other.
-    """
+    """The chirp of that number, else the longest wanted one, and all on its axis at its place."""
     if wanted.chirp is not None:
         listed = "; ".join(map(str, chirps)) or "none"
         chirp = next((x for x in chirps if x.number == wanted.chirp), None)
@@ -336,10 +332,7 @@ def number_of(log: Log, name: str, default: float = 0.0) -> float:
 
 
 def throttle_of(firmware: FirmwareLog, signals: Signals, *, wanted: bool = False) -> Mix:
-    """The collective of the vehicle, where the log of one flight has it.
-
-    It is what the motors had, where that is known; with `wanted` what they were asked for.
-    """
+    """The channel with what the motors had, else with what they were asked for (`wanted`)."""
     for name, factor in reversed(firmware.throttle) if wanted else firmware.throttle:
         logged = (x for x in signals.arrays if x == name or x.endswith(f".{name}"))
         full = next(logged, name)

@@ -40,11 +40,7 @@ def sniff_hdf5(head: bytes, path: Path) -> bool:
 
 
 def _hdf5_tables(path: str, check: Check) -> Content:
-    """The numeric datasets as `group.name` with their units, and what was left out.
-
-    MATLAB v7.3 files, which are HDF5 with the axes reversed, keep the rows and columns that they
-    have in MATLAB. Datasets whose values lie in other files are left out.
-    """
+    """The numeric datasets as `group.name`; those of MATLAB v7.3 have its rows and columns."""
     import h5py
 
     columns: dict[str, tuple[np.ndarray, str]] = {}
@@ -82,10 +78,7 @@ def _hdf5_tables(path: str, check: Check) -> Content:
 
 
 def _datasets(file: "h5py.h5f.FileID") -> Iterator[tuple[str, "h5py.h5d.DatasetID", np.dtype]]:
-    """Those of numbers or records, and their types; soft and external links are not followed.
-
-    By the lower layer of h5py: its upper one takes five times as long for many small datasets.
-    """
+    """Those of numbers, by the lower layer of h5py: its upper one takes five times as long."""
     import h5py
     from h5py import h5o  # pyright: ignore[reportAttributeAccessIssue]  # h5py has no stubs of it
 
@@ -129,10 +122,7 @@ def sniff_parquet(head: bytes, path: Path) -> bool:
 
 
 def _parquet_tables(path: str, check: Check) -> Content:
-    """The numeric columns with their units; time stamps and durations in s.
-
-    Where values are missing, integers become floats with NaN.
-    """
+    """The numeric columns, with NaN where values are missing; time stamps and durations in s."""
     import pyarrow.parquet
 
     types = pyarrow.types
@@ -173,11 +163,9 @@ def sniff_bag(head: bytes, path: Path) -> bool:
 
 
 def _bag_tables(path: str, check: Check) -> Content:
-    """The numbers of each topic with their units and a column `time` (s), and what was left out.
+    """The numbers of each topic, `/imu/data` with `angular_velocity.x`; its time begins at 0.
 
-    The table `/imu/data` has the columns `angular_velocity.x`, ... Its time is that of the
-    message's header, else that of recording, in s from the beginning of the bag. Covariances are
-    left out.
+    It is that of the message's header, else that of recording. Covariances are left out.
     """
     from rosbags.highlevel import AnyReader
     from rosbags.typesys import get_typestore, Stores

@@ -153,10 +153,7 @@ def _find_rate_unit(tables: dict[str, Table]) -> list[str]:
 
 
 class _Extent(NamedTuple):
-    """A part of a file from definitions of its messages to the next ones.
-
-    One of `other_layout` begins anew, and defines messages otherwise than the part before.
-    """
+    """A part of a file; one of `other_layout` defines messages otherwise than the part before."""
 
     begin: int  # its first byte
     end: int  # the one after its last
@@ -179,10 +176,7 @@ def _span(times: np.ndarray) -> tuple[float, float] | None:
 
 
 def _choose_log(parts: Sequence[_Extent]) -> tuple[list[int], list[str]]:
-    """The numbers of the parts of the log to read, and a remark on those that are left out.
-
-    It is the longest one with a chirp, else the longest.
-    """
+    """The numbers of the parts of the longest log, with a chirp if any; a remark on the others."""
     logs: list[list[int]] = [[]]
     last = -np.inf
     for i, part in enumerate(parts):  # a log begins where the clock goes back, or definitions do
@@ -281,11 +275,7 @@ def _rows(
 
 @dataclasses.dataclass(frozen=True)
 class _Part:
-    """From definitions of messages to the next ones: formats by message type, offsets of each.
-
-    `defined` are the types that it defines itself, and `redefined` place, old and new format of
-    those that the part before defined otherwise.
-    """
+    """From definitions of messages to the next ones: formats by message type, offsets of each."""
 
     begin: int
     formats: dict[int, _Format]
@@ -295,10 +285,7 @@ class _Part:
 
 
 def _scan(data: bytes) -> tuple[list[_Part], list[str]]:
-    """The parts of a file, and what was skipped.
-
-    A log ends within a message, wherever the writer's buffer did, which is no damage.
-    """
+    """The parts of a file, and what was skipped. A log may end within a message."""
     parts = [part := _Part(0, {})]
     lengths = [0] * 256
     lengths[_FORMAT_TYPE] = _FMT_LENGTH
@@ -427,10 +414,7 @@ def sniff_text(head: bytes, path: Path) -> bool:
 
 
 def load_text(path: Path) -> Log:
-    """The same of a text log.
-
-    Numbers stand in the units of their format letters; those of FMTU remain to be multiplied.
-    """
+    """The same of a text log, in the units of its format letters; those of FMTU are applied."""
     content = path.read_bytes()
     begins = [hit.start() for hit in _BEGIN.finditer(content)][1:]
     if len(begins) >= _MOST_PARTS:

@@ -42,11 +42,7 @@ PATIENCE = 20.0  # s, beside what the size of the file allows
 
 
 def _in_child(name: str, per_megabyte: float, path: Path) -> Log:
-    """A file of the format `name` of `_by_library`, read in a child process.
-
-    A column `time` of a table with a name is its clock, in s. The process may take `per_megabyte`
-    s for each megabyte of the file beside `PATIENCE`.
-    """
+    """A file of a format of `_by_library`, in a process that may take so many s per megabyte."""
     kind = READERS[name].kind
     files = [file for file in path.iterdir() if file.is_file()] if path.is_dir() else [path]
     stored = sum(file.stat().st_size for file in files)
@@ -149,11 +145,7 @@ READERS: Mapping[str, Reader] = {
 
 
 def load_signals(path: str | Path) -> Signals:
-    """The numeric arrays of a file and what is known of their clocks and units.
-
-    Raises ReadError, and nothing else, where the file is missing, damaged or of another kind.
-    Warns with RecordWarning of what was skipped.
-    """
+    """The numeric arrays of a file and what is known of their clocks and units."""
     if not isinstance(path, str | Path):
         raise ReadError(
             f"{type(path).__name__} is no path of a file: a table in memory is read by "
