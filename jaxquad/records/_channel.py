@@ -2,10 +2,10 @@
 
 import dataclasses
 from collections.abc import Iterable, Mapping
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from ._errors import RecordError, unknown_name
@@ -149,14 +149,6 @@ def window(time: Times, start: Number | None, stop: Number | None) -> slice:
 _MOST_DROPPED = 0.01  # of the time stamps; more is not a glitch, and the record is refused
 
 
-class RepairedTime(NamedTuple):
-    """Increasing time stamps, the rows that they belong to, and what was repaired."""
-
-    time: np.ndarray
-    kept: Bool[np.ndarray, " samples"] | None  # None: all
-    remark: str
-
-
 def unwrap(counter: np.ndarray) -> tuple[np.ndarray, int]:
     """A counter with its overflows undone, and how many; seen by its dtype or a step of 32 bits."""
     if counter.dtype.kind in "iu" and counter.dtype.itemsize <= 4:
@@ -172,11 +164,14 @@ def unwrap(counter: np.ndarray) -> tuple[np.ndarray, int]:
     return counter.astype(np.float64) + span * turns, int(wraps.sum())
 
 
+RepairedTime = tuple[Times, np.ndarray | None, str]  # stamps, which rows (None: all), a remark
+
+
 def repair_time(time: Times) -> RepairedTime:
     """Drop stamps that repeat, go back, jump ahead or are not finite; none if over 1 % would."""
     good = np.isfinite(time)
     if time.size < FEWEST or (good.all() and (np.diff(time) > 0).all()):
-        return RepairedTime(time, None, "")
+        return time, None, ""
     kept = np.flatnonzero(good)
     if kept.size > 2:  # what jumps ahead although its neighbours are in order goes alone
         a, b, c = time[kept][:-2], time[kept][1:-1], time[kept][2:]
@@ -185,7 +180,7 @@ def repair_time(time: Times) -> RepairedTime:
     kept = kept[np.concatenate([[True], time[kept][1:] > highest[:-1]])] if kept.size else kept
     dropped = time.size - kept.size
     if dropped > _MOST_DROPPED * time.size:
-        return RepairedTime(time, None, "")
+        return time, None, ""
     mask = np.zeros(time.size, dtype=bool)
     mask[kept] = True
     first = int(np.flatnonzero(~mask)[0])
@@ -193,7 +188,7 @@ def repair_time(time: Times) -> RepairedTime:
         f"{dropped} of {time.size} time stamps repeat or go back; these rows were dropped, the "
         f"first of them row {first} ({time[first]:.9g} s)"
     )
-    return RepairedTime(time[mask], mask, remark)
+    return time[mask], mask, remark
 
 
 _GENERIC = 10  # nominal samples of a gap that is bridged where nobody says how long it may be

@@ -76,7 +76,28 @@ def resample(
     """
     from scipy.interpolate import CubicSpline, make_interp_spline
 
-    begin, end = _common_extent(channels, start, stop)
+    if not channels:
+        raise RecordError("there are no channels to resample: give at least one.")
+    latest = max(channels, key=lambda channel: channel.time[0])
+    earliest = min(channels, key=lambda channel: channel.time[-1])
+    first, last = float(latest.time[0]), float(earliest.time[-1])
+    origin = min(clock_start(channel.time) for channel in channels)
+    start, stop = in_file_time(start, origin), in_file_time(stop, origin)
+    begin = first if start is None else float(start)
+    end = last if stop is None else float(stop)
+    shown = lambda *times: show_times(*times, start=origin)
+    overlap = (
+        f"the channels overlap from {first - origin:.6g} s ({latest.name!r} begins) "
+        f"to {shown(last)} ({earliest.name!r} ends)"
+    )
+    if not first < last:
+        raise RecordError(f"the channels have no common time: {overlap}.")
+    if not begin < end:
+        raise RecordError(f"start {shown(begin)} is not before stop {shown(end)}; {overlap}.")
+    slack = 1e-9 * (1 + abs(last))
+    if begin < first - slack or end > last + slack:
+        raise RecordError(f"{shown(begin, end)} is out of range; {overlap}.")
+    begin, end = max(begin, first), min(end, last)
     if not (np.isfinite(sample_rate) and sample_rate > 0):
         raise RecordError(f"the sample rate is {sample_rate} Hz: it must be positive.")
     steps = (end - begin) * sample_rate
@@ -129,34 +150,6 @@ def resample(
         padded = np.pad(inside, padding, mode="reflect", reflect_type="odd")
         columns.append(np.lib.stride_tricks.sliding_window_view(padded, taps.size)[::fold] @ taps)
     return time, np.stack(columns, axis=1)
-
-
-def _common_extent(
-    channels: Sequence[Channel], start: Number | None, stop: Number | None
-) -> tuple[float, float]:
-    """First and last time (s) of the grid, within the time that all channels share."""
-    if not channels:
-        raise RecordError("there are no channels to resample: give at least one.")
-    latest = max(channels, key=lambda channel: channel.time[0])
-    earliest = min(channels, key=lambda channel: channel.time[-1])
-    first, last = float(latest.time[0]), float(earliest.time[-1])
-    origin = min(clock_start(channel.time) for channel in channels)
-    start, stop = in_file_time(start, origin), in_file_time(stop, origin)
-    begin = first if start is None else float(start)
-    end = last if stop is None else float(stop)
-    shown = lambda *times: show_times(*times, start=origin)
-    overlap = (
-        f"the channels overlap from {first - origin:.6g} s ({latest.name!r} begins) "
-        f"to {shown(last)} ({earliest.name!r} ends)"
-    )
-    if not first < last:
-        raise RecordError(f"the channels have no common time: {overlap}.")
-    if not begin < end:
-        raise RecordError(f"start {shown(begin)} is not before stop {shown(end)}; {overlap}.")
-    slack = 1e-9 * (1 + abs(last))
-    if begin < first - slack or end > last + slack:
-        raise RecordError(f"{shown(begin, end)} is out of range; {overlap}.")
-    return max(begin, first), min(end, last)
 
 
 def _contiguous_part(
@@ -376,11 +369,7 @@ def mix(
     )
 
 
-def combine(
-    name: str,
-    weights: Mapping[str, Number],
-    values: Callable[[str], Times],
-) -> Times:
+def combine(name: str, weights: Mapping[str, Number], values: Callable[[str], Times]) -> Times:
     """The weighted sum that makes the channel `name`; a single weight of 1 changes no bit."""
     if not weights:
         raise RecordError(f"the sum {name!r} is empty: give it channels and their weights.")

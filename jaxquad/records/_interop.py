@@ -83,8 +83,34 @@ _SAVE = "s = get(z); save('z.mat', 's', '-v7')"
 
 
 def from_iddata(path: str | Path, variable: str | None, references: Names) -> Record:
-    """`Record.from_iddata`, where the arguments are described."""
-    fields = _fields(path, variable)
+    """`Record.from_iddata`, from the variable of that name, the only struct, or the file itself."""
+    load_log(path)  # which refuses what is damaged, before scipy reads it
+    from scipy.io import loadmat
+
+    try:
+        content = loadmat(path, simplify_cells=True)
+    except Exception as error:  # of damaged and of HDF5 files scipy raises almost anything
+        raise ReadError(
+            f"{path}: cannot be read as a MAT file of version 5 to 7 ({type(error).__name__}): "
+            f"save it in MATLAB with {_SAVE}"
+        ) from error
+    is_iddata = lambda value: (
+        isinstance(value, Mapping)
+        and any(names <= set(value) for names in ({"y", "u"}, {"OutputData", "InputData"}))
+    )
+    structs = {name: value for name, value in content.items() if is_iddata(value)}
+    if variable is None and is_iddata(content):
+        fields = content
+    elif variable is None and len(structs) == 1:
+        fields = next(iter(structs.values()))
+    elif variable in structs:
+        fields = structs[variable]
+    else:
+        which = "which of them (variable=) is not said" if variable is None else f"not {variable!r}"
+        raise ReadError(
+            f"{path}: structs with y and u: {', '.join(structs) or 'none'}; {which}. An iddata "
+            f"object cannot be read outside of MATLAB: make a struct of it, {_SAVE}"
+        )
     y = _matrix(path, fields, "y", "OutputData")
     u = _matrix(path, fields, "u", "InputData")
     unit = str(fields.get("TimeUnit", "seconds"))
@@ -127,36 +153,6 @@ def from_iddata(path: str | Path, variable: str | None, references: Names) -> Re
         source=str(path),
         hold=hold,
         time_unit="s",
-    )
-
-
-def _fields(path: str | Path, variable: str | None) -> Mapping:
-    """The struct with y and u: the variable of that name, the only one, or the file itself."""
-    load_log(path)  # which refuses what is damaged, before scipy reads it
-    from scipy.io import loadmat
-
-    try:
-        content = loadmat(path, simplify_cells=True)
-    except Exception as error:  # of damaged and of HDF5 files scipy raises almost anything
-        raise ReadError(
-            f"{path}: cannot be read as a MAT file of version 5 to 7 ({type(error).__name__}): "
-            f"save it in MATLAB with {_SAVE}"
-        ) from error
-    is_iddata = lambda value: (
-        isinstance(value, Mapping)
-        and any(names <= set(value) for names in ({"y", "u"}, {"OutputData", "InputData"}))
-    )
-    structs = {name: value for name, value in content.items() if is_iddata(value)}
-    if variable is None and is_iddata(content):
-        return content
-    if variable is None and len(structs) == 1:
-        return next(iter(structs.values()))
-    if variable in structs:
-        return structs[variable]
-    which = "which of them (variable=) is not said" if variable is None else f"not {variable!r}"
-    raise ReadError(
-        f"{path}: structs with y and u: {', '.join(structs) or 'none'}; {which}. An iddata object "
-        f"cannot be read outside of MATLAB: make a struct of it, {_SAVE}"
     )
 
 

@@ -206,14 +206,7 @@ def known_unit(text: str) -> str:
     return plain if plain in _UNITS else _SAME.get(plain, "")
 
 
-class Column(NamedTuple):
-    """What the cell of a header names, and its unit: empty where it has none."""
-
-    name: str
-    unit: str
-
-
-def columns_of(titles: Sequence[str]) -> dict[str, Column]:
+def columns_of(titles: Sequence[str]) -> dict[str, tuple[str, str]]:
     """The cells of a header, such as `q [deg/s]`, as names and units.
 
     A cell keeps its whole text where the name alone would be that of another cell.
@@ -222,6 +215,6 @@ def columns_of(titles: Sequence[str]) -> dict[str, Column]:
     for title in titles:
         match = _TITLE.fullmatch(title)
         unit = known_unit(match[2] or match[3]) if match else ""
-        parts[title] = Column(match[1], unit) if match and unit else Column(title, "")
+        parts[title] = (match[1], unit) if match and unit else (title, "")
     names = [name for name, _ in parts.values()]
-    return {t: p if names.count(p.name) == 1 else Column(t, p.unit) for t, p in parts.items()}
+    return {t: (n if names.count(n) == 1 else t, unit) for t, (n, unit) in parts.items()}

@@ -43,28 +43,16 @@ _COUNTED = "rows"  # the time base where dt says how far apart they are
 
 
 class ChannelSummary(NamedTuple):
-    """One channel of a file: NaN for its rate and times where it has no usable time base.
-
-    **Arguments:**
-
-    - `name`: of the channel.
-    - `samples`: their number.
-    - `rate`: Hz, without gaps.
-    - `start`: s.
-    - `stop`: s.
-    - `minimum`: of the finite values.
-    - `maximum`: likewise.
-    - `unit`: empty where unknown.
-    """
+    """One channel of a file: NaN for its rate and times where it has no usable time base."""
 
     name: str
     samples: int
-    rate: float
-    start: float
-    stop: float
-    minimum: float
+    rate: float  # Hz, without gaps
+    start: float  # s
+    stop: float  # s
+    minimum: float  # of the finite values
     maximum: float
-    unit: str
+    unit: str  # empty where unknown
 
     def __str__(self) -> str:
         start = clock_start(np.array([self.start]))
@@ -166,7 +154,20 @@ class Timebases:
         self._structs = {prefix: base for prefix, (_, base) in ranks.items()}
         self._columns: dict[str, Place] = {}  # of all arrays
         self.names: dict[str, Place] = {}  # of the channels alone
-        stamps = self._time_names()
+        arrays, stamps = self._arrays, set()  # of what holds time stamps rather than a channel
+        for name in arrays:
+            struct, dot, field = name.rpartition(".")
+            if field.startswith("t_") and f"{struct}{dot}{field.removeprefix('t_')}" in arrays:
+                stamps.add(name)
+        if self._time is not None:
+            stamps |= set(self._time.split("+"))
+        else:
+            stamps |= {name for name in arrays if _CLOCK.fullmatch(name)}
+            pairs = (base.split("+") for base in self._structs.values() if "+" in base)
+            stamps |= {part for pair in pairs for part in pair} & set(arrays)
+            if self._topics:
+                bases = {self._clock_by_name(name) for name in arrays}
+                stamps |= bases & set(self._topics.values())
         for array, signal in self._arrays.items():
             matrix = signal.values
             columns: dict[str, Place] = {array: (array, None)}
@@ -190,16 +191,16 @@ class Timebases:
 
     def channel(self, name: str) -> Channel:
         """The named channel with its time stamps, in s; warns of those that were repaired."""
-        values, stamps = self.values(name), self._repaired_time(name)[1]
-        values = values if stamps.kept is None else values[stamps.kept]
-        return Channel(name, stamps.time, values, self.unit(name))
+        values, (stamps, kept, _) = self.values(name), self._repaired_time(name)[1]
+        values = values if kept is None else values[kept]
+        return Channel(name, stamps, values, self.unit(name))
 
     def extent(self, name: str) -> tuple[float, float, float]:
         """Rate in Hz, first and last time in s of a channel; raises as `channel` does."""
-        base, stamps = self._repaired_time(name)
+        base, (stamps, _, _) = self._repaired_time(name)
         if base not in self._rates:
             self._rates[base] = self.channel(name).rate
-        return self._rates[base], float(stamps.time[0]), float(stamps.time[-1])
+        return self._rates[base], float(stamps[0]), float(stamps[-1])
 
     def values(self, name: str) -> np.ndarray:
         """The values of a channel in its unit, without its time stamps."""
@@ -257,7 +258,7 @@ class Timebases:
         repaired = self._repaired[key] = repair_time(seconds)
         times = "once" if wraps == 1 else f"{wraps} times"
         overflow = f"the counter overflowed {times}; this was undone" if wraps else ""
-        for text in filter(None, (overflow, repaired.remark)):
+        for text in filter(None, (overflow, repaired[2])):
             warnings.warn(f"time base {base!r}: {text}.", RecordWarning, stacklevel=2)
         return key, repaired
 
@@ -368,22 +369,6 @@ class Timebases:
                 return self._structs[prefix]
         topics = (self._topics.get(prefix, array) for prefix in _prefixes(array, "_"))
         return next((base for base in topics if base != array), "")
-
-    def _time_names(self) -> set[str]:
-        """The arrays that hold time stamps rather than a channel."""
-        arrays, stamps = self._arrays, set()
-        for name in arrays:
-            struct, dot, field = name.rpartition(".")
-            if field.startswith("t_") and f"{struct}{dot}{field.removeprefix('t_')}" in arrays:
-                stamps.add(name)
-        if self._time is not None:
-            return stamps | set(self._time.split("+"))
-        stamps |= {name for name in arrays if _CLOCK.fullmatch(name)}
-        pairs = (base.split("+") for base in self._structs.values() if "+" in base)
-        stamps |= {part for pair in pairs for part in pair} & set(arrays)
-        if self._topics:
-            stamps |= {self._clock_by_name(name) for name in arrays} & set(self._topics.values())
-        return stamps
 
 
 def _prefixes(name: str, separator: str) -> Iterator[str]:

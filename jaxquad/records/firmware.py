@@ -29,19 +29,15 @@ Point = Literal["", "rate", "mixer", "angle"]
 
 
 class NumberedChirp(NamedTuple):
-    """One of the chirps that a log holds.
+    """One of the chirps that a log holds."""
 
-    `number` counts them in the order of time, from 1; `axis` is empty where it turns none; `place`
-    says in words what it was added to; `low` and `high` are its band, 0 where it is unknown.
-    """
-
-    number: int
-    axis: str
-    place: str
+    number: int  # in the order of time, from 1
+    axis: str  # empty where it turns none
+    place: str  # what it was added to, in words
     point: Point
     start: float  # s
     stop: float
-    low: float = 0.0  # Hz
+    low: float = 0.0  # Hz, 0 where the band is unknown
     high: float = 0.0
 
     def __str__(self) -> str:
@@ -209,25 +205,15 @@ Spans = Sequence[tuple[float, float]]  # s
 
 
 class Flight(NamedTuple):
-    """One flight of a file, as `flights` lists it; it prints as one line.
+    """One flight of a file, as `flights` lists it; it prints as one line."""
 
-    **Arguments:**
-
-    - `number`: in the file, from 1; what `propose` takes as `flight`.
-    - `log`: what its channels begin with, `log2` for `log2.gyroADC[0]`; empty for a single one.
-    - `start`, `stop`: s of the file's time.
-    - `throttle`: lowest and highest, 0 to 1; None where it is not logged.
-    - `chirps`: seconds of injected sweeps, by axis.
-    - `sticks`: how much each stick moves, RMS about its mean as a share of full deflection.
-    """
-
-    number: int
-    log: str
-    start: float
+    number: int  # in the file, from 1; what `propose` takes as `flight`
+    log: str  # what its channels begin with, `log2` for `log2.gyroADC[0]`; empty for a single one
+    start: float  # s of the file's time
     stop: float
-    throttle: tuple[float, float] | None
-    chirps: Mapping[str, float]
-    sticks: Mapping[str, float]
+    throttle: tuple[float, float] | None  # lowest and highest, 0 to 1; None where it is not logged
+    chirps: Mapping[str, float]  # seconds of injected sweeps, by axis
+    sticks: Mapping[str, float]  # RMS of each about its mean, as a share of full deflection
 
     @property
     def duration(self) -> float:
@@ -342,18 +328,11 @@ def throttle_of(firmware: FirmwareLog, signals: Signals, *, wanted: bool = False
 
 
 class Settings(NamedTuple):
-    """Firmware and parameters of a log, as text.
+    """Firmware and parameters of a log, as text."""
 
-    **Arguments:**
-
-    - `vehicle`: ardupilot, px4 or betaflight.
-    - `version`: of the firmware, (4, 2, 0); empty where the log does not say.
-    - `values`: by name: a Betaflight header's lines, ArduPilot's PARM, PX4's parameters.
-    """
-
-    vehicle: str
-    version: tuple[int, ...]
-    values: Mapping[str, str]
+    vehicle: str  # ardupilot, px4 or betaflight
+    version: tuple[int, ...]  # of the firmware, (4, 2, 0); empty where the log does not say
+    values: Mapping[str, str]  # a Betaflight header's lines, ArduPilot's PARM, PX4's parameters
 
 
 def read_settings(path: str | Path, *, log: str = "", at: Number | None = None) -> Settings:

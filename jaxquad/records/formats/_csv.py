@@ -75,9 +75,9 @@ def load(path: Path) -> Log:
     # The columns by the names in their titles, with the units that stand behind these.
     parts = columns_of(list(columns))
     table = Table(
-        columns={parts[title].name: values for title, values in columns.items()},
+        columns={parts[title][0]: values for title, values in columns.items()},
         units={name: unit for name, unit in parts.values() if unit},
-        rows={parts[title].name: there for title, there in rows.items()},
+        rows={parts[title][0]: there for title, there in rows.items()},
         titles={title: name for title, (name, _) in parts.items() if title != name},
     )
     return Log({"": table}, remarks)

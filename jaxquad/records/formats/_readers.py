@@ -164,7 +164,28 @@ def load_log(path: str | Path) -> Log:
     """The tables of a file, as its reader finds them. Raises ReadError, warns RecordWarning."""
     path = Path(path)
     try:
-        reader = _choose_reader(path)
+        require_file(path)
+        head = b""
+        if not path.is_dir():
+            with path.open("rb") as file:
+                head = file.read(_HEAD)
+            if not head:
+                raise ReadError(f"{path}: the file is empty.", offset=0)
+        suffix = path.suffix.lower()
+        readers = [*(log.reader for log in registered_logs() if log.reader), *READERS.values()]
+        by_content = (reader for reader in readers if reader.sniff(head, path))
+        by_name = (reader for reader in readers if suffix in reader.suffixes)
+        reader = next(by_content, None) or next(by_name, None)
+        if reader is None:
+            if path.is_dir():
+                raise ReadError(f"{path} is a folder, and no bag of ROS 2: name the file in it.")
+            suffixes = ", ".join(ending for x in READERS.values() for ending in x.suffixes)
+            ending = f"ending {suffix!r}" if suffix else "name, which has no ending,"
+            raise ReadError(
+                f"{path}: unknown file format: neither the first bytes nor the {ending} are those "
+                f"of a known one ({suffixes}). Convert the file«, or build a jq.Record from its "
+                "arrays»."
+            )
     # A name with a zero byte, one too long, a link to itself, a folder that may not be read.
     except (OSError, RuntimeError, ValueError) as error:
         if isinstance(error, ReadError):
@@ -191,32 +212,6 @@ def load_log(path: str | Path) -> Log:
     for remark in remarks:
         warnings.warn(f"{path}: {remark}.", RecordWarning, stacklevel=3)
     return log
-
-
-def _choose_reader(path: Path) -> Reader:
-    """By the first bytes of the file, else by the ending of its name."""
-    require_file(path)
-    head = b""
-    if not path.is_dir():
-        with path.open("rb") as file:
-            head = file.read(_HEAD)
-        if not head:
-            raise ReadError(f"{path}: the file is empty.", offset=0)
-    suffix = path.suffix.lower()
-    readers = [*(log.reader for log in registered_logs() if log.reader), *READERS.values()]
-    by_content = (reader for reader in readers if reader.sniff(head, path))
-    by_name = (reader for reader in readers if suffix in reader.suffixes)
-    reader = next(by_content, None) or next(by_name, None)
-    if reader is None:
-        if path.is_dir():
-            raise ReadError(f"{path} is a folder, and no bag of ROS 2: name the file in it.")
-        suffixes = ", ".join(ending for reader in READERS.values() for ending in reader.suffixes)
-        ending = f"ending {suffix!r}" if suffix else "name, which has no ending,"
-        raise ReadError(
-            f"{path}: unknown file format: neither the first bytes nor the {ending} are those of "
-            f"a known one ({suffixes}). Convert the file«, or build a jq.Record from its arrays»."
-        )
-    return reader
 
 
 def require_file(path: str | Path) -> None:

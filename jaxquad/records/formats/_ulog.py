@@ -176,24 +176,6 @@ _BASIC = {
 _FIELD = re.compile(r"(\w+)(?:\[(\d{1,9})\])? (\w+)", re.ASCII)
 
 
-def _layout(name: str, formats: Formats, offset: int, most: int) -> np.dtype:
-    """The bytes of a message as at most so many columns, those of a nested one `field.column`."""
-    fields: list[tuple[str, str]] = []
-    size = 0
-    for column, kind in _columns(name, "", formats, offset, 0):
-        fields.append((column, kind))
-        size += np.dtype(kind).itemsize
-        if size > _LARGEST or len(fields) > most:
-            raise ReadError(f"the format {name!r} is implausibly long", offset=offset)
-    while fields and fields[-1][0].rpartition(".")[2].startswith("_padding"):
-        fields.pop()  # as the logger leaves it out
-    if len({column for column, _ in fields}) < max(1, len(fields)):
-        raise ReadError(
-            f"the format {name!r} has no field, or two with the same name", offset=offset
-        )
-    return np.dtype(fields)
-
-
 def _columns(
     name: str, prefix: str, formats: Formats, offset: int, depth: int
 ) -> Iterator[tuple[str, str]]:
@@ -270,8 +252,21 @@ def _interpret(kind: int, body: bytes, place: int, messages: _Messages) -> None:
             if name in messages.formats and name not in messages.layouts:
                 most = min(_WIDEST, messages.columns_left)
                 messages.columns_left -= most  # What fails has cost as much time as a wide one.
-                messages.layouts[name] = _layout(name, messages.formats, place, most)
-                messages.columns_left += most - len(messages.layouts[name].names or ())
+                fields: list[tuple[str, str]] = []
+                size = 0
+                for column, code in _columns(name, "", messages.formats, place, 0):
+                    fields.append((column, code))
+                    size += np.dtype(code).itemsize
+                    if size > _LARGEST or len(fields) > most:
+                        raise ReadError(f"the format {name!r} is implausibly long", offset=place)
+                while fields and fields[-1][0].rpartition(".")[2].startswith("_padding"):
+                    fields.pop()  # as the logger leaves it out
+                if len({column for column, _ in fields}) < max(1, len(fields)):
+                    raise ReadError(
+                        f"the format {name!r} has no field, or two with the same name", offset=place
+                    )
+                messages.layouts[name] = np.dtype(fields)
+                messages.columns_left += most - len(fields)
             if name not in messages.layouts:
                 raise ReadError(f"the format {name!r} is not defined", offset=place)
             dtype = messages.layouts[name]
