@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools as ft
-import warnings
 from collections.abc import Callable, Mapping, Sequence
 from typing import Literal
 
@@ -24,7 +23,7 @@ from ._channel import (
     window,
     within,
 )
-from ._errors import choose_range, GapError, mend_holes, RecordError, RecordWarning
+from ._errors import choose_range, GapError, mend_holes, RecordError, warn
 from ._record import as_tuple, assemble, Record
 
 
@@ -113,11 +112,9 @@ def resample(
     pieces = [_contiguous_part(c, begin, end, margin=margin, max_gap=max_gap) for c in channels]
     _warn_of_clocks(pieces, begin, end)
     if slow := [f"{c.name!r} {c.rate:.6g} Hz" for c in channels if sample_rate > _SAME * c.rate]:
-        warnings.warn(
+        warn(
             f"resampled to {sample_rate:.6g} Hz, faster than {', '.join(slow)}: such a channel "
-            f"holds no information above half its own rate. Keep the frequency band below that.",
-            RecordWarning,
-            stacklevel=2,
+            f"holds no information above half its own rate. Keep the frequency band below that."
         )
     # The low-pass against aliasing runs on a grid twice as fine as the fastest channel's.
     fastest = max(channel.rate for channel in channels)
@@ -210,19 +207,17 @@ def _warn_of_clocks(pieces: Sequence[Channel], begin: float, end: float) -> None
             gaps.append(f"{piece.name!r} {holes.size}, {longest}")
     if gaps:
         remark = f"gaps filled by interpolation: {'; '.join(gaps)}."
-        warnings.warn(remark, RecordWarning, stacklevel=3)
+        warn(remark)
     scattered = [piece for piece in pieces if scatters(piece.time)]
     if scattered:
         off = max(nonuniformity(piece.time) for piece in scattered)
         rate = min(piece.rate for piece in scattered)
-        warnings.warn(
+        warn(
             f"the time stamps of {', '.join(repr(piece.name) for piece in scattered)} lie up to "
             f"{off:.2g} samples off a clock of "
             f"{rate:.5g} Hz, and steps shorter than half a sample are as frequent as long ones: "
             f"values were interpolated at these times. If the samples were equally spaced, give "
-            f"their interval instead: {1 / rate:.4g} s («dt=»).",
-            RecordWarning,
-            stacklevel=3,
+            f"their interval instead: {1 / rate:.4g} s («dt=»)."
         )
 
 

@@ -1,4 +1,5 @@
 import difflib
+import warnings
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
@@ -34,6 +35,11 @@ class RecordWarning(UserWarning):
 
     def __init__(self, reason: str):
         super().__init__(Message(reason))
+
+
+def warn(reason: str) -> None:
+    """Warn whoever called the function that says this."""
+    warnings.warn(reason, RecordWarning, stacklevel=3)
 
 
 def located(error: ReadError, path: Path | str) -> ReadError:

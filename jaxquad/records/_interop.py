@@ -8,7 +8,7 @@ import numpy as np
 
 from ._channel import dates_in_seconds, doubt_of_seconds, PER_SECOND, Times, TimeUnit
 from ._errors import ReadError, RecordError, unknown_name
-from ._record import as_tuple, Names, Record
+from ._record import as_tuple, assemble, Names, Record
 from .formats import load_log
 
 
@@ -128,31 +128,22 @@ def from_iddata(path: str | Path, variable: str | None, references: Names) -> Re
         dt = float(_UNITS[unit] * interval[0])
     else:
         raise ReadError(f"{path}: Ts is {interval.tolist()}: give the sample interval, in {unit}")
-    inputs = _labels(fields, "InputName", u, "u")
-    input_units = _labels(fields, "InputUnit", u, "")
+    inputs, outputs = _labels(fields, "InputName", u, "u"), _labels(fields, "OutputName", y, "y")
+    names, columns = [*inputs, *outputs], [*u.T, *y.T]
+    labels = [*_labels(fields, "InputUnit", u, ""), *_labels(fields, "OutputUnit", y, "")]
     outer = as_tuple(references or ())
     for name in outer:
         if name not in inputs:
             raise RecordError(f"{path}: there is no input {name!r}; it has {', '.join(inputs)}.")
-    is_outer = np.array([name in outer for name in inputs], bool)
-    pick = lambda texts, chosen: [t for t, c in zip(texts, chosen, strict=True) if c]
     kinds = set(_texts(fields, "InterSample"))
-    # Held, or measured within the band.
-    hold = {"zoh": dt, "bl": 0.0}.get(kinds.pop()) if len(kinds) == 1 else None
-    return Record(
+    return assemble(
         time,
-        u[:, ~is_outer],
-        y,
-        u[:, is_outer] if outer else None,
-        input_names=pick(inputs, ~is_outer),
-        output_names=_labels(fields, "OutputName", y, "y"),
-        reference_names=pick(inputs, is_outer),
-        input_units=pick(input_units, ~is_outer),
-        output_units=_labels(fields, "OutputUnit", y, ""),
-        reference_units=pick(input_units, is_outer),
+        ([x for x in inputs if x not in outer], outputs, [x for x in inputs if x in outer]),
+        dict(zip(names, columns, strict=True)).__getitem__,
+        dict(zip(names, labels, strict=True)).__getitem__,
         source=str(path),
-        hold=hold,
-        time_unit="s",
+        # Held, or measured within the band.
+        hold={"zoh": dt, "bl": 0.0}.get(kinds.pop()) if len(kinds) == 1 else None,
     )
 
 

@@ -1,7 +1,6 @@
 """The channels of a file, and the time stamps of each."""
 
 import re
-import warnings
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -23,7 +22,7 @@ from ._channel import (
     TimeUnit,
     unwrap,
 )
-from ._errors import listed, located, ReadError, RecordError, RecordWarning, unknown_name
+from ._errors import listed, located, ReadError, RecordError, unknown_name, warn
 from ._log import Signal, Signals
 from .formats import load_signals
 
@@ -259,7 +258,7 @@ class Timebases:
         times = "once" if wraps == 1 else f"{wraps} times"
         overflow = f"the counter overflowed {times}; this was undone" if wraps else ""
         for text in filter(None, (overflow, repaired[2])):
-            warnings.warn(f"time base {base!r}: {text}.", RecordWarning, stacklevel=2)
+            warn(f"time base {base!r}: {text}.")
         return key, repaired
 
     def _base(self, array: str) -> str:
@@ -321,7 +320,7 @@ class Timebases:
             )
         if doubt:
             said = f"the time stamps are taken from {base!r}{doubt}"
-            warnings.warn(said, RecordWarning, stacklevel=2)
+            warn(said)
         return base
 
     def _count(self, base: str) -> tuple[np.ndarray, int]:
