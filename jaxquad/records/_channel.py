@@ -40,11 +40,6 @@ def show_times(*times: float, start: float = 0.0) -> str:
     return f"{text} s after {start:.3f} s" if start else f"{text} s"
 
 
-def in_file_time(time: Number | None, start: float) -> Number | None:
-    """A time that a user named, which may count from the `start` that is shown (s)."""
-    return start + time if time is not None and start and time < _DATES else time
-
-
 def check_unit(unit: TimeUnit | None) -> None:
     if unit is not None and unit not in PER_SECOND:
         raise RecordError(f"time_unit is {unit!r}: use one of {', '.join(PER_SECOND)}.")
@@ -123,25 +118,39 @@ def nonuniformity(time: Times) -> float:
     return float(np.abs(time - grid).max() * (time.size - 1) / (time[-1] - time[0]))
 
 
-def window(time: Times, start: Number | None, stop: Number | None) -> slice:
-    """The samples from `start` to `stop` (s, both included), which may count from a first date."""
-    slack = 1e-6 * (time[-1] - time[0]) / (time.size - 1)
-    origin = clock_start(time)
-    start, stop = in_file_time(start, origin), in_file_time(stop, origin)
-    begin = time[0] if start is None else start
-    end = time[-1] if stop is None else stop
+def chosen_span(
+    first: float, last: float, start: Number | None, stop: Number | None, origin: float,
+    slack: float, extent: str,
+) -> tuple[float, float]:  # fmt: skip
+    """From `start` to `stop` within `first` .. `last` (s), where None is the end.
+
+    Both may count from the `origin` that is shown; the `extent` is what errors say there is.
+    """
+    start, stop = (
+        origin + time if time is not None and origin and time < _DATES else time
+        for time in (start, stop)
+    )
+    begin = first if start is None else float(start)
+    end = last if stop is None else float(stop)
     shown = lambda *times: show_times(*times, start=origin)
-    extent = f"the record covers {shown(time[0], time[-1])}"
     if not begin < end:
         raise RecordError(f"start {shown(begin)} is not before stop {shown(end)}; {extent}.")
-    if begin < time[0] - slack or end > time[-1] + slack:
+    if begin < first - slack or end > last + slack:
         raise RecordError(f"{shown(begin, end)} is out of range; {extent}.")
+    return begin, end
+
+
+def window(time: Times, start: Number | None, stop: Number | None) -> slice:
+    """The samples from `start` to `stop` (s, both included), which may count from a first date."""
+    slack, origin = 1e-6 * (time[-1] - time[0]) / (time.size - 1), clock_start(time)
+    extent = f"the record covers {show_times(time[0], time[-1], start=origin)}"
+    begin, end = chosen_span(float(time[0]), float(time[-1]), start, stop, origin, slack, extent)
     first = int(np.searchsorted(time, begin - slack))
     last = int(np.searchsorted(time, end + slack, side="right"))
     if last - first < FEWEST:
         raise RecordError(
-            f"{shown(begin, end)} holds {last - first} samples: at least {FEWEST} are "
-            f"needed; {extent}."
+            f"{show_times(begin, end, start=origin)} holds {last - first} samples: at least "
+            f"{FEWEST} are needed; {extent}."
         )
     return slice(first, last)
 

@@ -10,9 +10,9 @@ from jaxtyping import Float
 
 from ._channel import (
     Channel,
+    chosen_span,
     clock_start,
     FEWEST,
-    in_file_time,
     longest_gap,
     longest_step,
     nonuniformity,
@@ -81,21 +81,14 @@ def resample(
     earliest = min(channels, key=lambda channel: channel.time[-1])
     first, last = float(latest.time[0]), float(earliest.time[-1])
     origin = min(clock_start(channel.time) for channel in channels)
-    start, stop = in_file_time(start, origin), in_file_time(stop, origin)
-    begin = first if start is None else float(start)
-    end = last if stop is None else float(stop)
-    shown = lambda *times: show_times(*times, start=origin)
     overlap = (
         f"the channels overlap from {first - origin:.6g} s ({latest.name!r} begins) "
-        f"to {shown(last)} ({earliest.name!r} ends)"
+        f"to {show_times(last, start=origin)} ({earliest.name!r} ends)"
     )
     if not first < last:
         raise RecordError(f"the channels have no common time: {overlap}.")
-    if not begin < end:
-        raise RecordError(f"start {shown(begin)} is not before stop {shown(end)}; {overlap}.")
     slack = 1e-9 * (1 + abs(last))
-    if begin < first - slack or end > last + slack:
-        raise RecordError(f"{shown(begin, end)} is out of range; {overlap}.")
+    begin, end = chosen_span(first, last, start, stop, origin, slack, overlap)
     begin, end = max(begin, first), min(end, last)
     if not (np.isfinite(sample_rate) and sample_rate > 0):
         raise RecordError(f"the sample rate is {sample_rate} Hz: it must be positive.")

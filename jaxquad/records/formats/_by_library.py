@@ -1,8 +1,8 @@
 """Formats that other libraries decode: HDF5, Parquet and ROS 2 bags, in a process of their own.
 
-The face of this folder runs it as a script, without the package: `_by_library.py FORMAT PATH LIMIT`. It
-reads PATH and writes to stdout a line of JSON (names, dtypes, shapes, units, remarks; or what was
-wrong), then the bytes of the arrays.
+The face of this folder runs it as a script, without the package: `_by_library.py FORMAT PATH
+LIMIT`. It reads PATH and writes to stdout a line of JSON (names, dtypes, shapes, units, remarks; or
+what was wrong), then the bytes of the arrays.
 """
 
 import dataclasses
