@@ -222,18 +222,11 @@ _BY_LAW = (
 
 
 class LawLoop(NamedTuple):
-    """The flown loop where the law is known.
+    """The flown loop where the law is known."""
 
-    **Attributes:**
-
-    - `measured`: law times measured response of the plant; `model`: times the identified one.
-    - `step`: from set-point to rate, of plants that the fit leaves possible.
-    - `unmodelled`: what the law leaves out.
-    """
-
-    measured: BrokenLoop
-    model: BrokenLoop | None
-    step: StepBand | None
+    measured: BrokenLoop  # law times measured response of the plant
+    model: BrokenLoop | None  # law times the identified one
+    step: StepBand | None  # from set-point to rate, of plants that the fit leaves possible
     unmodelled: Sequence[str] = ()
 
     @property

@@ -55,22 +55,18 @@ class Identification:
 
     **Attributes:**
 
-    - `path`: of the log.
     - `settings`: those that were used, a proposal included.
     - `records`: one for each segment of each log.
     - `responses`: the frequency response by method, the one to trust first.
     - `fits`: the fit to each of them.
     - `parts`: where the misfit is large, the fit beside those to the upper and to the lower part of
       the band; None for one that diverged.
-    - `proposal`: where the log itself said what is input and output.
     - `more`: the logs that were taken together with the first.
     - `flown`: the gyro's filters and the law of an autopilot's log, up to whose filters the model
       is, unless `settings.keep_gyro_filters`.
     - `check`: the second record simulated, where `settings.verify` names one.
-    - `bands`: the same parameters from the lower and the upper half of the band, where there is a
-      fit.
-    - `explanation`: which further term the response wants, where `settings.explain` asks for it and
-      the misfit exceeds 1.5 random errors.
+    - `bands`: the same parameters from the lower and the upper half of the band.
+    - `explanation`: which further term the response wants, where `settings.explain` asks for it.
     - `failures`: by title, why something beside the fit could not be computed.
     """
 

@@ -76,27 +76,18 @@ def propose_settings(
 
 
 class OpenedLogs(NamedTuple):
-    """What `identify_opened` computes with: one log, or several of one vehicle, as records.
-
-    **Attributes:**
-
-    - `paths`: of the logs.
-    - `settings`: those given, with what the log proposes.
-    - `proposal`: where the log itself said what is input and output.
-    - `records`: one for each segment of each log.
-    """
+    """What `identify_opened` computes with: one log, or several of one vehicle, as records."""
 
     paths: tuple[Path, ...]
-    settings: IdentifySettings
-    proposal: Proposal | None
-    records: tuple[Record, ...]
+    settings: IdentifySettings  # with what the log proposes
+    proposal: Proposal | None  # where the log itself said what is input and output
+    records: tuple[Record, ...]  # one for each segment of each log
 
 
 def open_logs(
-    path: str | Path | Sequence[str | Path],
-    settings: IdentifySettings | None = None,
+    path: str | Path | Sequence[str | Path], settings: IdentifySettings | None = None,
     proposal: Proposal | None = None,
-) -> OpenedLogs:
+) -> OpenedLogs:  # fmt: skip
     """Read what `identify` takes, with the same arguments; it needs no JAX.
 
     **Raises:** `RecordError` or `ReadError` (both ValueErrors) for a log that cannot be used, and
@@ -194,8 +185,8 @@ DEMO = IdentifySettings(
 def write_demo_log(path: str | Path, seed: int = 0) -> Path:
     """Write time, reference x0, command M and rate q as CSV; the same for the same seed.
 
-    An axis under rate feedback, in gusts, is excited by a sweep of its command. `DEMO` holds the
-    settings to identify it with, `DEMO_TRUTH` the true parameters.
+    An axis under rate feedback, in gusts, is excited by a sweep of its command. `DEMO` are the
+    settings to identify it with.
     """
     low, high = 2 * np.pi * 0.4, 2 * np.pi * 15
     signal = sweep(low, high, duration=40, sample_rate=_RATE, amplitude=0.06)
