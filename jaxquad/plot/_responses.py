@@ -286,8 +286,7 @@ def pzmap(*shown: Thing, ax: AxesLike = None, title: str = "") -> Panels:
     there are marks.
     """
     things = named_models(shown, "pzmap")
-    panels = lay.stacked(1, ax)
-    [panel] = panels
+    [panel] = panels = lay.stacked(1, ax)
     for k, (name, thing) in enumerate(things.items()):
         if not isinstance(thing, Fit | Model):
             poles, zeros = analysed(name, thing, "pzmap").poles, np.empty(0)
@@ -349,8 +348,7 @@ def nyquist(
     channels = channels_shown(measured, modelled)
     o, i = channels.places(pair)[0]
     grid = frequencies_of(measured, modelled, None if omega is None else np.asarray(omega, float))
-    panels = lay.stacked(1, ax)
-    [panel] = panels
+    [panel] = panels = lay.stacked(1, ax)
     sizes = []
     for k, response in enumerate(measured):
         frf = response.frf
