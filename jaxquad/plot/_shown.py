@@ -183,7 +183,7 @@ class Shown(NamedTuple):
     def frequencies(
         self, omega: Float[ArrayLike, " frequencies"] | None
     ) -> Float[np.ndarray, " frequencies"]:
-        """Where models are drawn, in rad/s: as given, over what was measured, or about their poles."""
+        """Where models are drawn, in rad/s: as given, over what was measured, or about poles."""
         if omega is not None:
             return np.atleast_1d(np.asarray(omega, float))
         spans = [np.asarray(response.frf.omega)[[0, -1]] for response in self.measured]
