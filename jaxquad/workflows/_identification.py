@@ -140,8 +140,20 @@ class Identification:
 
     @property
     def formula(self) -> str:
-        """The structure of the model in words."""
-        return model_formula(self.settings, damped="damping" in self.fit.names)
+        """The structure of the model, such as `q / M = K e^(-delay s) / (s (lag s + 1))`."""
+        settings, n = self.settings, self.settings.integrators
+        [output], [source] = mix_of(settings.output), mix_of(settings.input)
+        if settings.poles is not None:
+            kind = f"{settings.zeros} zeros over {settings.poles} poles and {n} integrators"
+            return f"{output} / {source}, {kind}{', delayed' if settings.delay else ''}"
+        damped = "damping" in self.fit.names
+        pure = n - damped
+        below = [] if pure == 0 else ["s"] if pure == 1 else [f"s^{pure}"]
+        below += ["(s + damping)"] if damped else []
+        below += ["(lag s + 1)"] if settings.lag else []
+        above, product = "K e^(-delay s)" if settings.delay else "K", " ".join(below)
+        ratio = f" / ({product})" if len(below) > 1 else f" / {product}" if below else ""
+        return f"{output} / {source} = {above}{ratio}"
 
     @property
     def sums(self) -> Mapping[str, Callable[[Model], Float[Array, ""]]]:
@@ -358,22 +370,6 @@ class Identification:
 def total_delay(model: Model) -> Float[Array, ""]:
     """The sum of lag and delay, which a record determines better than either of them."""
     return model.delay if isinstance(model, TransferFunction) else model.lag + model.delay
-
-
-def model_formula(settings: IdentifySettings, *, damped: bool = False) -> str:
-    """The structure of the model, such as `q / M = K e^(-delay s) / (s (lag s + 1))`."""
-    n = settings.integrators
-    [output], [source] = mix_of(settings.output), mix_of(settings.input)
-    if settings.poles is not None:
-        kind = f"{settings.zeros} zeros over {settings.poles} poles and {n} integrators"
-        return f"{output} / {source}, {kind}{', delayed' if settings.delay else ''}"
-    pure = n - damped
-    below = [] if pure == 0 else ["s"] if pure == 1 else [f"s^{pure}"]
-    below += ["(s + damping)"] if damped else []
-    below += ["(lag s + 1)"] if settings.lag else []
-    above, product = "K e^(-delay s)" if settings.delay else "K", " ".join(below)
-    ratio = f" / ({product})" if len(below) > 1 else f" / {product}" if below else ""
-    return f"{output} / {source} = {above}{ratio}"
 
 
 def _on_negative_gain(fit: Fit, frf: FrequencyResponse) -> list[str]:
