@@ -99,12 +99,9 @@ def autopilot(declared: argparse.ArgumentParser) -> Run:
 
 
 def run_autopilot(
-    options: argparse.Namespace,
-    log: Path,
-    settings: AutopilotSettings,
-    wanted: Path,
+    options: argparse.Namespace, log: Path, settings: AutopilotSettings, wanted: Path,
     note: str = "",
-) -> int:
+) -> int:  # fmt: skip
     """Tune the gains of the loop that flew the log, print and write what comes out; `{page}` in
     `note` is the page's path."""
     proposal = workflows.autopilot(log, settings)
