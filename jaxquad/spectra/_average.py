@@ -6,8 +6,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Complex, Float
 
-from ._checks import adjoint, diagonal, Grid, Levels, Pairs, power_of, Responses
 from ._error_covariance import window_products
+from ._estimators import adjoint, diagonal, Grid, Levels, Pairs, power_of, Responses
 from ._fourier_sums import coefficients, Layout
 from ._noise import noise_root, padded, Resolved, Slopes, without_leakage
 
@@ -26,10 +26,9 @@ _Pairs = Float[np.ndarray, "*groups frequencies outputs inputs"]
 
 
 class Segments(NamedTuple):
-    """Transforms of one set of windows for each length, in absolute phase.
+    """Transforms of windows for each length, in absolute phase, by the channels of `Record.names`.
 
-    Channels are in the order of `Record.names`; `groups` are the lengths and starts in samples, of
-    the records one after the other, with gaps wider than any window.
+    The starts in `groups` are of the records one after the other, with gaps wider than any window.
     """
 
     transforms: tuple[Complex[np.ndarray, "frequencies windows channels"], ...]
@@ -65,11 +64,8 @@ class Conditioned(NamedTuple):
 
 
 def condition(products: Products, channels: Channels, counts: Counts) -> Conditioned:
-    """`(Z* X)^-1 Z* Y` from the sums of `conj(a) b` over so many windows of each length.
-
-    With two inputs and instruments z = x, this is the closed form of the textbook.
-    Source: Bendat & Piersol, ch. 7; Tischler & Remple, ch. 9.
-    """
+    """`(Z* X)^-1 Z* Y` from the sums of `conj(a) b` (Bendat & Piersol, ch. 7; Tischler & Remple,
+    ch. 9)."""
 
     def inverse(matrix: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
         """That of matrices in any units, which `rows` and `columns` are."""
@@ -120,17 +116,15 @@ class Combined(NamedTuple):
 
 
 def combine(parts: Conditioned, scales: Counts, freedom: Counts, resolved: Resolved) -> Combined:
-    """Weight spectra of several window lengths by (eps_i / eps_min)^-4 and fit one set to them.
+    """Weight spectra of several window lengths by W_i = (eps_i / eps_min)^-4 and fit one set to
+    them.
 
-    `scales` turn powers into densities, `freedom` are the independent windows less the inputs
-    that share them, and eps = sqrt(1 - g^2) / (|g| sqrt(2 freedom)); `resolved` says where a window
-    holds enough cycles. The cost is
+    The cost (Tischler & Remple eq. 10.4), each part relative to its mean under W_i^2 (G_xx~ ...),
+    is
 
         sum_i W_i {(G_xx - G_xx,i)^2 + (G_yy - G_yy,i)^2 + |G_xy - G_xy,i|^2 + 5 (g^2 - g_i^2)^2}
 
-    each part relative to its mean under W_i^2 (G_xx~ and so on). |G_xy~| stands for the textbook's
-    Re G_xy~ and Im G_xy~, one of which may be zero. Only weighted means of the spectra enter, and
-    the phase is that of the mean. Source: Tischler & Remple eq. 10.4.
+    with |G_xy~| for Re G_xy~ and Im G_xy~, one of which may be zero. The phase is that of the mean.
     """
     averages = 2 * freedom[:, None, None, None]
     error = (1 - parts.coherence + 1e-12) / (np.maximum(parts.coherence, 1e-12) * averages)
@@ -195,11 +189,7 @@ def average(
     shape: str,
     independent: Counts,
 ) -> Averaged:
-    """One response from all window lengths, with the effect of noise in each window.
-
-    `sums` are those of the products of transforms over windows, `independent` the windows of each
-    length that do not overlap.
-    """
+    """One response from all window lengths, with the effect of noise in each window."""
     lengths, starts = zip(*segments.groups, strict=True)
     transforms, many = segments.transforms, tuple(map(len, starts))
     overlap, counts = window_products(segments.groups, shape), np.array(many, float)

@@ -1,16 +1,22 @@
-"""Signs that a controller, and not the plant, made the coherence between input and output."""
+"""Feedback: signs that a controller made the coherence, the bias by it, the plant without it."""
 
+import dataclasses
 import functools as ft
 import itertools
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
+import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Complex, Float, Int
+from jaxtyping import ArrayLike, Complex, Float, Int
 
+from jaxquad.models import Model
 from jaxquad.records import Record
 
-from ._checks import (
+from ._estimators import (
+    check_compatible,
+    check_references,
     COHERENT,
     DOMINATED,
     EARLY,
@@ -19,11 +25,15 @@ from ._checks import (
     Method,
     Remark,
     Response,
+    Welch,
     Where,
 )
-from ._frequency_response import Estimate
+from ._frequency_response import Estimate, FrequencyResponse
+from ._welch import spectral_density
 
 
+_AMPLIFIED = 10.0  # factor on the relative error from which a remark is made
+_SIGNIFICANT = 0.02  # share of noise in the input from which the joint estimate is recommended
 _CHANCE = 1.35e-3  # of calling the phase of any pair rising: 3 standard errors of a single slope
 _FALLS = 0.35  # rad over the top of the coherent band: less than an actuator's phase falls there
 _LESS = 0.05  # power of 1/omega by which a lag's magnitude falls there
@@ -56,10 +66,8 @@ _FED_BACK = (
 def remarks_on_feedback(
     records: Sequence[Record], method: Method, estimate: Estimate
 ) -> tuple[Remark, ...]:
-    """Remarks on feedback that a user of the response has to know.
-
-    Points of a response whose errors overlapping windows correlate count as independent.
-    """
+    """Remarks on feedback; points whose errors overlapping windows correlate count as
+    independent."""
     from scipy.special import ndtri
 
     outputs, inputs, omega = records[0].output_names, records[0].input_names, estimate.omega
@@ -132,16 +140,12 @@ class PhaseSlope(NamedTuple):
     order: float  # of the magnitude: -1 where it falls as 1/omega
 
     def rises(
-        self,
-        response: Response,
-        covariance: Covariance | None = None,
-        clear: float = 3.0,
+        self, response: Response, covariance: Covariance | None = None, clear: float = 3.0
     ) -> bool:
-        """Whether the phase increases, by `clear` standard errors.
+        """Whether the phase increases by `clear` standard errors, as that of -1/C and of no
+        actuator.
 
-        Every actuator lags, so a plant's phase decreases there. That of -1/C, with a controller
-        that filters and delays, increases. Neighbours share noise, which makes a slope less certain
-        than its many points say: the response's `covariance` is asked for where these say that it
+        Neighbours share noise: the `covariance` is asked for where the points alone say that it
         rises.
         """
         variance, top = self.variance, self.top
@@ -187,9 +191,9 @@ _EXACT = 1e-7  # of its power: new parts of the output below it say nothing
 class Share(NamedTuple):
     """Of the input's power at each frequency, that which the output's innovations make.
 
-    Innovations are what the past of both signals does not predict. What both have in common at one
-    sample counts as the output's in `output_first`, because a plant takes time to answer, and as
-    the input's in `input_first`, because a logger may write an answer beside its cause.
+    What both have in common at one sample is the output's in `output_first`, because a plant takes
+    time to answer, and the input's in `input_first`, because a logger may write an answer beside
+    its cause.
     """
 
     output_first: Grid
@@ -199,17 +203,11 @@ class Share(NamedTuple):
 def share_from_output(
     records: Sequence[Float[np.ndarray, "2 _samples"]], dt: float, omega: Grid
 ) -> Share:
-    """The directed share of Geweke (1982); zero where the records are too short for a model.
+    """The directed share of Geweke (1982) by an autoregressive model; zero for records too short.
 
-    It is that of a joint autoregressive model of both. At which sample rate innovations tell a
-    loop's directions apart depends on its noise: of several rates, the one with the largest median
-    counts. At a rate so slow that a plant answers within one sample, it can be mistaken for its
+    `records` are of output and input. Of several sample rates, the one with the largest median
+    counts. At one so slow that a plant answers within a sample, it can be mistaken for its
     controller: the highest rate has to show half of it, too.
-
-    **Arguments:**
-
-    - `records`: output and input, sampled every `dt` seconds.
-    - `omega`: frequencies in rad/s, increasing.
     """
     flat = []
     for x in records:  # without offset and trend, in units of the standard deviation
@@ -263,3 +261,146 @@ def lagged_products(x: Float[np.ndarray, "2 samples"]) -> Float[np.ndarray, "lag
         blocks[1:] += np.cumsum(entering - leaving, axis=0)
         sums[i, :, i + k], sums[i + k, :, i] = blocks, blocks.transpose(0, 2, 1)
     return sums.reshape(2 * p + 2, 2 * p + 2)
+
+
+def deembed(
+    closed: FrequencyResponse,
+    controller: Model,
+    *,
+    entry: Literal["set-point", "plant input"] = "set-point",
+) -> FrequencyResponse:
+    """Calculate the plant from a measured closed loop whose controller is known.
+
+    With T = G C / (1 + G C) measured from the set-point, G = T / (C (1 - T)); with
+    P = G / (1 + G C) measured from the plant input, G = P / (1 - P C). Random errors are propagated
+    to first order.
+
+    **Arguments:**
+
+    - `closed`: the `FrequencyResponse` of one output to the injected signal.
+    - `controller`: has `frequency_response(omega)`, from minus the output to the plant input, shape
+        `(frequencies, 1, 1)`; it is taken as exact.
+    - `entry`: where the signal was injected, `"set-point"` or `"plant input"`.
+
+    **Returns:** the `FrequencyResponse` of the plant, with a remark where the loop amplifies the
+    errors of the closed loop more than ten times.
+
+    **Raises:**
+
+    - `ValueError`: for another entry, or responses with more than one input or output.
+    """
+    measured = np.asarray(closed.response)
+    feedback = np.asarray(controller.frequency_response(jnp.asarray(closed.omega)))
+    if measured.shape[1:] != (1, 1) or feedback.shape != measured.shape:
+        raise ValueError(
+            f"deembed needs one input and one output, but the response has shape {measured.shape} "
+            f"and the controller's {feedback.shape} (frequencies, outputs, inputs): select "
+            "channels with jq.records.select"
+        )
+    if entry == "set-point":
+        rest = 1 - measured
+        plant, slope = measured / (feedback * rest), 1 / (feedback * rest**2)
+    elif entry == "plant input":
+        rest = 1 - measured * feedback
+        plant, slope = measured / rest, 1 / rest**2
+    else:
+        raise ValueError(f"entry is {entry!r}: use 'set-point' or 'plant input'")
+    amplified = np.abs(slope * measured / plant)
+    lost, remarks = np.asarray(closed.omega)[amplified[:, 0, 0] > _AMPLIFIED], list(closed.remarks)
+    if lost.size:
+        text = (
+            f"the closed loop hardly depends on the plant {{where}}: its errors are amplified more "
+            f"than {_AMPLIFIED:g} times there. Leave these frequencies out, or inject the signal "
+            "at the plant input"
+        )
+        remarks.append(Remark(text, lost, kind="amplified errors"))
+    errors = closed.errors.scaled(jnp.asarray(slope[:, 0, 0]))
+    return dataclasses.replace(
+        closed,
+        response=jnp.asarray(plant),
+        random_error=closed.random_error * jnp.asarray(amplified),
+        errors=errors,
+        remarks=tuple(remarks),
+    )
+
+
+class FeedbackBias(eqx.Module):
+    """The bias of the direct estimate by noise that a controller C feeds back.
+
+    With g^2 the coherence of reference and input, the direct estimate is
+    H1 = g^2 G + (1 - g^2) (-1/C). `noise_share` is 1 - g^2, `joint` is G, and `inverse` is -1/C,
+    estimated from the parts of input and output that the reference does not explain.
+    """
+
+    omega: Grid  # rad/s
+    direct: Response
+    joint: Response
+    inverse: Response
+    noise_share: Grid  # of the input's power, 0 to 1
+
+    @property
+    def bias(self) -> Response:
+        """Relative error of the direct estimate, H1 / G - 1."""
+        return self.direct / self.joint - 1
+
+    def __str__(self) -> str:
+        worst, largest = int(np.argmax(self.noise_share)), int(np.argmax(np.abs(self.bias)))
+        share, size = 100 * self.noise_share, 100 * np.abs(self.bias)
+        lines = [
+            f"feedback: {np.median(share):.2g} % of the input's power is fed-back noise (median), "
+            f"at most {share[worst]:.2g} % at {in_hertz(self.omega[[worst]])}",
+            f"  bias of the direct estimate: {np.median(size):.2g} % (median), at most "
+            f"{size[largest]:.2g} % at {in_hertz(self.omega[[largest]])}",
+        ]
+        if np.max(self.noise_share) > _SIGNIFICANT:
+            lines.append("  use the joint estimate, the default for a record with a reference")
+        return "\n".join(lines)
+
+
+def feedback_bias(
+    record: Record | Sequence[Record],
+    omega: Float[ArrayLike, " frequencies"] | None = None,
+    *,
+    welch: Welch | None = None,
+) -> FeedbackBias:
+    """Estimate how far feedback biases the direct estimate of a plant.
+
+    Input and output are split into the part that the reference explains and the rest (Wellstead,
+    1981, "Non-parametric methods of system identification"; Forssell and Ljung, 1999, "Closed-loop
+    identification revisited").
+
+    **Arguments:**
+
+    - `record`: one `Record` or several, with one input, one output and one external reference.
+    - `omega`: frequencies in rad/s; by default those of `welch`.
+    - `welch`: window and overlap, by default `jq.spectra.Welch()`.
+
+    **Returns:** a `FeedbackBias`, which prints as a summary.
+
+    **Raises:**
+
+    - `ValueError`: for other channels, and for frequencies that the window does not resolve.
+    """
+    records = [record] if isinstance(record, Record) else list(record)
+    check_compatible(records)
+    check_references(records)
+    first = records[0]
+    if len(first.input_names) != 1 or len(first.output_names) != 1:
+        raise ValueError(
+            f"feedback_bias needs one input and one output, but the record has "
+            f"{first.input_names} and {first.output_names}: select them with jq.records.select"
+        )
+    density = spectral_density(records, omega, welch=welch)
+    u, y, r = first.names
+    power, spread = np.asarray(density.power(u)), np.asarray(density.power(r))
+    cross, from_u, from_y = (np.asarray(density.cross(*pair)) for pair in ((u, y), (r, u), (r, y)))
+    explained = np.abs(from_u) ** 2 / spread
+    joint = from_y / from_u
+    rest = np.maximum(power - explained, 1e-300)
+    return FeedbackBias(
+        np.asarray(density.omega),
+        cross / power,
+        joint,
+        (cross - np.conj(from_u) * from_y / spread) / rest,
+        np.clip(1 - explained / power, 0.0, 1.0),
+    )

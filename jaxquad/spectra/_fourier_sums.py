@@ -31,10 +31,8 @@ def window(name: str, samples: int) -> Float[np.ndarray, " window"]:
 
 
 def waves(name: str) -> tuple[float, float, float]:
-    """Coefficients of a window with angle a = 2 pi n / samples: level - cosine cos a - sine sin a.
-
-    A prime stands for a derivative by a: "hann'" and "hann''".
-    """
+    """level - cosine cos a - sine sin a of a window, a = 2 pi n / samples; primes stand for
+    d/da."""
     plain = name.rstrip("'")
     (level, cosine), sine = coefficients(plain), 0.0
     for _ in range(len(name) - len(plain)):
@@ -51,10 +49,7 @@ def coefficients(name: str) -> tuple[float, float]:
 
 @ft.lru_cache(maxsize=256)
 def segment_starts(samples: int, length: int, overlap: float) -> tuple[int, ...]:
-    """First samples of windows that overlap by at least `overlap`, spread evenly to both ends.
-
-    The end of a record must not be lost: the highest frequencies of a sweep are there.
-    """
+    """First samples of windows that overlap by at least `overlap`, spread evenly to both ends."""
     step = max(int(round(length * (1 - overlap))), 1)
     count = -(-(samples - length) // step) + 1
     return tuple(int(start) for start in np.round(np.linspace(0, samples - length, count)))
@@ -69,10 +64,8 @@ def lattice_windows(
 ) -> Layout:
     """Windows near `lengths` that overlap by about `overlap`, of whole blocks where that pays.
 
-    A block is about 50 rad long at the `highest` frequency (rad per sample). Lengths become
-    multiples of it; starts lie on blocks counted from the record's end, but the first window of
-    each length starts at the first sample. Windows shorter than 16 of the smallest blocks keep
-    their length and their even spread.
+    A block is about 50 rad long at the `highest` frequency (rad per sample), and counted from the
+    record's end; the first window of each length starts at the first sample.
     """
     if not 0 <= overlap < 1:
         raise ValueError(f"overlap {overlap} is not in [0, 1): 0.5 or 0.8 are usual")
@@ -129,9 +122,8 @@ def fourier_sums(
 ) -> list[list[Complex[np.ndarray, "frequencies segments _"]]]:
     """`sum_n taper[n] x[start + n] exp(-j angle (origin + start + n))`, by taper and by length.
 
-    `signals` lie side by side, `angle` is in rad per sample, and the phase is that of a record
-    whose first sample is number `origin`. `detrend` removes the "constant" or the "linear"
-    least-squares trend of every window before the taper, or "none". Accurate to about 2e-13 of the
+    `signals` lie side by side, `angle` is in rad per sample. `detrend` removes the "constant" or
+    the "linear" trend of every window before the taper, or "none". Accurate to about 2e-13 of the
     largest sum. In memory, the windows of one channel are neighbours.
     """
     require_x64("a transform")
@@ -198,10 +190,7 @@ class _Blocks(NamedTuple):
 
 
 def _share_blocks(samples: int, angle: Grid, windows: Sequence) -> _Blocks:
-    """Blocks of about 50 rad, at whose ends as many windows as possible begin and end.
-
-    But for the first of each length, windows lie on blocks where one divides all their steps.
-    """
+    """Blocks of about 50 rad, at whose ends as many windows as possible begin and end."""
     highest = float(np.max(np.abs(angle)))
     ideal = int(np.clip(50 / max(highest, 1e-9), *_BLOCKS))
     origin = windows[0][1][-1]
@@ -394,10 +383,7 @@ def _sum_directly(
 def _from_middle(
     segments: Float[np.ndarray, "channels windows samples"], angle: Grid
 ) -> Complex[np.ndarray, "frequencies channels windows"]:
-    """Fourier sums with phases from the middle of a window.
-
-    Within short blocks and then over the blocks, so that few exponentials are needed.
-    """
+    """Fourier sums with phases from the middle of a window, in two steps: few exponentials."""
     *many, length = segments.shape
     block = max(int(np.sqrt(length)), 1)
     count = -(-length // block)

@@ -14,26 +14,31 @@ from jaxtyping import Array, ArrayLike, Bool, Complex, Float
 from jaxquad._core import pytree_node, require_float64, require_x64
 from jaxquad.records import Record
 
-from ._checks import (
+from ._error_covariance import ErrorCovariance, independent_errors
+from ._estimators import (
     check_band,
     check_compatible,
     check_distinct,
     check_excitation,
     check_references,
     COHERENT,
+    Composite,
     DOMINATED,
+    Estimator,
     Grid,
     in_hertz,
+    JointInputOutput,
     Levels,
+    LocalPolynomial,
     Method,
     Pairs,
+    Periodic,
     Remark,
     Remarks,
     Responses,
     Square,
+    Welch,
 )
-from ._error_covariance import ErrorCovariance, independent_errors
-from ._estimators import Composite, Estimator, JointInputOutput, LocalPolynomial, Periodic, Welch
 
 
 class Distortion(eqx.Module):
@@ -193,12 +198,12 @@ class FrequencyResponse:
         )
 
     @property
-    def magnitude_db(self) -> Float[np.ndarray, "frequencies outputs inputs"]:
+    def magnitude_db(self) -> Pairs:
         """20 log10 of the magnitude."""
         return 20 * np.log10(np.abs(np.asarray(self.response)))
 
     @property
-    def phase_deg(self) -> Float[np.ndarray, "frequencies outputs inputs"]:
+    def phase_deg(self) -> Pairs:
         """Phase in degrees, unwrapped along frequency."""
         return np.degrees(np.unwrap(np.angle(np.asarray(self.response)), axis=0))
 
@@ -239,7 +244,7 @@ class FrequencyResponse:
         return covariance / np.outer(response, response.conj())
 
     @property
-    def error_exponent(self) -> Float[np.ndarray, "frequencies outputs inputs"]:
+    def error_exponent(self) -> Pairs:
         """The power p of |measurement / model| in the random error relative to a model.
 
         Noise of a numerator is relative to the measured one: error |measurement| / |model|, p = 1.
@@ -328,10 +333,7 @@ def _like(name: str, numbers: ArrayLike, values: np.ndarray) -> np.ndarray:
 
 
 class Estimate(NamedTuple):
-    """What an estimator makes of records; nan and infinite errors where it is undetermined.
-
-    `remarks` are the estimator's own, made where they are asked for.
-    """
+    """What an estimator makes of records; nan and infinite errors where it is undetermined."""
 
     omega: Grid
     response: Responses

@@ -11,9 +11,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
 
-from ._checks import diagonal, Grid
+from ._estimators import diagonal, Grid
 from ._local_fit import Bins, left_power, LocalFit, window_slices
-from ._local_noise import SharedErrors
+from ._local_windows import SharedErrors
 from ._noise import Noise
 from ._rational_fit import (
     columns_of,
@@ -51,9 +51,9 @@ Levels = Float[np.ndarray, " bins"]
 class GlobalModel(NamedTuple):
     """Y = (sum_i B_i U_i + C_r) / A of one output, polynomials in x = (exp(-j omega dt) - 1)/scale.
 
-    Inputs that are held, or linear between samples, reach a system of finite order exactly so, with
-    all their aliases; C_r is the difference of the states at the ends of record r. The errors of
-    the real parameters are Re(drive V), V the transform of the output's noise at `places`.
+    So a system of finite order answers to inputs that are held, or linear between samples; C_r is
+    the difference of the states at the ends of record r. Errors of the real parameters are Re(drive
+    V).
     """
 
     solved: Solved
@@ -108,15 +108,13 @@ class GlobalModel(NamedTuple):
 def global_models(
     bins: Bins, inputs: slice, outputs: slice, highest: float, dt: float, most: int
 ) -> list[GlobalModel | None]:
-    """One model for each output, of one order more, up to `most`, than has the least criterion.
+    """One model for each output, of one order more than has the least criterion; `None` for chance.
 
-    The criterion asks for more than Akaike's, under which a pole and a zero settle where the noise
-    of single bins happens to rise, and for less than a Bayesian one, which stops where what is left
-    hides in that noise; in a local window that would be a bias. It cannot see what is of the size
-    of the noise, as half a sample of a delay: so the order is the next one, which takes most of it.
-    `None` where a model explains no more than chance allows. The bins reach five times `highest`
-    (rad/s). Above 20000 of them one of each n is taken: each is an equation of its own, so thinning
-    costs precision, never resolution. The order is chosen with 4000 at most.
+    The criterion lies between Akaike's, under which a pole and a zero settle where the noise of
+    single bins rises, and a Bayesian one, which stops where what is left hides in that noise. It
+    cannot see what is of the size of the noise, as half a sample of a delay: so the order is the
+    next one. Of many bins one of each n is taken: each is an equation of its own, so that costs
+    precision alone.
     """
     reach = int(np.searchsorted(bins.omega, highest_modelled(highest), "right"))
     places = _thin(reach, _MOST_BINS)
@@ -137,11 +135,8 @@ def weighted_model(
     most: int,
     noise: Float[np.ndarray, " places"],
 ) -> GlobalModel | None:
-    """The model of the same bins that count by `noise`, the output's power at the model's places.
-
-    What the first model leaves can hide response: where it fits the loud bins alone, what it leaves
-    of the others counts as their noise, and they never matter.
-    """
+    """The model of the same bins that count by `noise`: by what a first model leaves, quiet ones do
+    not."""
     equations = _equations(bins, model.places, inputs, output, model.scale, model.dt)
     omega, weight = bins.omega[model.places], 1 / np.sqrt(noise)
     white = equations.weighted(weight).pick(_thin(len(omega), _TRIAL_BINS))
@@ -171,10 +166,8 @@ def highest_modelled(highest: float) -> float:
 
 
 def _thin(count: int, most: int) -> Places:
-    """At most so many of `count` bins, one of each n neighbours.
-
-    Not every n-th: of a periodic input's lines it would take all, or none.
-    """
+    """At most so many of `count` bins, one of each n neighbours: not every n-th, of periodic
+    lines."""
     step = -(-count // most)
     first = np.arange(0, count, step)
     shift = np.floor(step * (0.6180339887 * np.arange(first.size) % 1.0)).astype(int)
@@ -202,10 +195,8 @@ class _Task:
 
 @ft.lru_cache(maxsize=2)
 def _identify_kept(task: _Task) -> Settled | None:
-    """A fit with another delay of the outputs asks for the model of the inputs once more.
-
-    One of 20000 bins takes 20 MB.
-    """
+    """A fit with another delay of the outputs asks for the model of the inputs again; one takes 20
+    MB."""
     return task.identify()
 
 
@@ -220,10 +211,7 @@ def _identify(equations: Equations, omega: Levels, most: int) -> Settled | None:
         return None
 
     def value(order: int) -> float:
-        """Price and likelihood of an order's model and smoothed noise together.
-
-        In weights without the peak that gusts make through a light mode, further poles describe it.
-        """
+        """Price and likelihood together with the noise: gusts through a light mode peak in it."""
         left = first.solved[order].left * np.sqrt(rough)
         noise = noise_left(grid, left, first.solved[order].below, np.ones_like(grid))
         return PRICE * equations.parameters(order) - 2 * _log_likelihood(left, noise)
@@ -264,10 +252,8 @@ def _settle(
 
 
 def rough_noise(equations: Equations, omega: Levels) -> Levels:
-    """Power of what local rational functions, of one pole in a few bins, leave of the output.
-
-    Without a pole a light mode would leave much, and its bins would hardly count.
-    """
+    """Power of what local rational functions leave; without their pole a light mode would leave
+    much."""
     factors = np.concatenate([equations.u, equations.owner])
     count, columns = omega.size, 2 * len(factors) + 1
     length = min(2 * columns, count)
@@ -295,8 +281,7 @@ def noise_left(
 ) -> Levels:
     """Running power of what a model leaves; that before its poles where it is clearly likelier.
 
-    `below` are the values of the model's denominator: gusts pass the poles of the plant, and a
-    light mode makes a peak of them that is narrower than a running power.
+    `below` is the denominator: gusts pass the poles, and peak more narrowly than a running power.
     """
     after = running_power(omega, left, freedom)
     before = running_power(omega, left * below, freedom) / np.abs(below) ** 2
@@ -334,11 +319,8 @@ class Rest(NamedTuple):
     def without_followed(
         self, omega: Grid, half_width: Grid, order: int, fit: LocalFit
     ) -> LocalFit:
-        """The fit with the scatter of its residuals corrected for the noise that models follow.
-
-        A model takes off as much of the noise as it has parameters; what of it a local fit would
-        have followed by itself is counted already.
-        """
+        """The fit, its residuals corrected for noise that models follow and it would not have
+        followed."""
         scatter, freedom = np.array(fit.scatter), fit.freedom
         # A long record has many times the bins that the windows reach.
         reach = int(np.max(window_slices(omega, half_width, self.bins)[1]))
@@ -395,10 +377,7 @@ def take_off(
 def response_left(
     rest: Rest, omega: Grid, half_width: Grid, fit: LocalFit
 ) -> Float[np.ndarray, " moved"]:
-    """The most that a model leaves in any window, to what the local `fit` leaves of it; or 0.
-
-    Noise is 1 to 6. More is response, or a transient, that the local fit follows.
-    """
+    """The most that a model leaves in any window, to what `fit` leaves: noise is 1 to 6; or 0."""
     first, last = window_slices(omega, half_width, rest.bins)
     running = np.cumsum(np.abs(rest.bins.values[:, rest.moved]) ** 2, axis=0)
     running = np.concatenate([np.zeros((1, running.shape[1])), running])
@@ -435,9 +414,7 @@ def shared_errors(
 ) -> SharedErrors | None:
     """Errors of the models' parameters in left (models + `fit`) right; `None` without models.
 
-    `noise` is that of the moved channels, and `fit` is from the sources to these. A local fit
-    follows what a wrong parameter leaves in its window, so that only the difference of the model's
-    own change at the frequency and of the change that the local fit sees remains.
+    A local fit follows what a wrong parameter leaves in its window: only the difference remains.
     """
     used = [(c, model) for c, model in enumerate(rest.models) if model is not None]
     if not used:
@@ -469,21 +446,18 @@ def shared_errors(
 
 
 def highest_looked_at(highest: float, grid: Grid) -> float:
-    """Frequency in rad/s above which neither models nor `left_moving` on a `grid` take any bin.
-
-    The models are those of responses up to `highest`.
-    """
+    """Frequency above which neither models of responses up to `highest` nor `left_moving` take
+    bins."""
     return max(highest_modelled(highest), np.exp(_AROUND) * grid[-1])
 
 
 def left_moving(
     rest: Rest, ends: Sequence[Float[np.ndarray, "_samples channels"]], grid: Grid, noise: Noise
 ) -> Bool[np.ndarray, " grid"]:
-    """Where models leave a peak, far above the noise, of a channel that moves when a record ends.
+    """Where models leave a peak, far above the noise, of a channel that moves at a record's `ends`.
 
-    There the local fits alone have to tell the response from what still rings, which they cannot do
-    of a mode narrower than their windows. `ends` are those of the records' channels as transformed,
-    and `noise` is that of the moved channels on the `grid`.
+    The local fits cannot tell the response from a mode that still rings, narrower than their
+    windows.
     """
     ringing, bins = np.zeros(grid.size, bool), rest.bins
     place = np.log(bins.omega)

@@ -17,7 +17,7 @@ from jaxtyping import Complex, Float, Int, Real
 
 from jaxquad.records import Record
 
-from ._checks import COHERENT, Grid, in_hertz, Method, Remark, Response
+from ._estimators import COHERENT, Grid, in_hertz, Method, Remark, Response
 from ._frequency_response import Estimate
 
 
@@ -61,10 +61,7 @@ OfInputs = Complex[np.ndarray, "frequencies inputs"]
 def remarks_on_linearity(
     records: Sequence[Record], method: Method, estimate: Estimate
 ) -> tuple[Remark, ...]:
-    """Remarks on pairs whose residual shows that the plant is not linear, or not constant.
-
-    Of a sweep these are its harmonics: there, time is no other signal than frequency.
-    """
+    """Remarks on pairs that are not linear, or not constant; of a sweep these are its harmonics."""
     remarks, first, omega = [], records[0], estimate.omega
     finite = np.isfinite(estimate.response).all(axis=2)
     for i, source in enumerate(first.input_names):
@@ -217,11 +214,7 @@ class _Factors(NamedTuple):
 
     @classmethod
     def of(cls, left: _LeftOver, columns: Columns) -> "_Factors":
-        """Real factors of the columns in the residual.
-
-        The covariance is that of residuals of any variance at each bin (MacKinnon and White, 1985,
-        HC3).
-        """
+        """Real factors of columns in the residual; covariance HC3 (MacKinnon and White, 1985)."""
         weighted = np.conj(columns) * left.weight[:, None]
         inverse = np.linalg.inv(np.real(weighted.T @ columns))
         value = inverse @ np.real(weighted.T @ left.residual)
@@ -300,10 +293,8 @@ def _say_static(left: _LeftOver, v: Signal) -> str:
 
 
 def period_of(signals: Sequence[Float[np.ndarray, "_samples sources"]]) -> int:
-    """Samples of the shortest period with which all signals repeat exactly; 0 without one.
-
-    Every signal holds two whole periods at least.
-    """
+    """Samples of the shortest period, of two at least, with which all signals repeat exactly; or
+    0."""
     most = min(len(signal) for signal in signals) // 2
     lags, first = np.arange(4, most + 1), signals[0]
     near = _EXACT * max(float(np.max(np.abs(signal))) for signal in signals)
@@ -385,10 +376,7 @@ def _say_harmonics(
 
 
 def _tones_of(records: Sequence[Record], i: int, method: Method) -> list[Tone] | None:
-    """Of each record, the input's part at the frequency of a sweep, with its phase.
-
-    `None` unless all inputs, or in the joint estimate all references, sweep.
-    """
+    """The input's part at the frequency of a sweep; `None` unless all that moves it sweeps."""
     tones = []
     for record in records:
         count = fast_length(record.samples)
@@ -402,10 +390,8 @@ def _tones_of(records: Sequence[Record], i: int, method: Method) -> list[Tone] |
 
 
 def phase_of_sweep(signal: Signal) -> tuple[Signal, Tone] | None:
-    """The phase in rad, rising, and the part that turns with it, of a tone of slow frequency.
-
-    `None` for other signals: noise, multisines and steps have much power beside such a tone.
-    """
+    """The rising phase and the part of a tone of slow frequency; `None` where much power is
+    beside."""
     centred = signal - np.mean(signal)
     # The signal without its negative frequencies, doubled; scipy.signal takes 0.4 s to import.
     share = np.zeros(signal.size)
@@ -433,10 +419,7 @@ def phase_of_sweep(signal: Signal) -> tuple[Signal, Tone] | None:
 
 
 def _at_phase(signal: Signal, phase: Signal) -> Tone:
-    """The part of a signal that turns with `phase`: analytic, over two cycles.
-
-    Averages over whole cycles have no response to its harmonics.
-    """
+    """The analytic part that turns with `phase`: averages over whole cycles pass no harmonics."""
     rising = phase + 1e-9 * np.arange(phase.size)
     wave = np.cos(rising) + 1j * np.sin(rising)
     turned = 2 * (signal - np.mean(signal)) * np.conj(wave)
@@ -461,16 +444,12 @@ def _mean_of_cycles(phase: Signal, values: Tone | Signal, *, twice: bool = False
 
 
 def _harmonics(
-    record: Record,
-    tone: Tone,
-    omega: Grid,
-    response: OfInputs,
-    pair: tuple[int, int],
+    record: Record, tone: Tone, omega: Grid, response: OfInputs, pair: tuple[int, int]
 ) -> tuple[Complex[np.ndarray, " harmonics"], Float[np.ndarray, " harmonics"]] | None:
     """The harmonics at the plant's input, relative to its fundamental, and their inverse variance.
 
-    Least squares of the residual's bins on harmonics that have passed the plant; `None` where the
-    band holds too few bins.
+    Least squares of the residual's bins on harmonics that have passed the plant; `None` for few
+    bins.
     """
     output, source = pair
     count = tone.size
@@ -506,11 +485,8 @@ def fast_length(samples: int) -> int:
 
 
 def interpolated(grid: Bins, omega: Grid, response: OfInputs) -> Complex[np.ndarray, "bins inputs"]:
-    """Smooth in magnitude and phase along log frequency.
-
-    Across a wide gap a spline may leave its points by hundreds of nepers, so it is limited to the
-    neighbourhood of these.
-    """
+    """Smooth in magnitude and phase along log frequency, and near the points where a spline leaves
+    them."""
     from scipy.interpolate import CubicSpline
 
     size, angle = np.log(np.abs(response)), np.unwrap(np.angle(response), axis=0)

@@ -11,14 +11,24 @@ from jaxtyping import Bool, Complex, Float, Int
 
 from jaxquad.records import Record
 
-from ._checks import adjoint, diagonal, Grid, Levels, Pairs, Places, Responses, Where
+from ._estimators import (
+    adjoint,
+    Covariances,
+    diagonal,
+    Grid,
+    Levels,
+    Pairs,
+    Places,
+    Response,
+    Responses,
+    Where,
+)
 
 
 class Bins(NamedTuple):
-    """Transforms of whole records, all bins in increasing order of frequency.
+    """Transforms of whole records over the root of their length, by increasing frequency.
 
-    Scaled by the root of the record's length: the noise is the same in a short record as in a long
-    one. The mean and the Nyquist bin are left out.
+    The mean and the Nyquist bin are left out.
     """
 
     omega: Float[np.ndarray, " bins"]  # rad/s
@@ -42,10 +52,7 @@ class Bins(NamedTuple):
 
 
 def record_bins(records: Sequence[Record], integrators: int, delay: float) -> Bins:
-    """Transform all channels as `Record.names` has them.
-
-    Outputs are differenced `integrators` times and advanced by `delay` (s); `recolour` undoes it.
-    """
+    """Transform all channels; outputs differenced, and advanced by `delay` in s: see `recolour`."""
     values, grids, owners = [], [], []
     for index, record in enumerate(records):
         columns = transformed_columns(record, integrators)
@@ -69,9 +76,7 @@ def record_bins(records: Sequence[Record], integrators: int, delay: float) -> Bi
     return Bins(omega, owner, joined, len(records), largest)
 
 
-def recolour(
-    omega: Grid, integrators: int, delay: float, dt: float
-) -> Complex[np.ndarray, " frequencies"]:
+def recolour(omega: Grid, integrators: int, delay: float, dt: float) -> Response:
     """Factor from a response to the outputs of `record_bins` to one to the recorded outputs."""
     lag = integrators // 2 * dt + delay
     return np.exp(-1j * lag * omega) / (1 - np.exp(-1j * dt * omega)) ** integrators
@@ -108,11 +113,9 @@ Columns = Complex[np.ndarray, "frequencies window columns"]
 
 
 class LocalFit(NamedTuple):
-    """Responses at the centre of each window, and the effect of noise on them.
+    """Responses at the centre of each window, and the effect of noise on them; nan if undetermined.
 
-    The error of output o to input i at f is `boost[f, o] sum_k effect[f, i, k] V_o[first[f] + k]`,
-    V the transform of the output's noise. Where the inputs do not determine the response, all
-    fields are nan.
+    The error of output o to input i at f is `boost[f, o] sum_k effect[f, i, k] V_o[first[f] + k]`.
     """
 
     response: Responses
@@ -120,7 +123,7 @@ class LocalFit(NamedTuple):
     boost: Levels
     gain: Pairs  # mean squared error for unit noise
     first: Places
-    scatter: Complex[np.ndarray, "frequencies outputs outputs"]  # residual products over freedom
+    scatter: Covariances  # residual products over freedom
     freedom: Grid  # complex degrees of freedom
     power: Complex[np.ndarray, "frequencies inputs inputs"]  # of the inputs, mean over the window
 
@@ -157,11 +160,8 @@ def local_fit(
     order: int,
     shape: Literal["polynomial", "rational"],
 ) -> LocalFit:
-    """Fit the response and each record's transient around every frequency.
-
-    `shape` says whether both are polynomials of `order`, or such polynomials over a common
-    denominator of the first degree.
-    """
+    """Fit polynomials of `order`, or these over a linear denominator, to responses and
+    transients."""
     first, last = window_slices(omega, half_width, bins)
     longest, fields = max(int(np.max(last - first)), 1), []
     for chunk, window in _chunks(omega, half_width, bins, order):
@@ -194,10 +194,8 @@ def left_power(
     values: Complex[np.ndarray, "bins outputs"],
     order: int,
 ) -> Grid:
-    """Power of all `values` in each window that `local_fit` by polynomials would leave.
-
-    All channels of `bins` are the inputs; 0 where they do not determine a response.
-    """
+    """Power of `values` that `local_fit` by polynomials would leave, all `bins` inputs; 0 without
+    fit."""
     left, power = np.zeros(omega.size), np.sum(np.abs(values) ** 2, axis=1)
     for chunk, window in _chunks(omega, half_width, bins, order):
         u = bins.values[window.index] * window.used[:, :, None]
@@ -222,10 +220,8 @@ class _Window(NamedTuple):
 def _chunks(
     omega: Grid, half_width: Grid, bins: Bins, order: int
 ) -> Iterator[tuple[Int[np.ndarray, " chunk"], _Window]]:
-    """Frequencies whose windows are about as long, and these windows, padded.
-
-    A record with no more bins here than its transient has coefficients says nothing.
-    """
+    """Frequencies with windows of about one length, padded; records with too few bins take no
+    part."""
     first, last = window_slices(omega, half_width, bins)
     longest = max(int(np.max(last - first)), 1)
     places, size = np.argsort(last - first, kind="stable"), min(_CHUNK, max(_BINS // longest, 1))
@@ -247,10 +243,8 @@ def _excited(
 ) -> Where:
     """Whether each input's power in the window is near that which determines its response.
 
-    Beyond the end of a sweep the input's transform is what the ends of the record leak, as smooth
-    along frequency as a transient, and says nothing about the response: the ratio, the summed
-    squares of the `effect` times those of the input, is 1e9, or what rounding makes of it. A sweep
-    that reaches the frequency has 2 to 30.
+    Beyond a sweep's end an input leaks as smoothly as a transient: the ratio, 2 to 30 within, is
+    1e9.
     """
     power = np.abs(u) ** 2
     excited = np.all(np.max(power, axis=1) > (_UNEXCITED * largest) ** 2, axis=1)
@@ -279,12 +273,11 @@ def solve_polynomial(place: Places, u: Inputs, y: Outputs, owner: Owner, order: 
 
 
 def solve_rational(place: Places, u: Inputs, y: Outputs, owner: Owner, order: int) -> Solution:
-    """The same over a denominator 1 + a place, with a different `a` for each output.
+    """The same over 1 + a place (local rational method, McKelvey and Guerin, 2012), a for each
+    output.
 
-    `a` is first estimated from the linear equation error, then by Gauss-Newton steps on the output
-    error; the regressors of the last step say how the noise enters through `a`. All outputs use the
-    effect of the first, scaled to their own variance. Source: local rational method, McKelvey and
-    Guerin (2012).
+    By the linear equation error, then Gauss-Newton; all outputs use the effect of the first,
+    scaled.
     """
     columns, x = regressors(place, u, owner, order), place[:, :, None]
     normal = Normal.of(columns)
@@ -333,9 +326,8 @@ def regressors(place: Places, u: Inputs, owner: Owner, order: int) -> Columns:
 class Normal(NamedTuple):
     """Normal equations of some columns.
 
-    Their inverse is wrong by the square of the columns' condition. What it gives is corrected once
-    by what it leaves, after which it is as good as that of a QR decomposition up to a condition of
-    1e4, and good to some 1e-5 where columns are as dependent as is allowed.
+    What their inverse gives is corrected once by what it leaves: as good as a QR decomposition up
+    to a condition of 1e4, and good to some 1e-5 where columns are as dependent as is allowed.
     """
 
     columns: Columns

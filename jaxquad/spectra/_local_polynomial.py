@@ -13,8 +13,18 @@ from jaxtyping import Float
 from jaxquad._core import one_blas_thread
 from jaxquad.records import Record
 
-from ._checks import COHERENT, diagonal, Grid, Method, Remark, Where
-from ._estimators import LocalPolynomial
+from ._estimators import (
+    adjoint,
+    COHERENT,
+    diagonal,
+    Grid,
+    LocalPolynomial,
+    Method,
+    Pairs,
+    Places,
+    Remark,
+    Where,
+)
 from ._frequency_response import Estimate
 from ._global_model import (
     highest_looked_at,
@@ -35,25 +45,18 @@ from ._local_fit import (
     transformed_columns,
     window_slices,
 )
-from ._local_noise import (
-    coherence_of_references,
-    coloured_gain,
-    DIVISIBLE,
-    error_covariance,
-    find_unmoved,
-    joint_factors,
-    joint_fit,
-    multiple_coherence,
-    partial_coherence,
-    share_of_inputs,
-    unresolved,
-)
 from ._local_windows import (
     choose_widths,
+    coloured_gain,
+    error_covariance,
     make_windows,
+    multiple_coherence,
+    partial_coherence,
+    power_alone,
     reach,
     Respond,
     Shape,
+    unresolved,
     WIDENED,
     WIDENINGS,
     Windows,
@@ -61,6 +64,8 @@ from ._local_windows import (
 from ._noise import covariance_of_bands, Noise, smooth_noise, smoothed
 
 
+_DEPENDENT = 1e-6  # smallest singular value of the responses of the inputs, to the largest
+_DIVISIBLE = 0.15  # largest random error of an input's response to the references
 _SHARPER = 0.5  # ratio of residual powers that noise alone seldom reaches
 _MISSED = 100.0  # ratio of what a model leaves to the noise, from which it misses the response
 _REPAIRS, _BETTER = 2, 0.1  # the most, and how little of that ratio a better model leaves
@@ -81,9 +86,7 @@ def estimate_local_polynomial(
 ) -> Estimate:
     """Responses of all outputs to all inputs at increasing `omega` in rad/s, from all records.
 
-    Coherence is the share of an output's power near each frequency that an input explains beyond
-    the other inputs; in the joint estimate, the smaller of the shares of input and output that the
-    references explain.
+    Coherence is that near each frequency; of the joint estimate, the smaller of input and output.
     """
     inputs, outputs = records[0].inputs.shape[1], records[0].outputs.shape[1]
     bins, dt = record_bins(records, options.integrators, options.delay), records[0].dt
@@ -232,9 +235,8 @@ class Setup(NamedTuple):
 def _repair_models(setup: Setup, rest: Rest) -> tuple[Rest, LocalFit]:
     """What better models leave where those of `rest` miss the response, and the narrow fits of it.
 
-    A model can fit the loud bins alone: what it leaves of the quiet ones counts as their noise, and
-    they never matter. It may be many times the response there, which biases the local fits. The
-    better models' bins count by the noise of the local fits.
+    A model can fit the loud bins alone, and be many times the response at quiet ones, which biases
+    the local fits. The better models' bins count by the noise of the local fits.
     """
     fit, left = _narrowly(setup, rest)
     for _ in range(_REPAIRS):
@@ -259,8 +261,7 @@ def _repair_models(setup: Setup, rest: Rest) -> tuple[Rest, LocalFit]:
 def _narrowly(setup: Setup, rest: Rest) -> tuple[LocalFit, Float[np.ndarray, " moved"]]:
     """Fits from the sources to what they move, and what models leave, to what the fits leave.
 
-    A window is widened where it determines nothing, as between the lines of a multisine; a rational
-    fit counts where its residual is so much smaller that there must be a resonance.
+    A rational fit counts where its residual is so much smaller that there must be a resonance.
     """
     grid, width = setup.windows.grid, setup.windows.narrow
     respond = setup.to_moved(rest)
@@ -329,7 +330,7 @@ def _remarks(
     if unmoved:  # Where no frequency is left, the reader needs to know why.
         text = (
             "no response at any frequency: the references move the inputs too little to divide by "
-            f"(random errors above {100 * DIVISIBLE:.0f} %). Excite by the references, record "
+            f"(random errors above {100 * _DIVISIBLE:.0f} %). Excite by the references, record "
             "longer, or sample faster"
         )
         remarks.append(Remark(text, kind="no response"))
@@ -342,3 +343,70 @@ def _remarks(
         )
         remarks.append(Remark(text, omega[ringing], kind="ringing"))
     return tuple(remarks)
+
+
+def joint_factors(fit: LocalFit, inputs: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Where T_ru has an inverse, [-G, 1], and that inverse: dG = [-G, 1] dT T_ru^-1."""
+    invertible = fit.determined
+    through = np.where(invertible[:, None, None], fit.response[:, :inputs], np.eye(inputs))
+    strength = np.linalg.svd(through, compute_uv=False)
+    invertible &= strength[:, -1] > _DEPENDENT * strength[:, 0]
+    back = np.linalg.inv(np.where(invertible[:, None, None], through, np.eye(inputs)))
+    response = fit.response[:, inputs:] @ back
+    outputs = response.shape[1]
+    ones = np.broadcast_to(np.eye(outputs), (len(back), outputs, outputs))
+    return invertible, np.concatenate([-response, ones], axis=2), back
+
+
+def joint_fit(fit: LocalFit, inputs: int) -> LocalFit:
+    """G = T_ry T_ru^-1 of the fit from references to [inputs, outputs], with the error of v = y - G
+    u.
+
+    Source: Pintelon and Schoukens, System Identification, 2nd ed., section 2.6 and 7.2.7.
+    """
+    invertible, left, back = joint_factors(fit, inputs)
+    through, response = fit.response[:, :inputs], -left[:, :, :inputs]
+    blank = np.where(invertible, 1.0, np.nan)[:, None, None]
+    effect = np.swapaxes(back, 1, 2) @ fit.effect * blank
+    scatter = left @ fit.scatter @ adjoint(left) * blank
+    boosted = left * fit.boost[:, None, :]
+    boosted = diagonal(boosted @ fit.scatter @ adjoint(boosted))
+    boost = np.sqrt(boosted / np.maximum(diagonal(scatter), 1e-300))
+    gain = boost[:, :, None] ** 2 * np.vecdot(effect, effect).real[:, None, :]
+    power = through @ fit.power @ adjoint(through)
+    freedom = np.where(invertible, fit.freedom, 0.0)
+    return LocalFit(response * blank, effect, boost, gain, fit.first, scatter, freedom, power)
+
+
+def coherence_of_references(omega: Grid, half_width: Grid, fit: LocalFit, inputs: int) -> Pairs:
+    """Partial coherence of the joint estimate: the smaller of the shares of input and output.
+
+    Source: Bendat and Piersol, Random Data, ch. 7.
+    """
+    noise = smooth_noise(omega, half_width, fit.scatter, fit.freedom)
+    moved = noise.power[:, None, :inputs]
+    plant = joint_fit(fit, inputs)
+    alone = power_alone(plant)[:, None, :]
+    through = partial_coherence(plant, noise.power[:, inputs:])
+    return np.minimum(through, alone / (alone + moved))
+
+
+def share_of_inputs(left: np.ndarray, noise: Noise, at: Places, inputs: int) -> Pairs:
+    """Share of a joint estimate's squared error by the noise of T_ru, half of what both make
+    included."""
+    root = noise.root()[at]
+    total = left @ root
+    of_inputs = left[:, :, :inputs] @ root[:, :inputs]
+    power = np.vecdot(total, total).real
+    mine = np.sum(np.real(of_inputs * np.conj(total)), axis=2)
+    share = np.clip(mine / np.maximum(power, 1e-300), 0.0, 1.0)
+    return np.repeat(share[:, :, None], inputs, axis=2)
+
+
+def find_unmoved(moved: LocalFit, noise: Noise, at: Places, inputs: int) -> Where:
+    """Where references hardly move an input: the joint ratio of two noises is -1 over the
+    controller."""
+    invertible, _, back = joint_factors(moved, inputs)
+    effect = np.sum(np.abs(np.swapaxes(back, 1, 2) @ moved.effect) ** 2, axis=2)
+    relative = np.sqrt(noise.power[at][:, :inputs] * effect / 2)
+    return invertible & np.any(relative > _DIVISIBLE, axis=1)

@@ -14,14 +14,15 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple, TypeVar
 
 import numpy as np
-from jaxtyping import Bool, Complex, Float, Int
+from jaxtyping import Bool, Complex, Float
 
-from ._checks import (
+from ._estimators import (
     adjoint,
     Covariances,
     diagonal,
     Grid,
     Levels,
+    Places,
     power_of,
     Responses,
     Square,
@@ -88,10 +89,9 @@ def smooth_noise(
 ) -> Noise:
     """Smooth residual covariances, each of `freedom` complex degrees of freedom, along frequency.
 
-    Powers are smoothed by local lines in log-log, corrected for the bias of the logarithm of a
-    chi-squared variable; correlations by positive weights, so that they stay positive semidefinite.
-    Residuals larger than chance allows are left out. Outputs in `open_loop` are correlated as in a
-    wide band, as far as the narrow ones agree with it.
+    Powers by local lines in log-log, without outliers or the logarithm's bias; correlations by
+    positive weights. In `open_loop` these are as in a wide band, as far as the narrow ones agree
+    with it.
     """
     from scipy.special import digamma, gammaincinv
 
@@ -169,10 +169,8 @@ def _kernels_of(omega: tuple[float, ...]) -> Float[np.ndarray, "3 frequencies fr
 
 
 def smoothed(omega: Grid, covariance: Square, weight: Grid) -> Square:
-    """Covariance of the logarithm of noise powers after smoothing along frequency.
-
-    `covariance` is that of the single ones, each of `weight` complex degrees of freedom.
-    """
+    """Covariance of the logarithm of noise powers, of `weight` degrees of freedom, after
+    smoothing."""
     near = kernels(omega)
     m0, m1, m2 = (near @ weight)[:, :, None]
     # A single frequency has no slope: the small term keeps the line flat there.
@@ -182,14 +180,9 @@ def smoothed(omega: Grid, covariance: Square, weight: Grid) -> Square:
     return lines @ covariance @ lines.T
 
 
-def covariance_of_bands(
-    first: Int[np.ndarray, " frequencies"], last: Int[np.ndarray, " frequencies"], freedom: Grid
-) -> Square:
-    """Of the logarithm of mean residual powers over the bins `first` to before `last`.
-
-    Residuals of `n` bins have `freedom` complex degrees of freedom: their mean has a relative
-    variance of 1 / freedom. Two bands share as much of it as they share of their bins.
-    """
+def covariance_of_bands(first: Places, last: Places, freedom: Grid) -> Square:
+    """Of the logarithm of mean residual powers over bins: bands share as much of it as of their
+    bins."""
     count = np.maximum(last - first, 1)
     shared = np.minimum(last[:, None], last) - np.maximum(first[:, None], first)
     overlap = np.maximum(shared, 0) / np.sqrt(np.outer(count, count))
@@ -202,11 +195,7 @@ def covariance_of_windows(
     shape: str,
     lengths: tuple[int, ...],
 ) -> Square:
-    """Of the logarithm of mean residual powers over windows of several lengths.
-
-    All lengths see the same noise, each with its own resolution; `levels` are the standard errors
-    that they contribute. `angle` is in rad per sample.
-    """
+    """Of the logarithm of residual powers of all lengths, whose standard errors are `levels`."""
     angles, shared = tuple(angle.tolist()), kept_if_few(_shared_power, angle.size)
     parts = (
         shared(shape, length, angles) * level * level[:, None]
@@ -245,10 +234,9 @@ class Slopes(NamedTuple):
 
 
 class Rest(NamedTuple):
-    """What is left of the outputs' windows, with what noise does there, for each window length.
+    """What is left of the outputs' windows: sums of `conj(a) b`, by window length.
 
-    `products` are the sums of `conj(a) b` of what is left, `trace` is the energy that unit noise
-    leaves, and `fits` are those of leakage.
+    `trace` is the energy that unit noise leaves.
     """
 
     products: Complex[np.ndarray, "frequencies outputs outputs groups"]
@@ -298,11 +286,10 @@ def without_leakage(
     overlap: Overlap,
     resolved: Resolved,
 ) -> Rest:
-    """Outputs less all that inputs and leakage explain, one window length after the other.
+    """Outputs less all that inputs and leakage explain, by window length, from where it is
+    `resolved`.
 
-    `windows` are the inputs and the outputs of each length, which is looked at where it is
-    `resolved`: from a frequency on, and the first everywhere. A length with too few windows for its
-    leakage keeps it, as noise; its slopes do not matter.
+    A length with too few windows for its leakage keeps it, as noise; its slopes do not matter.
     """
     parts, first = [], 0
     for pair, derivatives, where in zip(windows, slopes, resolved, strict=True):
@@ -339,8 +326,8 @@ def _least_squares(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, Fit]:
     """`Rest` of one length: each output on the columns, and on its own slope, behind it in `both`.
 
-    With P = P0 - q q^H the projection, P0 that of the common columns A, and O the overlap: the
-    trace of P O, the degrees of freedom tr(P O)^2 / tr(P O P O).
+    With P the projection and O the overlap: tr(P O), the degrees of freedom tr(P O)^2 / tr(P O P
+    O).
     """
     count, conjugate = columns.shape[1], np.conj(columns)
     weighed = _times_overlap(columns, overlap)
@@ -403,18 +390,14 @@ def _inner(
     return np.vecdot(a.view(float), b.view(float))
 
 
-def _trace(a: Gram, b: Gram) -> Float[np.ndarray, " frequencies"]:
+def _trace(a: Gram, b: Gram) -> Grid:
     """The real part of the trace of the product of `a` with the adjoint of `b`."""
     a, b = (np.ascontiguousarray(part).reshape(len(part), -1) for part in (a, b))
     return _inner(a, b)
 
 
 def noise_root(omega: Grid, rest: Rest, outputs: Groups, weights: Groups) -> Covariances:
-    """Hermitian root of the noise's covariance, from what is left of the outputs' windows.
-
-    It is smooth along frequency: local straight lines, which leave a power law unchanged.
-    `outputs` are the outputs' own energies, and `weights` says how much a length counts.
-    """
+    """Hermitian root of the noise's covariance, from what is left, by local lines in log-log."""
     freedom = rest.freedom
     near = kernels(omega)
     energy = np.real(np.einsum("foog->fog", rest.products))

@@ -13,9 +13,20 @@ from jaxtyping import Bool, Complex, Float, Int
 from jaxquad._core import Message
 from jaxquad.records import Record
 
-from ._checks import adjoint, Covariances, diagonal, Grid, Levels, Method, Remark, Responses, Where
 from ._error_covariance import ErrorCovariance
-from ._estimators import Periodic
+from ._estimators import (
+    adjoint,
+    Covariances,
+    diagonal,
+    Grid,
+    Levels,
+    Method,
+    Periodic,
+    Places,
+    Remark,
+    Responses,
+    Where,
+)
 from ._frequency_response import Distortion, Estimate
 from ._noise import smooth_noise, smoothed
 
@@ -31,11 +42,7 @@ Averages = Complex[np.ndarray, "frequencies _ realisations"]  # over a record's 
 
 
 class Periods(NamedTuple):
-    """Transforms of one record's periods: their mean, and the covariance of a single one.
-
-    Scaled so that noise of unit variance has unit power; channels are in the order of
-    `Record.names`.
-    """
+    """Transforms of a record's periods, scaled so that noise of unit variance has unit power."""
 
     mean: Complex[np.ndarray, "lines channels"]
     covariance: Complex[np.ndarray, "lines channels channels"]  # of a single period
@@ -44,10 +51,7 @@ class Periods(NamedTuple):
 
 
 def record_periods(record: Record, options: Periodic) -> Periods:
-    """Transform the periods that are kept, at all harmonics below the Nyquist frequency.
-
-    Raises `ValueError` where fewer than two are left.
-    """
+    """Transform the periods that are kept, at all harmonics below the Nyquist frequency."""
     samples = options.samples(record)
     count = record.samples // samples - options.discard
     if count < 2:
@@ -119,13 +123,10 @@ class Scatter(NamedTuple):
         return np.maximum(total - self.noise, 0.0)
 
 
-def estimate_scatter(
-    omega: Grid, fit: Fit, periods: Sequence[Periods], lines: Int[np.ndarray, " frequencies"]
-) -> Scatter:
+def estimate_scatter(omega: Grid, fit: Fit, periods: Sequence[Periods], lines: Places) -> Scatter:
     """Noise between periods, from v = y - G u, and scatter between realisations.
 
-    With input noise and feedback, v is what perturbs G: its variance is that of Pintelon and
-    Schoukens, eq. 2-25, with the covariance of input and output.
+    With input noise and feedback, v is what perturbs G (Pintelon and Schoukens, eq. 2-25).
     """
     from scipy.special import fdtri, gammaincinv
 
@@ -174,9 +175,8 @@ def estimate_periodic(
     """Responses of all outputs to all inputs, by default at all lines that are excited.
 
     With Z the period averages of the references ("joint") or of the inputs ("direct") over the
-    records, G = Y Z^H (U Z^H)^-1. For one input and one record that is Y / U, which is not biased
-    by noise that is fed back to the input either: only its average over the periods remains. Raises
-    `ValueError` for fewer records than inputs, and for an `omega` that is not an excited line.
+    records, G = Y Z^H (U Z^H)^-1. For one input and one record that is Y / U, which fed-back noise
+    does not bias either: only its average over the periods remains.
     """
     inputs, outputs = records[0].inputs.shape[1], records[0].outputs.shape[1]
     sizes = {options.samples(record) for record in records}

@@ -11,27 +11,23 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Complex, Float
 
-from jaxquad._core import one_blas_thread, require_x64
+from jaxquad._core import Message, one_blas_thread, require_x64
 from jaxquad.records import Record
 
-from ._average import (
-    average,
-    Averaged,
-    Channels,
-    Segments,
-)
-from ._checks import (
+from ._average import average, Averaged, Channels, Segments
+from ._error_covariance import ErrorCovariance, place_windows
+from ._estimators import (
     adjoint,
     check_band,
     check_compatible,
     check_excitation,
+    Composite,
     Grid,
     in_hertz,
     Method,
     Remark,
+    Welch,
 )
-from ._error_covariance import ErrorCovariance, place_windows
-from ._estimators import Composite, Welch
 from ._fourier_sums import (
     coefficients,
     fourier_sums,
@@ -61,7 +57,7 @@ def transform_records(
     """Transform all channels of all records; no window spans two records.
 
     With two `derivatives`, behind those of the windows too, from the first length on whose windows
-    can tell leakage from noise: the first on all channels but references, the second on inputs.
+    can tell leakage from noise: the first on inputs and outputs, the second on inputs.
     """
     require_x64("a frequency response")
     first, welch, dt = records[0], members[0], records[0].dt
@@ -138,11 +134,21 @@ def frequencies_for(
     welch: Welch,
 ) -> Grid:
     """`omega` or the default of `welch`, rad/s; `ValueError` where the window is too short."""
+    length, dt = welch.length(records), records[0].dt
+    seconds = length * dt
     if omega is None:
-        return welch.default_omega(records)
+        # Below three cycles in a window, leakage exceeds the random error of a good record.
+        if length <= 30:
+            raise ValueError(
+                Message(
+                    f"a window of {length} samples is too short for frequencies up to a tenth of "
+                    "the sample rate: use a longer window («window_length=»)«, or give the "
+                    "frequencies (omega=)»"
+                )
+            )
+        return np.geomspace(6 * np.pi / seconds, 2 * np.pi / (10 * dt), 100)
     omega = np.atleast_1d(np.asarray(omega, dtype=float))
-    check_band(omega, records[0].dt)
-    seconds = welch.length(records) * records[0].dt
+    check_band(omega, dt)
     lowest = 2 * np.pi / seconds
     if omega[0] < 0.999 * lowest:
         raise ValueError(

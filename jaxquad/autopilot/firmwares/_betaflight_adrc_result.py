@@ -123,28 +123,20 @@ class ADRCAutopilot:
 
     def content(self) -> dict[str, object]:
         """All of it, for JSON."""
+        proposal, plant = self.proposal, self.plant
         content = {
-            "kind": self.kind,
-            "verdict": self.verdict,
-            "firmware": "betaflight",
-            "version": self.version,
-            "axis": self.axis,
-            "law": "adrc",
-            "flown_law": "adrc" if self.flew_adrc else "pid",
-            "flown": self.flown.parameters(),
-            "unmodelled": self.flown.unmodelled,
-            "old": self.old,
-            "new": self.new,
+            "kind": self.kind, "verdict": self.verdict, "firmware": "betaflight",
+            "version": self.version, "axis": self.axis, "law": "adrc",
+            "flown_law": "adrc" if self.flew_adrc else "pid", "flown": self.flown.parameters(),
+            "unmodelled": self.flown.unmodelled, "old": self.old, "new": self.new,
             "words": [x._asdict() for x in self.words],
-            "proposal": None if self.proposal is None else self.proposal.content(),
+            "proposal": None if proposal is None else proposal.content(),
             "reproduction": [
-                {"throttle": throttle} | loop.to_dict()
-                for throttle, loop in self.reproductions.items()
+                {"throttle": x} | loop.to_dict() for x, loop in self.reproductions.items()
             ],
-            "plant": None if self.plant is None else self.plant.to_dict(),
-            "remarks": self.remarks,
-            "settings": self.settings.content(),
-        }
+            "plant": None if plant is None else plant.to_dict(),
+            "remarks": self.remarks, "settings": self.settings.content(),
+        }  # fmt: skip
         return {key: plain_content(value) for key, value in content.items()}
 
     @property
@@ -178,8 +170,33 @@ class ADRCAutopilot:
                 f"thrust_linear {linear:g} flew and stays: the gain over the throttle is that with "
                 "it, taken as a straight line"
             )
-        if self.proposal is not None and self.plant is not None:
-            remarks += _remarks_on_b0(self.plant, self.proposal, self.flew_adrc)
+        proposal, plant = self.proposal, self.plant
+        if proposal is None or plant is None:
+            return tuple(remarks)
+        schedule, scaled, throttle = proposal.schedule, proposal.scaled, proposal.throttle
+        most = float(schedule.scale(throttle[-1]))
+        if scaled is None:
+            remarks.append(
+                f"b0 over the throttle is not known, and adrc_b0_law {schedule.law} is "
+                f"{'what flew' if self.flew_adrc else 'the default'}: the certificate is of "
+                f"{throttle[0]:.2f} throttle alone; {plant.what_to_fly()}"
+            )
+            return tuple(remarks)
+        if most >= schedule.high > 1:
+            remarks.append(
+                f"at {throttle[-1]:.2f} throttle b0 is at adrc_b0_scale_max, {schedule.high:g}"
+            )
+        if self.flew_adrc and scaled.law != schedule.law:
+            off = {law: f"{100 * share:.0f} %" for law, share in scaled.deviations.items()}
+            remarks.append(
+                f"adrc_b0_law {schedule.law} stays as it flew: it is off by up to "
+                f"{off[schedule.law]}, and {scaled.law} by {off[scaled.law]}"
+            )
+        if scaled.extrapolated:
+            remarks.append(
+                f"the hover throttle of {scaled.hover:.2f} lies outside of what was flown, "
+                f"{float(plant.low.min()):.2f} to {float(plant.high.max()):.2f}"
+            )
         return tuple(remarks)
 
     def write(self, folder: str | Path) -> list[Path]:
@@ -229,26 +246,25 @@ class ADRCAutopilot:
 
     def __str__(self) -> str:
         version, law = ".".join(map(str, self.version)), "ADRC" if self.flew_adrc else "PID"
-        lines = [
-            f"betaflight {version}, rate loop of {self.axis}: the {law} flew".replace(" ,", ",")
-        ]
-        of_axis = {k: x for k, x in self.flown.parameters().items() if k.endswith(f"_{self.axis}")}
-        lines += [f"  {name} = {value:.6g}" for name, value in of_axis.items()]
+        head = f"betaflight {version}, rate loop of {self.axis}: the {law} flew"
+        values = self.flown.parameters().items()
+        lines = [head.replace(" ,", ",")]
+        lines += [f"  {name} = {x:.6g}" for name, x in values if name.endswith(f"_{self.axis}")]
         if isinstance(self.flown, FlownADRC):
             schedule = self.flown.schedule
             lines.append(f"  adrc_b0_law = {schedule.law}, hover {100 * schedule.hover:.0f} %")
         lines += [f"  not modelled: {x}" for x in self.flown.unmodelled]
-        lines += ["", str(self.plant)] if self.plant is not None else []
         again = [
-            f"flown loop at {throttle:.2f} throttle: {loop.verdict}"
-            for throttle, loop in self.shown_again.items()
+            f"flown loop at {x:.2f} throttle: {y.verdict}" for x, y in self.shown_again.items()
         ]
-        lines += ["", *again] if again else []
-        if self.proposal is not None:
-            lines += ["", self.proposal.table()]
-        if self.new:
-            lines += ["", change_table(self.changes, self.words).rstrip()]
-        lines += ["", *(f"! {x}" for x in self.remarks)] if self.remarks else []
+        parts = (
+            [] if self.plant is None else [str(self.plant)], again,
+            [] if self.proposal is None else [self.proposal.table()],
+            [change_table(self.changes, self.words).rstrip()] if self.new else [],
+            [f"! {x}" for x in self.remarks],
+        )  # fmt: skip
+        for part in parts:
+            lines += ["", *part] if part else []
         return "\n".join([*lines, "", self.verdict])
 
 
@@ -257,33 +273,6 @@ def doubted_throttle(again: Mapping[float, Reproduction]) -> float | None:
     off = [throttle for throttle, check in again.items() if check.kind == "not flown"]
     blind = all(check.kind == "unknown" for check in again.values())
     return next(iter(off or (again if blind else ())), None)
-
-
-def _remarks_on_b0(plant: GainOverThrottle, proposal: ADRCProposal, flew: bool) -> list[str]:
-    schedule, scaled = proposal.schedule, proposal.scaled
-    if scaled is None:
-        return [
-            f"b0 over the throttle is not known, and adrc_b0_law {schedule.law} is "
-            f"{'what flew' if flew else 'the default'}: the certificate is of "
-            f"{proposal.throttle[0]:.2f} throttle alone; {plant.what_to_fly()}"
-        ]
-    remarks, most = [], float(schedule.scale(proposal.throttle[-1]))
-    if most >= schedule.high > 1:
-        remarks.append(
-            f"at {proposal.throttle[-1]:.2f} throttle b0 is at adrc_b0_scale_max, {schedule.high:g}"
-        )
-    if flew and scaled.law != schedule.law:
-        off = scaled.deviations
-        remarks.append(
-            f"adrc_b0_law {schedule.law} stays as it flew: it is off by up to "
-            f"{100 * off[schedule.law]:.0f} %, and {scaled.law} by {100 * off[scaled.law]:.0f} %"
-        )
-    if scaled.extrapolated:
-        remarks.append(
-            f"the hover throttle of {scaled.hover:.2f} lies outside of what was flown, "
-            f"{float(plant.low.min()):.2f} to {float(plant.high.max()):.2f}"
-        )
-    return remarks
 
 
 _PLANTS, _SEED = 100, 77  # of the steps' bands
@@ -314,18 +303,13 @@ def adrc_page(result: ADRCAutopilot, origin: Provenance) -> PilotPage:
         title=f"betaflight {version}, ADRC for {result.axis}".replace(" ,", ","),
         headlines=headlines,
         remarks=[*result.remarks, *(f"not modelled: {text}" for text in flown.unmodelled)],
-        filters=filters,
-        steps=steps,
-        b0=b0,
+        filters=filters, steps=steps, b0=b0, terms_are="as logged", unit="pidsum",
         terms={} if flight is None or not flight.terms else logged_terms(flight),
-        terms_are="as logged",
         motors=[] if flight is None else motor_rows(flight),
         stages=None if proposal is None else stage_table(proposal, result.settings.fresh),
         changes=change_rows(result.changes, result.words) if result.new else None,
-        text=str(result),
-        unit="pidsum",
-        provenance=origin,
-    )
+        text=str(result), provenance=origin,
+    )  # fmt: skip
 
 
 def _steps_and_b0(
