@@ -10,8 +10,8 @@ from jaxtyping import Float, PyTree
 from jaxquad._core import Message, require_x64
 from jaxquad.records import Record
 
-from ..uncertainty._accuracy import orthonormal, projected_noise
 from ..uncertainty._verdict import UndeterminedError, Verdict
+from ._noise import orthonormal, projected_noise
 from ._simulated import (
     band_filter,
     band_gain,
