@@ -177,13 +177,7 @@ def throttle_levels(
 ) -> ThrottleLevels:
     """The levels of throttle with an excitation, as `gain_over_throttle` finds them.
 
-    **Arguments:** as there.
-
-    **Returns:** a `jq.identify.ThrottleLevels`.
-
-    **Raises:**
-
-    - `ValueError`: as there.
+    Arguments and errors are those; the result is a `jq.identify.ThrottleLevels`.
     """
     records = [record] if isinstance(record, Record) else list(record)
     _check(records, throttle_range, 0.0, width, shortest)
