@@ -446,10 +446,6 @@ def fit_batch(
     - `frfs`: responses on the same frequencies, with the same channels.
     - `band`: (low, high) in rad/s.
 
-    **Returns:**
-
-    `jq.identify.BatchFit`.
-
     **Raises:**
 
     - `ValueError`: responses on different frequencies or channels, or without a usable frequency.

@@ -276,11 +276,9 @@ class GainOverThrottle(eqx.Module):
     def firmware_value(self, firmware: CurveFirmware) -> FirmwareValue:
         """The parameter with which a firmware makes the gain the same at every throttle.
 
-        **Arguments:**
-
-        - `firmware`: `"px4"` (THR_MDL_FAC), `"ardupilot"` (MOT_THST_EXPO), `"betaflight"`
-            (thrust_linear from 2026.6 on) or `"betaflight 2025.12"`, whose thrust_linear
-            t (1 + e (1 - t)^2) is fitted to the inverse curve by least squares over 0 to 1.
+        **Arguments:** `firmware`: `"px4"` (THR_MDL_FAC), `"ardupilot"` (MOT_THST_EXPO),
+        `"betaflight"` (thrust_linear from 2026.6 on) or `"betaflight 2025.12"`, whose thrust_linear
+        t (1 + e (1 - t)^2) is fitted to the inverse curve by least squares over 0 to 1.
 
         **Raises:**
 
