@@ -16,17 +16,16 @@ from ._local_fit import Bins, left_power, LocalFit, window_slices
 from ._local_windows import SharedErrors
 from ._noise import Noise
 from ._rational_fit import (
+    Basis,
     columns_of,
     descend,
     Equations,
-    make_basis,
     next_order,
     parts_of,
     powers_of,
     PRICE,
     refine_orders,
     search_orders,
-    slopes_of,
     Solved,
 )
 
@@ -218,7 +217,7 @@ def _identify(equations: Equations, omega: Levels, most: int) -> Settled | None:
 
     first = first._replace(best=min((order for order in first.solved if order > 0), key=value))
     solved = first.solved[first.best]
-    basis = make_basis(equations, len(solved.denominator))
+    basis = Basis.of(equations, len(solved.denominator))
     below = solved.denominator @ basis.powers
     left = equations.y - solved.linear @ basis.columns / below
     noise = noise_left(omega, left, below, np.ones_like(omega))
@@ -237,10 +236,10 @@ def _settle(
 ) -> Settled:
     """A descent from `start`, and how noise moves its parameters."""
     white = equations.weighted(weight)
-    basis = make_basis(white, start.size)
-    solved = descend(white, basis, start, _SETTLED)
+    solved, basis = descend(white, start, _SETTLED)
     fixed = basis.largest(solved.denominator)
-    slopes = parts_of(slopes_of(white, basis, solved, fixed))
+    slopes = np.concatenate([basis.columns / solved.below, basis.slopes(solved, fixed)])
+    slopes = parts_of(slopes)
     length = np.linalg.norm(slopes, axis=1, keepdims=True)
     left, size, right = np.linalg.svd(slopes / length, full_matrices=False)
     inverse = np.where(size > 1e-12 * size[0], 1 / np.maximum(size, 1e-300), 0.0)
