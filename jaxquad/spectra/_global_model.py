@@ -104,48 +104,6 @@ class GlobalModel(NamedTuple):
         return powers_of((np.exp(-1j * omega * self.dt) - 1) / self.scale, self.order + 1)
 
 
-def global_models(
-    bins: Bins, inputs: slice, outputs: slice, highest: float, dt: float, most: int
-) -> list[GlobalModel | None]:
-    """One model for each output, of one order more than has the least criterion; `None` for chance.
-
-    The criterion lies between Akaike's, under which a pole and a zero settle where the noise of
-    single bins rises, and a Bayesian one, which stops where what is left hides in that noise. It
-    cannot see what is of the size of the noise, as half a sample of a delay: so the order is the
-    next one. Of many bins one of each n is taken: each is an equation of its own, so that costs
-    precision alone.
-    """
-    reach = int(np.searchsorted(bins.omega, highest_modelled(highest), "right"))
-    places = _thin(reach, _MOST_BINS)
-    scale = float(np.abs(np.exp(-1j * dt * bins.omega[places[-1]]) - 1)) / 2
-    models = []
-    for output in range(outputs.start, outputs.stop):
-        equations = _equations(bins, places, inputs, output, scale, dt)
-        settled = _identify_kept(_Task(equations, bins.omega[places], most))
-        models.append(None if settled is None else GlobalModel(*settled, scale, dt, places, reach))
-    return models
-
-
-def weighted_model(
-    model: GlobalModel,
-    bins: Bins,
-    inputs: slice,
-    output: int,
-    most: int,
-    noise: Float[np.ndarray, " places"],
-) -> GlobalModel | None:
-    """The model of the same bins that count by `noise`: by what a first model leaves, quiet ones do
-    not."""
-    equations = _equations(bins, model.places, inputs, output, model.scale, model.dt)
-    omega, weight = bins.omega[model.places], 1 / np.sqrt(noise)
-    white = equations.weighted(weight).pick(_thin(len(omega), _TRIAL_BINS))
-    orders = search_orders(white, most)
-    if orders.best == 0:
-        return None
-    settled = _settle(equations, omega, weight, next_order(white, orders, most))
-    return GlobalModel(*settled, model.scale, model.dt, model.places, model.reach)
-
-
 def _equations(
     bins: Bins, places: Places, inputs: slice, output: int, scale: float, dt: float
 ) -> Equations:
@@ -157,11 +115,6 @@ def _equations(
 def _owner(bins: Bins, rows: Places | slice) -> Float[np.ndarray, "records bins"]:
     """1 in the row of each bin's record."""
     return (bins.record[rows] == np.arange(bins.records)[:, None]).astype(float)
-
-
-def highest_modelled(highest: float) -> float:
-    """Frequency in rad/s up to which bins are modelled for responses up to `highest`."""
-    return _BEYOND * highest
 
 
 def _thin(count: int, most: int) -> Places:
@@ -353,9 +306,24 @@ class Rest(NamedTuple):
 def subtract_models(
     bins: Bins, sources: slice, moved: slice, highest: float, dt: float, most: int
 ) -> Rest:
-    """Fit a model of order up to `most` to each moved channel, and take it off; 0 for none."""
-    none = (None,) * (moved.stop - moved.start)
-    models = global_models(bins, sources, moved, highest, dt, most) if most else none
+    """Take a model off each moved channel, of one order more than has the least criterion; 0: none.
+
+    The criterion lies between Akaike's, under which a pole and a zero settle where the noise of
+    single bins rises, and a Bayesian one, which stops where what is left hides in that noise. It
+    cannot see what is of the size of the noise, as half a sample of a delay: so the order is the
+    next one. Of many bins one of each n is taken: each is an equation of its own, so that costs
+    precision alone.
+    """
+    reach = int(np.searchsorted(bins.omega, _BEYOND * highest, "right"))
+    places = _thin(reach, _MOST_BINS)
+    scale = float(np.abs(np.exp(-1j * dt * bins.omega[places[-1]]) - 1)) / 2
+    models = []
+    for channel in range(moved.start, moved.stop):
+        settled = None
+        if most:
+            equations = _equations(bins, places, sources, channel, scale, dt)
+            settled = _identify_kept(_Task(equations, bins.omega[places], most))
+        models.append(None if settled is None else GlobalModel(*settled, scale, dt, places, reach))
     return take_off(bins, sources, moved, models)
 
 
@@ -398,7 +366,13 @@ def weighted_models(
         omega, channel = bins.omega[model.places], rest.moved.start + c
         power = noise._replace(power=noise.power[:, c : c + 1]).power_at(omega)[:, 0]
         power = np.where(omega > noise.omega[-1], model.noise, power)
-        models[c] = weighted_model(model, bins, rest.sources, channel, most, power) or model
+        equations = _equations(bins, model.places, rest.sources, channel, model.scale, model.dt)
+        white = equations.weighted(1 / np.sqrt(power)).pick(_thin(len(omega), _TRIAL_BINS))
+        orders = search_orders(white, most)
+        if orders.best:
+            start = next_order(white, orders, most)
+            settled = _settle(equations, omega, 1 / np.sqrt(power), start)
+            models[c] = GlobalModel(*settled, model.scale, model.dt, model.places, model.reach)
     return models
 
 
@@ -447,7 +421,7 @@ def shared_errors(
 def highest_looked_at(highest: float, grid: Grid) -> float:
     """Frequency above which neither models of responses up to `highest` nor `left_moving` take
     bins."""
-    return max(highest_modelled(highest), np.exp(_AROUND) * grid[-1])
+    return max(_BEYOND * highest, np.exp(_AROUND) * grid[-1])
 
 
 def left_moving(
