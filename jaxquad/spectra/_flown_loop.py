@@ -39,20 +39,12 @@ _Spectra = Complex[np.ndarray, "windows frequencies"]
 
 
 class BrokenLoop(NamedTuple):
-    """The response of a loop L that is broken at its error, as `estimate_broken_loop` estimates it.
+    """The response of a loop L broken at its error, as `estimate_broken_loop` estimates it."""
 
-    **Attributes:**
-
-    - `omega`: rad/s.
-    - `response`: L, with negative feedback: closed as 1 + L = 0.
-    - `error`: standard error, relative and in rad.
-    - `coherence`: of the reference with what it was estimated from.
-    """
-
-    omega: Grid
-    response: Response
-    error: Grid
-    coherence: Grid
+    omega: Grid  # rad/s
+    response: Response  # L, with negative feedback: closed as 1 + L = 0
+    error: Grid  # standard error, relative and in rad
+    coherence: Grid  # of the reference with what it was estimated from
 
     @property
     def crossover(self) -> float:
@@ -168,29 +160,18 @@ def estimate_broken_loop(
 
 
 class StepResponse(NamedTuple):
-    """What an output does after a step of 1 in a reference, as `estimate_step` estimates it.
+    """What an output does after a step of 1 in a reference, as `estimate_step` estimates it."""
 
-    **Attributes:**
-
-    - `time`: s after the step, from a quarter of the length before it.
-    - `mean`: the response, over all windows, in output units per reference unit.
-    - `standard_error`: of the mean, from the scatter between windows.
-    - `windows`: the response in each active window by itself.
-    - `resolution`: what the estimator would make of a perfect step: how the reference's lack of
-      power at some frequencies blurs and tilts the mean.
-    - `total`: windows of the record; `windows` are those in which the reference is active.
-    - `names`: reference and output.
-    - `simulated`, `simulated_error`: the same of a simulated output, where one was given.
-    """
-
-    time: Samples  # s
-    mean: Samples
-    standard_error: Samples
-    windows: Float[np.ndarray, "windows samples"]
+    time: Samples  # s after the step, from a quarter of the length before it
+    mean: Samples  # over all windows, in output units per reference unit
+    standard_error: Samples  # of the mean, from the scatter between windows
+    windows: Float[np.ndarray, "windows samples"]  # the response in each active one by itself
+    # What the estimator would make of a perfect step: how the reference's lack of power at some
+    # frequencies blurs and tilts the mean.
     resolution: Samples
-    total: int
-    names: tuple[str, str]
-    simulated: Samples | None = None
+    total: int  # windows of the record; `windows` are those in which the reference is active
+    names: tuple[str, str]  # reference and output
+    simulated: Samples | None = None  # the mean of a simulated output, where one was given
     simulated_error: Samples | None = None
 
     @property
