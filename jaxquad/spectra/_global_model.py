@@ -70,38 +70,26 @@ class GlobalModel(NamedTuple):
         """Degree of the denominator."""
         return self.solved.order
 
-    def response(self, omega: Grid, inputs: int) -> Complex[np.ndarray, "frequencies inputs"]:
-        """B_i / A."""
-        powers = self._powers(omega)
-        numerators = self.solved.linear[: inputs * (self.order + 1)].reshape(inputs, -1)
-        return (numerators @ powers / (self.solved.denominator @ powers)).T
-
-    def response_slopes(
-        self, omega: Grid, inputs: int
-    ) -> Complex[np.ndarray, "frequencies inputs parameters"]:
-        """Derivatives of `response` with respect to the parameters."""
-        powers, size = self._powers(omega), self.order + 1
-        powers = (powers / (self.solved.denominator @ powers)).T
-        slopes = np.zeros((omega.size, inputs, self.drive.shape[0]), complex)
-        for i in range(inputs):
-            slopes[:, i, i * size : (i + 1) * size] = powers
-        turned = -np.delete(powers, self.fixed, axis=1)
-        slopes[:, :, len(self.solved.linear) :] = (
-            self.response(omega, inputs)[:, :, None] * turned[:, None, :]
-        )
-        return slopes
+    def response(self, omega: Grid, inputs: int) -> tuple[np.ndarray, np.ndarray]:
+        """B_i / A by frequency and input, and its derivatives with respect to the parameters."""
+        transients = len(self.solved.linear) - inputs * (self.order + 1)
+        none = np.zeros((transients // max(self.order, 1), omega.size))
+        single = np.eye(inputs)[:, :, None] * np.ones(omega.size)
+        parts = [self._output(omega, u, none) for u in single]
+        output, slopes = (np.stack(part, axis=1) for part in zip(*parts, strict=True))
+        return output, slopes
 
     def at_bins(self, bins: Bins, inputs: slice, rows: slice) -> tuple[np.ndarray, np.ndarray]:
         """The modelled output at some bins, and its derivatives with respect to the parameters."""
-        powers = self._powers(bins.omega[rows])
+        return self._output(bins.omega[rows], bins.values[rows, inputs].T, _owner(bins, rows))
+
+    def _output(self, omega: Grid, u: np.ndarray, owner: np.ndarray) -> tuple[np.ndarray, ...]:
+        powers = powers_of((np.exp(-1j * omega * self.dt) - 1) / self.scale, self.order + 1)
         powers /= self.solved.denominator @ powers
-        columns = columns_of(powers, bins.values[rows, inputs].T, _owner(bins, rows))
+        columns = columns_of(powers, u, owner)
         output = self.solved.linear @ columns
         turned = -np.delete(powers, self.fixed, axis=0)
         return output, np.concatenate([columns, output * turned]).T
-
-    def _powers(self, omega: Grid) -> Complex[np.ndarray, "powers frequencies"]:
-        return powers_of((np.exp(-1j * omega * self.dt) - 1) / self.scale, self.order + 1)
 
 
 def _equations(
@@ -130,26 +118,11 @@ def _thin(count: int, most: int) -> Places:
 Settled = tuple[Solved, int, np.ndarray, np.ndarray, np.ndarray]
 
 
-class _Task:
-    """Equations to solve, equal to others of the same content."""
-
-    def __init__(self, equations: Equations, omega: Levels, most: int):
-        self.identify = ft.partial(_identify, equations, omega, most)
-        data = b"".join(part.tobytes() for part in (*equations, omega))
-        self.content = hashlib.blake2b(data).digest(), equations.owner.shape, most
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Task) and self.content == other.content
-
-    def __hash__(self) -> int:
-        return hash(self.content)
-
-
 @ft.lru_cache(maxsize=2)
-def _identify_kept(task: _Task) -> Settled | None:
-    """A fit with another delay of the outputs asks for the model of the inputs again; one takes 20
-    MB."""
-    return task.identify()
+def _kept_models(content: tuple) -> list[Settled | None]:
+    """Room for the model of equations of this content, which a fit with another delay asks for
+    again; one takes 20 MB."""
+    return []
 
 
 def _identify(equations: Equations, omega: Levels, most: int) -> Settled | None:
@@ -299,7 +272,7 @@ class Rest(NamedTuple):
         inputs, response = fit.response.shape[2], np.array(fit.response)
         for c, model in enumerate(self.models):
             if model is not None:
-                response[:, c] += model.response(omega, inputs)
+                response[:, c] += model.response(omega, inputs)[0]
         return fit._replace(response=response)
 
 
@@ -322,7 +295,11 @@ def subtract_models(
         settled = None
         if most:
             equations = _equations(bins, places, sources, channel, scale, dt)
-            settled = _identify_kept(_Task(equations, bins.omega[places], most))
+            data = b"".join(part.tobytes() for part in (*equations, bins.omega[places]))
+            kept = _kept_models((hashlib.blake2b(data).digest(), equations.owner.shape, most))
+            if not kept:
+                kept.append(_identify(equations, bins.omega[places], most))
+            settled = kept[0]
         models.append(None if settled is None else GlobalModel(*settled, scale, dt, places, reach))
     return take_off(bins, sources, moved, models)
 
@@ -406,7 +383,7 @@ def shared_errors(
                 low, high = max(first[f], start), min(last[f], stop)
                 part = effect[f, :, low - first[f] : high - first[f]]
                 followed[f] += part @ at_bins[low - start : high - start]
-        slopes[:, c, :, ends[c] : ends[c + 1]] = model.response_slopes(omega, inputs) - followed
+        slopes[:, c, :, ends[c] : ends[c + 1]] = model.response(omega, inputs)[1] - followed
     slopes = np.einsum("foc,fcsp,fsi->foip", left, slopes, right, optimize=True)
     places = used[0][1].places
     roots = noise.root_at(bins.omega[places])
