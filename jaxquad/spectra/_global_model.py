@@ -74,7 +74,7 @@ class GlobalModel(NamedTuple):
         """B_i / A by frequency and input, and its derivatives with respect to the parameters."""
         transients = len(self.solved.linear) - inputs * (self.order + 1)
         none = np.zeros((transients // max(self.order, 1), omega.size))
-        single = np.eye(inputs)[:, :, None] * np.ones(omega.size)
+        single = np.eye(inputs, dtype=complex)[:, :, None] * np.ones(omega.size)
         parts = [self._output(omega, u, none) for u in single]
         output, slopes = (np.stack(part, axis=1) for part in zip(*parts, strict=True))
         return output, slopes
