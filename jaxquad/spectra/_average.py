@@ -97,16 +97,13 @@ def condition(products: Products, channels: Channels, counts: Counts) -> Conditi
     rest = np.maximum(total - explained, 0.0)
     answer = rest[..., None] + through
     count = counts[:, None, None]
+    share = 1 / (least * np.maximum(diagonal(moving), _TINY))
+    moved = np.minimum(diagonal(moving) / np.maximum(power[..., x], _TINY), 1.0)
+    multiple = np.clip(1 - rest / np.maximum(total, _TINY), 0.0, 1.0)
     return Conditioned(
-        response,
-        solver,
-        1 / (least * count),
-        1 / (least * np.maximum(diagonal(moving), _TINY)),
-        answer / count[..., None],
-        through / np.maximum(answer, _TINY),
-        np.minimum(diagonal(moving) / np.maximum(power[..., x], _TINY), 1.0),
-        np.clip(1 - rest / np.maximum(total, _TINY), 0.0, 1.0),
-    )
+        response, solver, 1 / (least * count), share, answer / count[..., None],
+        through / np.maximum(answer, _TINY), moved, multiple,
+    )  # fmt: skip
 
 
 class Combined(NamedTuple):
@@ -258,16 +255,8 @@ def average(
         with np.errstate(divide="ignore", invalid="ignore"):
             return np.stack([added, doubt]) / np.abs(combined.response)
 
+    multiple = np.einsum("fog,gfo->fo", weights, parts.multiple)
     return Averaged(
-        response,
-        coherence,
-        error,
-        direct,
-        np.einsum("fog,gfo->fo", weights, parts.multiple),
-        alone,
-        effect,
-        combined.share,
-        noise,
-        rest.freedom,
-        leakage,
-    )
+        response, coherence, error, direct, multiple, alone, effect, combined.share, noise,
+        rest.freedom, leakage,
+    )  # fmt: skip

@@ -127,12 +127,7 @@ def estimate_broken_loop(
     answer = output or record.output_names[0]
     answer = answer if entry == "set-point" else input or record.input_names[0]
     size = 2 * (record.samples // (_PARTS + 1))
-    starts = np.arange(0, record.samples - size + 1, size // 2)
-    taper = np.sin(np.pi * (np.arange(size) + 0.5) / size) ** 2
-    one, other = (
-        np.fft.rfft(taper * (x - x.mean())[starts[:, None] + np.arange(size)], axis=1)
-        for x in (record.channel(source), record.channel(answer))
-    )
+    one, other = (_spectra(_windows(record.channel(name), size)) for name in (source, answer))
     fine = 2 * np.pi * np.fft.rfftfreq(size, record.dt)
     low, high = band or (_CYCLES * fine[1], 0.2 * 2 * np.pi * record.sample_rate)
     edges = np.geomspace(max(low, 2 * fine[1]), min(high, fine[-2]), _LINES + 1)
@@ -305,10 +300,7 @@ def estimate_step(
             f"{record.duration:.4g} s at {record.sample_rate:.4g} Hz: choose another length"
         )
     moves = _moves(record.channel(names[0]), size, _RESTS)[:, None]
-    taper = np.sin(np.pi * (np.arange(size) + 0.5) / size) ** 2
-    source, answer = (
-        np.fft.rfft(taper * _windows(record.channel(name), size), axis=1) * moves for name in names
-    )
+    source, answer = (_spectra(_windows(record.channel(name), size)) * moves for name in names)
     noise = _noise_over_response(source, answer)
     power = np.sum(np.abs(source) ** 2, axis=0)
     bottom = np.maximum(power + noise, 1e-300)
@@ -319,7 +311,7 @@ def estimate_step(
             away = windows - _windows(record.channel(names[1]), size)
             basis = np.linalg.qr(np.vander(np.linspace(-1, 1, size), drift + 1))[0]
             windows = windows - away @ basis @ basis.T
-        answers.append(np.fft.rfft(taper * windows, axis=1) * moves)
+        answers.append(_spectra(windows) * moves)
     before, after = int(round(length / 4 / dt)), int(round(length / dt))
 
     def integrate(transfer: _Spectra) -> Float[np.ndarray, "windows samples"]:
@@ -356,6 +348,11 @@ def _windows(values: Samples, size: int) -> Float[np.ndarray, "windows size"]:
     """Windows that overlap by half, of the channel less its mean."""
     starts = np.arange(0, values.size - size + 1, size // 2)
     return (values - values.mean())[starts[:, None] + np.arange(size)]
+
+
+def _spectra(windows: Float[np.ndarray, "windows size"]) -> _Spectra:
+    size = windows.shape[1]
+    return np.fft.rfft(np.sin(np.pi * (np.arange(size) + 0.5) / size) ** 2 * windows, axis=1)
 
 
 def _moves(values: Samples, size: int, share: float) -> Bool[np.ndarray, " windows"]:

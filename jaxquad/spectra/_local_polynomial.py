@@ -166,18 +166,11 @@ def estimate_local_polynomial(
         bool(np.any(unmoved) and not np.any(finite)), ringing & coherent & ~far_off,
         None if options.width is None else windows.least[at],
     )  # fmt: skip
+    direct, log_noise = np.where(finite, direct, 0.0), log_noise[np.ix_(at, at)]
     return Estimate(
-        omega,
-        response,
-        coherence,
-        np.where(finite, direct, 0.0),
-        multiple,
-        errors,
-        error,
-        log_noise[np.ix_(at, at)],
-        remarks,
+        omega, response, coherence, direct, multiple, errors, error, log_noise, remarks,
         divided=share_of_inputs(left, sources, at, inputs) if joint else None,
-    )
+    )  # fmt: skip
 
 
 class Setup(NamedTuple):

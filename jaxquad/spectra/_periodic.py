@@ -206,19 +206,15 @@ def estimate_periodic(
     response = np.where(determined, response, np.nan)
     with np.errstate(divide="ignore", invalid="ignore"):
         relative = np.sqrt(errors.variance() / 2) / np.abs(response)
-    weight = np.where(fine, freedom, 1e-9)
+    relative = np.where(np.isfinite(response), relative, np.inf)
+    together, steady = together / (together + left), steady if method == "joint" else direct
+    log_noise = smoothed(omega, np.eye(omega.size) / freedom, np.where(fine, freedom, 1e-9))
+    remarks = ft.partial(_remarks, omega[~fine], bool(np.any(significant)), periods)
+    distortion = Distortion(omega, amplitude, *scatter, significant, names, len(records))
     return Estimate(
-        omega,
-        response,
-        steady if method == "joint" else direct,
-        direct,
-        together / (together + left),
-        errors,
-        np.where(np.isfinite(response), relative, np.inf),
-        smoothed(omega, np.eye(omega.size) / freedom, weight),
-        ft.partial(_remarks, omega[~fine], bool(np.any(significant)), periods),
-        distortion=Distortion(omega, amplitude, *scatter, significant, names, len(records)),
-    )
+        omega, response, steady, direct, together, errors, relative, log_noise, remarks,
+        distortion=distortion,
+    )  # fmt: skip
 
 
 def _remarks(lost: Grid, distorted: bool, periods: Sequence[Periods]) -> tuple[Remark, ...]:

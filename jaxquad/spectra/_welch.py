@@ -190,18 +190,13 @@ def average_windows(
     errors = ErrorCovariance(
         omega, averaged.effect, averaged.noise, averaged.share, windows, counts
     )
+    log_noise = smoothed(omega, noise, np.sum(weights * freedom, axis=1))
     return Estimate(
-        omega,
-        averaged.response,
-        averaged.coherence,
-        averaged.direct_coherence,
-        averaged.multiple_coherence,
-        errors,
-        averaged.random_error,
-        smoothed(omega, noise, np.sum(weights * freedom, axis=1)),
+        omega, averaged.response, averaged.coherence, averaged.direct_coherence,
+        averaged.multiple_coherence, errors, averaged.random_error, log_noise,
         ft.partial(_remarks, first, omega, averaged, float(np.max(independent))),
         resolution=2 * np.pi / (lengths[0] * dt),
-    )
+    )  # fmt: skip
 
 
 def _remarks(
