@@ -26,10 +26,7 @@ _Pairs = Float[np.ndarray, "*groups frequencies outputs inputs"]
 
 
 class Segments(NamedTuple):
-    """Transforms of windows for each length, in absolute phase, by the channels of `Record.names`.
-
-    The starts in `groups` are of the records one after the other, with gaps wider than any window.
-    """
+    """Transforms by `Record.names` for each length, in absolute phase, with gaps between records."""
 
     transforms: tuple[Complex[np.ndarray, "frequencies windows channels"], ...]
     slopes: tuple[Slopes, ...]  # empty where they are not needed, or nothing follows from them
@@ -64,8 +61,7 @@ class Conditioned(NamedTuple):
 
 
 def condition(products: Products, channels: Channels, counts: Counts) -> Conditioned:
-    """`(Z* X)^-1 Z* Y` from the sums of `conj(a) b` (Bendat & Piersol, ch. 7; Tischler & Remple,
-    ch. 9)."""
+    """`(Z* X)^-1 Z* Y` from sums of `conj(a) b` (Bendat, Piersol ch. 7; Tischler, Remple ch. 9)."""
 
     def inverse(matrix: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
         """That of matrices in any units, which `rows` and `columns` are."""

@@ -283,15 +283,7 @@ class ErrorCovariance:
 def independent_errors(
     omega: Float[Numbers, " frequencies"], variance: Float[Numbers, "frequencies outputs inputs"]
 ) -> ErrorCovariance:
-    """The covariance of uncorrelated errors.
-
-    **Arguments:**
-
-    - `omega`: frequencies in rad/s.
-    - `variance`: E|dT|^2 of each response, shape `(frequencies, outputs, inputs)`.
-
-    **Returns:** an `ErrorCovariance`.
-    """
+    """The covariance of uncorrelated errors; `variance` is E|dT|^2 of each response."""
     share = np.sqrt(np.asarray(variance))
     count, outputs, inputs = share.shape
     effect = np.broadcast_to(np.eye(inputs, dtype=complex), (count, inputs, inputs))

@@ -38,8 +38,7 @@ def window(name: str, samples: int) -> Float[np.ndarray, " window"]:
 
 
 def waves(name: str) -> tuple[float, float, float]:
-    """level - cosine cos a - sine sin a of a window, a = 2 pi n / samples; primes stand for
-    d/da."""
+    """level - cosine cos a - sine sin a of a window, a = 2 pi n / samples; primes are d/da."""
     plain = name.rstrip("'")
     (level, cosine), sine = coefficients(plain), 0.0
     for _ in range(len(name) - len(plain)):
@@ -66,11 +65,7 @@ def segment_starts(samples: int, length: int, overlap: float) -> tuple[int, ...]
 def lattice_windows(
     samples: int, lengths: tuple[int, ...], overlap: float, highest: float
 ) -> Layout:
-    """Windows near `lengths` that overlap by about `overlap`, of whole blocks where that pays.
-
-    A block is about 50 rad long at the `highest` frequency (rad per sample), and counted from the
-    record's end; the first window of each length starts at the first sample.
-    """
+    """Windows near `lengths`, with about the `overlap`, of whole blocks that all share."""
     if not 0 <= overlap < 1:
         raise ValueError(f"overlap {overlap} is not in [0, 1): 0.5 or 0.8 are usual")
     for length in lengths:

@@ -48,16 +48,11 @@ Levels = Float[np.ndarray, " bins"]
 
 
 class GlobalModel(NamedTuple):
-    """Y = (sum_i B_i U_i + C_r) / A of one output, polynomials in x = (exp(-j omega dt) - 1)/scale.
-
-    So a system of finite order answers to inputs that are held, or linear between samples; C_r is
-    the difference of the states at the ends of record r. Errors of the real parameters are Re(drive
-    V).
-    """
+    """Y = (sum_i B_i U_i + C_r) / A, of x = (exp(-j omega dt) - 1) / scale; C is of both ends."""
 
     solved: Solved
     fixed: int  # the power whose coefficient in A sets the common factor
-    drive: Complex[np.ndarray, "parameters places"]
+    drive: Complex[np.ndarray, "parameters places"]  # errors are Re(drive V), V the noise
     follow: Complex[np.ndarray, "places parameters"]  # orthonormal: what the model takes of noise
     noise: Float[np.ndarray, " places"]  # its power, smoothed, from what the model leaves
     scale: float
@@ -106,8 +101,7 @@ def _owner(bins: Bins, rows: Places | slice) -> Float[np.ndarray, "records bins"
 
 
 def _thin(count: int, most: int) -> Places:
-    """At most so many of `count` bins, one of each n neighbours: not every n-th, of periodic
-    lines."""
+    """At most so many of `count` bins, one of each n neighbours, not every n-th."""
     step = -(-count // most)
     first = np.arange(0, count, step)
     shift = np.floor(step * (0.6180339887 * np.arange(first.size) % 1.0)).astype(int)
@@ -120,8 +114,7 @@ Settled = tuple[Solved, int, np.ndarray, np.ndarray, np.ndarray]
 
 @ft.lru_cache(maxsize=2)
 def _kept_models(content: tuple) -> list[Settled | None]:
-    """Room for the model of equations of this content, which a fit with another delay asks for
-    again; one takes 20 MB."""
+    """Room for the model of such equations; another delay asks again. One takes 20 MB."""
     return []
 
 
@@ -177,8 +170,7 @@ def _settle(
 
 
 def rough_noise(equations: Equations, omega: Levels) -> Levels:
-    """Power of what local rational functions leave; without their pole a light mode would leave
-    much."""
+    """Power that local rational functions leave; without a pole a light mode leaves much."""
     factors = np.concatenate([equations.u, equations.owner])
     count, columns = omega.size, 2 * len(factors) + 1
     length = min(2 * columns, count)
@@ -204,10 +196,7 @@ def noise_left(
     below: Complex[np.ndarray, " bins"],
     freedom: Levels,
 ) -> Levels:
-    """Running power of what a model leaves; that before its poles where it is clearly likelier.
-
-    `below` is the denominator: gusts pass the poles, and peak more narrowly than a running power.
-    """
+    """Running power of what a model leaves; that before its poles where clearly likelier."""
     after = running_power(omega, left, freedom)
     before = running_power(omega, left * below, freedom) / np.abs(below) ** 2
     gain = _log_likelihood(left, before) - _log_likelihood(left, after)
@@ -244,8 +233,7 @@ class Rest(NamedTuple):
     def without_followed(
         self, omega: Grid, half_width: Grid, order: int, fit: LocalFit
     ) -> LocalFit:
-        """The fit, its residuals corrected for noise that models follow and it would not have
-        followed."""
+        """The fit, its residuals corrected for noise that only models have followed."""
         scatter, freedom = np.array(fit.scatter), fit.freedom
         # A long record has many times the bins that the windows reach.
         reach = int(np.max(window_slices(omega, half_width, self.bins)[1]))
@@ -362,10 +350,7 @@ def shared_errors(
     left: Complex[np.ndarray, "frequencies outputs moved"],
     right: Complex[np.ndarray, "frequencies sources inputs"],
 ) -> SharedErrors | None:
-    """Errors of the models' parameters in left (models + `fit`) right; `None` without models.
-
-    A local fit follows what a wrong parameter leaves in its window: only the difference remains.
-    """
+    """Errors of models' parameters in left (models + `fit`) right, less what a fit follows."""
     used = [(c, model) for c, model in enumerate(rest.models) if model is not None]
     if not used:
         return None
@@ -396,19 +381,14 @@ def shared_errors(
 
 
 def highest_looked_at(highest: float, grid: Grid) -> float:
-    """Frequency above which neither models of responses up to `highest` nor `left_moving` take
-    bins."""
+    """Frequency above which neither models up to `highest` nor `left_moving` take bins."""
     return max(_BEYOND * highest, np.exp(_AROUND) * grid[-1])
 
 
 def left_moving(
     rest: Rest, ends: Sequence[Float[np.ndarray, "_samples channels"]], grid: Grid, noise: Noise
 ) -> Bool[np.ndarray, " grid"]:
-    """Where models leave a peak, far above the noise, of a channel that moves at a record's `ends`.
-
-    The local fits cannot tell the response from a mode that still rings, narrower than their
-    windows.
-    """
+    """Where models leave a peak far above the noise of a channel moving at a record's `ends`."""
     ringing, bins = np.zeros(grid.size, bool), rest.bins
     place = np.log(bins.omega)
     for c in range(len(rest.models)):

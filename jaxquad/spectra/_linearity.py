@@ -241,10 +241,7 @@ def _say_static(left: _LeftOver, v: Signal) -> str:
     """What functions of the command v, of unit size, say of the gain."""
 
     def gains(columns: list[int], x: Signal, low: int, high: int) -> tuple[float, float, float]:
-        """At two percentiles of x, relative to that of the response, and in standard errors.
-
-        Where a nonlinearity is not clear, 1; factors must be real: no dynamics before it.
-        """
+        """At two percentiles of x, relative to the response, and how clear; 1 where it is not."""
         if np.min(left.share[columns]) < _DISTINCT_STATIC:
             return 1.0, 1.0, 0.0
         added = left.added[:, columns]
@@ -288,8 +285,7 @@ def _say_static(left: _LeftOver, v: Signal) -> str:
 
 
 def period_of(signals: Sequence[Float[np.ndarray, "_samples sources"]]) -> int:
-    """Samples of the shortest period, of two at least, with which all signals repeat exactly; or
-    0."""
+    """Samples of the shortest period, of two at least, of all signals; 0 without one."""
     most = min(len(signal) for signal in signals) // 2
     lags, first = np.arange(4, most + 1), signals[0]
     near = _EXACT * max(float(np.max(np.abs(signal))) for signal in signals)
@@ -399,8 +395,7 @@ def _say_harmonics(
 
 
 def phase_of_sweep(signal: Signal) -> tuple[Signal, Tone] | None:
-    """The rising phase and the part of a tone of slow frequency; `None` where much power is
-    beside."""
+    """The rising phase and the part of a tone of slow frequency; `None` of other signals."""
     centred = signal - np.mean(signal)
     # The signal without its negative frequencies, doubled; scipy.signal takes 0.4 s to import.
     share = np.where(np.arange(signal.size) < (signal.size + 1) // 2, 2.0, 0.0)
@@ -457,8 +452,7 @@ def fast_length(samples: int) -> int:
 
 
 def interpolated(grid: Bins, omega: Grid, response: OfInputs) -> Complex[np.ndarray, "bins inputs"]:
-    """Smooth in magnitude and phase along log frequency, and near the points where a spline leaves
-    them."""
+    """Smooth in magnitude and phase along log frequency, within limits of the points."""
     from scipy.interpolate import CubicSpline
 
     size, angle = np.log(np.abs(response)), np.unwrap(np.angle(response), axis=0)

@@ -42,10 +42,7 @@ Columns = Complex[np.ndarray, "frequencies window columns"]
 
 
 class Bins(NamedTuple):
-    """Transforms of whole records over the root of their length, by increasing frequency.
-
-    The mean and the Nyquist bin are left out.
-    """
+    """Transforms of whole records over the root of their length; no mean, no Nyquist bin."""
 
     omega: Float[np.ndarray, " bins"]  # rad/s
     record: Int[np.ndarray, " bins"]  # number of the record that it belongs to
@@ -158,8 +155,7 @@ def local_fit(
     order: int,
     shape: Literal["polynomial", "rational"],
 ) -> LocalFit:
-    """Fit polynomials of `order`, or these over a linear denominator, to responses and
-    transients."""
+    """Fit polynomials of `order`, or these over a linear denominator, and transients."""
     first, last = window_slices(omega, half_width, bins)
     longest, fields = max(int(np.max(last - first)), 1), []
     for chunk, window in _chunks(omega, half_width, bins, order):
@@ -187,8 +183,7 @@ def local_fit(
 
 
 def left_power(omega: Grid, half_width: Grid, bins: Bins, values: np.ndarray, order: int) -> Grid:
-    """Power of `values` that `local_fit` by polynomials would leave, all `bins` inputs; 0 without
-    fit."""
+    """Power of `values` that `local_fit` by polynomials would leave; 0 without a fit."""
     left, power = np.zeros(omega.size), np.sum(np.abs(values) ** 2, axis=1)
     for chunk, window in _chunks(omega, half_width, bins, order):
         u = bins.values[window.index] * window.used[:, :, None]
@@ -213,8 +208,7 @@ class _Window(NamedTuple):
 def _chunks(
     omega: Grid, half_width: Grid, bins: Bins, order: int
 ) -> Iterator[tuple[Int[np.ndarray, " chunk"], _Window]]:
-    """Frequencies with windows of about one length, padded; records with too few bins take no
-    part."""
+    """Frequencies with windows of about one length, padded; too few bins take no part."""
     first, last = window_slices(omega, half_width, bins)
     longest = max(int(np.max(last - first)), 1)
     places, size = np.argsort(last - first, kind="stable"), min(_CHUNK, max(_BINS // longest, 1))

@@ -259,10 +259,7 @@ def _repair_models(setup: Setup, rest: Rest) -> tuple[Rest, LocalFit]:
 
 
 def _narrowly(setup: Setup, rest: Rest) -> tuple[LocalFit, Float[np.ndarray, " moved"]]:
-    """Fits from the sources to what they move, and what models leave, to what the fits leave.
-
-    A rational fit counts where its residual is so much smaller that there must be a resonance.
-    """
+    """Fits from the sources to what they move; what models leave, to what the fits leave."""
     grid, width = setup.windows.grid, setup.windows.narrow
     respond = setup.to_moved(rest)
     fit, wider = respond(grid, width, "polynomial"), width
@@ -379,8 +376,7 @@ def joint_fit(fit: LocalFit, inputs: int) -> LocalFit:
 
 
 def share_of_inputs(left: np.ndarray, noise: Noise, at: Places, inputs: int) -> Pairs:
-    """Share of a joint estimate's squared error by the noise of T_ru, half of what both make
-    included."""
+    """Share of the squared error by noise of T_ru, with half of what both make."""
     root = noise.root()[at]
     total = left @ root
     of_inputs = left[:, :, :inputs] @ root[:, :inputs]

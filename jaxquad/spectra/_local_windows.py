@@ -185,12 +185,7 @@ def choose_widths(
 
 
 def reach(omega: Grid, centre: Grid, widest: Grid, bins: Bins, columns: slice) -> Grid:
-    """Half-widths in rad/s within which the excitation is even, `widest` at most.
-
-    Beyond a sweep's end, a window that reaches back takes the response from there: smooth, and
-    wrong. So the mean power on one side of `centre` must not outweigh that at the centre, unless
-    both do.
-    """
+    """Half-widths of even excitation: beyond a sweep's end a window would take its response."""
     running = np.cumsum(np.abs(bins.values[:, columns]) ** 2, axis=0)
     running = np.concatenate([np.zeros((1, running.shape[1])), running])
 
@@ -234,10 +229,7 @@ class SharedErrors(NamedTuple):
     def on_atoms(
         self, reached: Bool[np.ndarray, " bins"]
     ) -> tuple[np.ndarray, np.ndarray, Int[np.ndarray, " driven"]]:
-        """Slopes by the parameters' errors of unit size, their drive by atoms, and which atoms.
-
-        The bins that no local fit reaches are one more atom for each parameter, behind all bins.
-        """
+        """Slopes by errors of unit size, their drive by atoms, and these; others are one more."""
         level = np.sum(np.abs(self.lines) ** 2, axis=2)
         pairs = zip(self.single, self.line, strict=True)
         size = np.sqrt(0.5 * np.array([np.abs(row) ** 2 @ level[:, k] for row, k in pairs]))
@@ -267,11 +259,7 @@ def error_covariance(
     left: Left,
     models: SharedErrors | None,
 ) -> ErrorCovariance:
-    """Errors of `fit`, recoloured by `back`; `at` is the place of each frequency in `noise`.
-
-    The atoms are the bins, each with its own noise: `left` times that of the `sources`. Where the
-    residual is larger than chance allows, so is the error. The same noise disturbs the `models`.
-    """
+    """Errors of `fit`: atoms are bins, their noise `left` times `sources`, more where misfit."""
     colour = _colour_of_noise(sources, left, omega, bins, fit)
     effect = fit.effect * np.exp(0.5 * np.mean(np.log(colour), axis=2))[:, None, :]
     scale = fit.boost * np.sqrt(_misfit(fit, noise, at, colour, _CHANCE_OF_MISFIT))

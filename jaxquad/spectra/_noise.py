@@ -164,8 +164,7 @@ def _local_lines(omega: Grid, level: Levels, weight: Levels) -> Levels:
 
 
 def smoothed(omega: Grid, covariance: Square, weight: Grid) -> Square:
-    """Covariance of the logarithm of noise powers, of `weight` degrees of freedom, after
-    smoothing."""
+    """Covariance of the logarithm of noise powers after smoothing."""
     near = kernels(omega)
     m0, m1, m2 = (near @ weight)[:, :, None]
     # A single frequency has no slope: the small term keeps the line flat there.
@@ -176,8 +175,7 @@ def smoothed(omega: Grid, covariance: Square, weight: Grid) -> Square:
 
 
 def covariance_of_bands(first: Places, last: Places, freedom: Grid) -> Square:
-    """Of the logarithm of mean residual powers over bins: bands share as much of it as of their
-    bins."""
+    """Of the logarithm of mean residual powers over bins, by the bins that bands share."""
     count = np.maximum(last - first, 1)
     shared = np.minimum(last[:, None], last) - np.maximum(first[:, None], first)
     overlap = np.maximum(shared, 0) / np.sqrt(np.outer(count, count))
@@ -227,10 +225,7 @@ class Slopes(NamedTuple):
 
 
 class Rest(NamedTuple):
-    """What is left of the outputs' windows: sums of `conj(a) b`, by window length.
-
-    `trace` is the energy that unit noise leaves.
-    """
+    """What is left of the outputs' windows: sums of `conj(a) b`, and the energy of unit noise."""
 
     products: Complex[np.ndarray, "frequencies outputs outputs groups"]
     trace: Groups

@@ -168,11 +168,7 @@ def descend(equations: Equations, denominator: Powers, least_gain: float) -> tup
 
 
 class _Span(NamedTuple):
-    """What rows span, with the Cholesky factor of the products of these rows at unit length.
-
-    A QR decomposition takes three times as long: it is for products that would lose too many
-    digits.
-    """
+    """What rows span, by Cholesky of products at unit length, or QR where digits are lost."""
 
     rows: Rows
     length: Vector
@@ -248,10 +244,7 @@ class Orders(NamedTuple):
 
 
 def search_orders(equations: Equations, most: int) -> Orders:
-    """From 0 upwards, each order from the one below with one pole more.
-
-    Linear estimates are no better places to begin: the noise draws their poles to instability.
-    """
+    """From 0 upwards, each order from the one below with one pole more."""
     solved = {0: Basis.of(equations, 1).solve(np.ones(1))[0]}
     _climb(equations, solved, most, {}, _THOROUGH, _PATIENCE)
     return Orders.of(equations, solved)
@@ -295,8 +288,7 @@ def _climb(
 
 
 def next_order(equations: Equations, orders: Orders, most: int) -> Powers:
-    """Where a descent of the order above the best one begins: a pole at infinity, as half a
-    sample's delay."""
+    """Where a descent of the next order begins: a pole at infinity, as a small delay's."""
     best = orders.solved[orders.best]
     if orders.best >= equations.highest(most) or best.cost <= equations.rounding:
         return best.denominator
