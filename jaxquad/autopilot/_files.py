@@ -30,15 +30,10 @@ class WordChange(NamedTuple):
 
 
 def propose_changes(
-    firmware: str,
-    old: Mapping[str, Number],
-    new: Mapping[str, Number],
-    *,
-    share: Number = 1.0,
-    reasons: Mapping[str, str] | None = None,
-    beyond: Sequence[str] = (),
+    firmware: str, old: Mapping[str, Number], new: Mapping[str, Number], *, share: Number = 1.0,
+    reasons: Mapping[str, str] | None = None, beyond: Sequence[str] = (),
     at_once: Sequence[str] = (),
-) -> tuple[ParameterChange, ...]:
+) -> tuple[ParameterChange, ...]:  # fmt: skip
     """What changes between two sets of parameters once both are stored by the firmware.
 
     The changes are in the order of the firmware's table, without those that rounding undoes.
@@ -78,16 +73,11 @@ def propose_changes(
 
 
 def parameter_file(
-    firmware: str,
-    changes: Sequence[ParameterChange],
-    *,
-    revert: bool = False,
-    version: tuple[int, ...] = (2025, 12),
-    profile: int | None = 0,
-    raised: Sequence[str] = ("roll", "pitch", "yaw"),
-    title: str = "",
+    firmware: str, changes: Sequence[ParameterChange], *, revert: bool = False,
+    version: tuple[int, ...] = (2025, 12), profile: int | None = 0,
+    raised: Sequence[str] = ("roll", "pitch", "yaw"), title: str = "",
     words: Sequence[WordChange] = (),
-) -> str:
+) -> str:  # fmt: skip
     """The text to load: Betaflight's CLI, PX4's .params, ArduPilot's .param, Crazyflie's YAML.
 
     The other value of each parameter is in a comment where the format allows it.
@@ -135,19 +125,11 @@ class ParameterFiles(NamedTuple):
 
 
 def write_parameter_files(
-    folder: str | Path,
-    firmware: str,
-    old: Mapping[str, Number],
-    new: Mapping[str, Number],
-    *,
-    stem: str = "proposal",
-    shares: Sequence[Number] = (1 / 3, 1.0),
-    reasons: Mapping[str, str] | None = None,
-    beyond: Sequence[str] = (),
-    at_once: Sequence[str] = (),
-    version: tuple[int, ...] = (2025, 12),
-    profile: int | None = 0,
-) -> ParameterFiles:
+    folder: str | Path, firmware: str, old: Mapping[str, Number], new: Mapping[str, Number], *,
+    stem: str = "proposal", shares: Sequence[Number] = (1 / 3, 1.0),
+    reasons: Mapping[str, str] | None = None, beyond: Sequence[str] = (),
+    at_once: Sequence[str] = (), version: tuple[int, ...] = (2025, 12), profile: int | None = 0,
+) -> ParameterFiles:  # fmt: skip
     """Write a staged proposal, a file that reverts it, and a table of what changes.
 
     **Arguments:**

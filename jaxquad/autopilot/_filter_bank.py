@@ -24,15 +24,9 @@ _SLOW = 2 * np.pi * 5.0  # rad/s, where delays are compared
 
 
 def filter_choices(
-    firmware: str,
-    values: Mapping[str, str],
-    version: Sequence[int] = (),
-    *,
-    axis: int = 0,
-    throttle: float = 0.3,
-    change: float = 3.0,
-    line_hz: float | None = None,
-) -> tuple[FilterChoice, ...]:
+    firmware: str, values: Mapping[str, str], version: Sequence[int] = (), *, axis: int = 0,
+    throttle: float = 0.3, change: float = 3.0, line_hz: float | None = None,
+) -> tuple[FilterChoice, ...]:  # fmt: skip
     """The low-passes of gyro and D term that are on, and a notch at a line of the gyro's noise.
 
     Their kinds stay. A dynamic low-pass is moved as a whole, its lowest and its highest cutoff by

@@ -345,7 +345,7 @@ def read_flown(
         raise ValueError(
             f"{path}: P, I and D of {setup.axis} are all 0, so there is no rate loop to tune"
         )
-    angle = firmware.angle_loop(logged.values, axis, loop.law.interval(), levelled=setup.levelled)
+    angle = firmware.angle_loop(logged.values, axis, loop.law.dt, levelled=setup.levelled)
     chains = tuple(chain for chain in loop.law.gyro_chains() if chain.filters)
     filters, text = best_filters(chains, loop.unmodelled, flight, axis)
     return FlownAutopilot(

@@ -183,13 +183,9 @@ def _replaced(law: Law, field: str, value: Array) -> Law:
 
 
 def flown_loop(
-    firmware: str,
-    values: Mapping[str, str],
-    version: Sequence[int] = (),
-    *,
-    throttle: float = 0.3,
+    firmware: str, values: Mapping[str, str], version: Sequence[int] = (), *, throttle: float = 0.3,
     tracked_hz: Mapping[int, Sequence[float]] | None = None,
-) -> FlownLoop:
+) -> FlownLoop:  # fmt: skip
     """The rate loop of the parameters of a log.
 
     **Arguments:**

@@ -45,18 +45,10 @@ class _Row(NamedTuple):
 
 
 def replay_terms(
-    flown: FlownLoop,
-    setpoint: Samples,
-    gyro: Samples,
-    throttle: Series,
-    *,
-    dt: float,
-    feed_forward: Samples | None = None,
-    integral: Samples | None = None,
-    mixer_range: Series | None = None,
-    late: float = 0.0,
-    restart: float = 0.5,
-) -> dict[str, Float[np.ndarray, "samples axes"]]:
+    flown: FlownLoop, setpoint: Samples, gyro: Samples, throttle: Series, *, dt: float,
+    feed_forward: Samples | None = None, integral: Samples | None = None,
+    mixer_range: Series | None = None, late: float = 0.0, restart: float = 0.5,
+) -> dict[str, Float[np.ndarray, "samples axes"]]:  # fmt: skip
     """P, I, D and F of a log again, from its set-point and its filtered gyro.
 
     The law runs at the loop's rate; between the samples of the log its signals are taken as
@@ -83,9 +75,9 @@ def replay_terms(
 
     - `ValueError`: the log's interval is below the loop's.
     """
-    if dt < 0.5 * flown.law.interval():
+    if dt < 0.5 * flown.law.dt:
         raise ValueError(
-            f"the log's interval is {dt:g} s, below the loop's {flown.law.interval():g} s: read "
+            f"the log's interval is {dt:g} s, below the loop's {flown.law.dt:g} s: read "
             "the log at the loop's rate or below"
         )
     grid = _Grid(flown, len(setpoint), dt)
@@ -97,16 +89,9 @@ def replay_terms(
 
 
 def fly_again(
-    flown: FlownLoop,
-    plant: HeldPlant,
-    setpoint: Series,
-    throttle: Series,
-    *,
-    dt: float,
-    feed_forward: Series | None = None,
-    injected: Series | None = None,
-    late: float = 0.0,
-) -> Float[np.ndarray, " samples"]:
+    flown: FlownLoop, plant: HeldPlant, setpoint: Series, throttle: Series, *, dt: float,
+    feed_forward: Series | None = None, injected: Series | None = None, late: float = 0.0,
+) -> Float[np.ndarray, " samples"]:  # fmt: skip
     """The rate that law and plant make of a logged set-point: the closed loop in time, undisturbed.
 
     **Arguments:**
@@ -121,7 +106,7 @@ def fly_again(
     """
     from scipy.linalg import expm
 
-    dt_loop = flown.law.interval()
+    dt_loop = flown.law.dt
     grid, column = _Grid(flown, len(setpoint), dt), lambda x: np.asarray(x)[:, None]
     added = np.zeros_like(setpoint) if injected is None else injected
     forward = None if feed_forward is None else column(feed_forward)
@@ -143,7 +128,7 @@ class _Grid:
     """The loop's samples in the span of a log, and signals on either."""
 
     def __init__(self, flown: FlownLoop, count: int, dt: float):
-        self.flown, self.log, self.interval = flown, dt * np.arange(count), flown.law.interval()
+        self.flown, self.log, self.interval = flown, dt * np.arange(count), flown.law.dt
         size = int(np.floor(self.log[-1] / self.interval + 1e-6)) + 1
         self.loop = self.interval * np.arange(size)
 

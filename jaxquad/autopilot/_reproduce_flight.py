@@ -145,16 +145,10 @@ class Reproduction(eqx.Module):
 
 
 def reproduce_flight(
-    fit: Fit,
-    controller: FlownController,
-    flown: Record | Sequence[Record] | FrequencyResponse,
-    *,
-    plant: Callable[[PyTree], PyTree] | None = None,
-    unit: Literal["rad/s", "deg/s"] = "rad/s",
-    filters: Sequence[KnownFilter] = (),
-    axis: int = 0,
-    band: tuple[float, float] | None = None,
-) -> Reproduction:
+    fit: Fit, controller: FlownController, flown: Record | Sequence[Record] | FrequencyResponse, *,
+    plant: Callable[[PyTree], PyTree] | None = None, unit: Literal["rad/s", "deg/s"] = "rad/s",
+    filters: Sequence[KnownFilter] = (), axis: int = 0, band: tuple[float, float] | None = None,
+) -> Reproduction:  # fmt: skip
     """Compare the closed loop that a controller and an identified plant predict with a record.
 
     A plant, gains and filters that do not reproduce the response that was flown are no basis for
