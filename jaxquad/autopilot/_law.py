@@ -3,7 +3,7 @@
 import abc
 import dataclasses
 from collections.abc import Mapping
-from typing import ClassVar, Generic, NamedTuple, TypeVar
+from typing import ClassVar, Generic, NamedTuple, TYPE_CHECKING, TypeVar
 
 import equinox as eqx
 import jax
@@ -55,7 +55,10 @@ class FirmwareLoop(eqx.Module):
     Subclasses are final: they say what the law remembers at rest, and how it advances.
     """
 
-    dt: eqx.AbstractVar[float]  # s
+    if TYPE_CHECKING:  # fields of each law, in its own order
+
+        @property
+        def dt(self) -> float: ...  # s
 
     @abc.abstractmethod
     def rest(self, zero: Signal) -> dict[str, PyTree]:
@@ -124,7 +127,10 @@ class RateLoop(FirmwareLoop):
     feed_forward: ClassVar[tuple[str, ...]] = ()  # gains of it
     limits: ClassVar[tuple[str, ...]] = ()  # fields that are not below 0
     of_sticks: ClassVar[bool] = False  # whether feed-forward is theirs, between samples
-    gyro: eqx.AbstractVar[FilterChain]
+    if TYPE_CHECKING:
+
+        @property
+        def gyro(self) -> FilterChain: ...
 
     def __check_init__(self):
         gains = {name: vars(self)[name] for name in (*self.factors, *self.feed_forward)}
