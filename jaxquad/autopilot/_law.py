@@ -26,7 +26,7 @@ from jaxquad._core import (
     require_sample_interval,
     signal_shape,
 )
-from jaxquad.control import LinearController, Member, Reference, Setpoint, Transform
+from jaxquad.control import as_setpoint, LinearController, Member, Reference, Setpoint, Transform
 
 from ._filters import FilterChain, Memory, rest_of, run_sections, Section
 
@@ -234,7 +234,7 @@ class AngleLoop(FirmwareLoop):
         self, memory: Memories, excess: Signal, reference: Reference, measurement: Signal
     ) -> Advance:
         rate = (measurement - memory["angle"]) / self.dt
-        outer, wanted = self.wanted_rate(memory, reference, measurement, rate)
+        outer, wanted = self.wanted_rate(memory, as_setpoint(reference), measurement, rate)
         inner, command, terms = self.inner().advance(memory["rate"], excess, wanted, rate)
         return {"rate": inner, "angle": measurement, **outer}, command, terms
 
@@ -248,7 +248,7 @@ class AngleLoop(FirmwareLoop):
 
     @abc.abstractmethod
     def wanted_rate(
-        self, memory: Memories, reference: Reference, angle: Signal, rate: Signal
+        self, memory: Memories, aim: Setpoint, angle: Signal, rate: Signal
     ) -> tuple[dict[str, PyTree], Signal]:
         """What the angle loop remembers, and the set-point of the rate in rad/s."""
 

@@ -52,8 +52,7 @@ def convergence_figure(
     flying = np.array([one.phase == "optimise" for one in history])
     cost = np.where(flying[:, None], [np.atleast_1d(one.cost) for one in history], np.nan)
     stable = np.array([np.atleast_1d(one.stable) for one in history])
-    panels = lay.stacked(2, ax)
-    top, bottom = panels
+    top, bottom = panels = lay.stacked(2, ax)
     best = np.nanmin(cost) if np.isfinite(cost).any() else 0.0
     above, starts = np.maximum(cost - best, _LEAST), cost.shape[1]
     for k in range(starts):
@@ -99,8 +98,7 @@ def front_figure(pareto: Pareto, *, ax: AxesLike = None, title: str = "") -> Pan
     - `pareto`: see `jaxquad.tuning`.
     - `title`: by default what is shown.
     """
-    panels = lay.stacked(1, ax)
-    [panel] = panels
+    [panel] = panels = lay.stacked(1, ax)
     degrees, on = QUANTITIES["itae"].factor, pareto.front
     order = np.argsort(pareto.effort)
     front = order[on[order]]

@@ -17,7 +17,7 @@ from jaxquad.identify import (
     with_values,
 )
 from jaxquad.models import Model
-from jaxquad.plot import plain_ticks, short_names, StepBand, steps_figure, unit_label
+from jaxquad.plot import add_hertz, plain_ticks, short_names, StepBand, steps_figure, unit_label
 from jaxquad.records import Record
 from jaxquad.spectra import BrokenLoop, Entry, FrequencyResponse, StepResponse
 
@@ -222,18 +222,11 @@ _BY_LAW = (
 
 
 class LawLoop(NamedTuple):
-    """The flown loop where the law is known.
+    """The flown loop where the law is known."""
 
-    **Attributes:**
-
-    - `measured`: law times measured response of the plant; `model`: times the identified one.
-    - `step`: from set-point to rate, of plants that the fit leaves possible.
-    - `unmodelled`: what the law leaves out.
-    """
-
-    measured: BrokenLoop
-    model: BrokenLoop | None
-    step: StepBand | None
+    measured: BrokenLoop  # law times measured response of the plant
+    model: BrokenLoop | None  # law times the identified one
+    step: StepBand | None  # from set-point to rate, of plants that the fit leaves possible
     unmodelled: Sequence[str] = ()
 
     @property
@@ -335,11 +328,8 @@ def _draw_loop(loop: BrokenLoop, model: BrokenLoop | None) -> Figure:
     phase.axhline(-180, color="0.3", lw=0.8)
     level.set(ylabel="|L|, dB", xscale="log")
     phase.set(ylabel="phase of L, deg", xlabel="frequency, rad/s")
-    turns = (lambda omega: omega / (2 * np.pi), lambda hertz: 2 * np.pi * hertz)
-    hertz = level.secondary_xaxis("top", functions=turns)
-    hertz.set_xlabel("frequency, Hz")
-    for axis in (phase.xaxis, hertz.xaxis):
-        plain_ticks(axis)
+    plain_ticks(phase.xaxis)
+    add_hertz(level)
     return figure
 
 

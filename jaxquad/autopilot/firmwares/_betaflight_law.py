@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
 from jaxquad._core import as_float, broadcast_gain, per_member, require_positive
-from jaxquad.control import Reference
+from jaxquad.control import Reference, Setpoint
 
 from .._filters import Filter, FilterChain, PT2, PT3
 from .._law import (
@@ -412,9 +412,8 @@ class BetaflightAngle(AngleLoop):
         return {"smooth": self._smooth.init(zero)}
 
     def wanted_rate(
-        self, memory: Memories, reference: Reference, angle: Signal, rate: Signal
+        self, memory: Memories, aim: Setpoint, angle: Signal, rate: Signal
     ) -> tuple[dict[str, PyTree], Signal]:
-        aim, _ = split_reference(reference, angle, self.dt)
         level = broadcast_gain(self.level, angle) / 10
-        smooth, wanted = self._smooth.step(memory["smooth"], level * (aim - angle))
+        smooth, wanted = self._smooth.step(memory["smooth"], level * (aim.angle - angle))
         return {"smooth": smooth}, wanted
