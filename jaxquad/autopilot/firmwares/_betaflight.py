@@ -379,12 +379,8 @@ class Betaflight(Firmware):
         return {**values, "looptime": f"{looptime:.6g}"}
 
     def levelled(self, loop: FlownLoop) -> FlownLoop:
-        """The integral is held from a fifth of the set-point's speed on there."""
-        relax = loop.law.relax if isinstance(loop.law, BetaflightPID) else None
-        if relax is None:
-            return loop
-        relax = dataclasses.replace(relax, threshold=0.2 * relax.threshold)
-        return dataclasses.replace(loop, law=dataclasses.replace(loop.law, relax=relax))
+        law = loop.law.levelled() if isinstance(loop.law, BetaflightPID) else loop.law
+        return dataclasses.replace(loop, law=law)
 
     def angle_loop(self, values, axis, dt, *, levelled):
         level = values.get("levelPID", "").split(",")[0]

@@ -12,7 +12,6 @@ from jaxquad.plot import StepBand, ThrottleCurve
 from jaxquad.records import AXES
 from jaxquad.report import Headline, Provenance, Table
 
-from .._files import change_table, parameter_file, ParameterChange, propose_changes, WordChange
 from .._filters import FilterChain, PT2
 from .._flight_channels import FlightChannels
 from .._page import (
@@ -25,10 +24,17 @@ from .._page import (
     PilotPage,
     VERDICTS,
 )
-from .._parameters import find_parameter
+from .._parameters import (
+    change_table,
+    find_parameter,
+    parameter_file,
+    ParameterChange,
+    propose_changes,
+    WordChange,
+)
 from .._proposal import write_result
 from .._rate_loops import StepGrid
-from .._reproduce_flight import Reproduction
+from .._replay import Reproduction
 from .._stages import DesignSettings, Kind
 from ._betaflight_adrc import adrc_loops, adrc_parameters, b0_law, Flown, FlownADRC
 from ._betaflight_adrc_design import ADRCProposal
@@ -170,8 +176,33 @@ class ADRCAutopilot:
                 f"thrust_linear {linear:g} flew and stays: the gain over the throttle is that with "
                 "it, taken as a straight line"
             )
-        if self.proposal is not None and self.plant is not None:
-            remarks += _remarks_on_b0(self.plant, self.proposal, self.flew_adrc)
+        proposal, plant = self.proposal, self.plant
+        if proposal is None or plant is None:
+            return tuple(remarks)
+        schedule, scaled, throttle = proposal.schedule, proposal.scaled, proposal.throttle
+        most = float(schedule.scale(throttle[-1]))
+        if scaled is None:
+            remarks.append(
+                f"b0 over the throttle is not known, and adrc_b0_law {schedule.law} is "
+                f"{'what flew' if self.flew_adrc else 'the default'}: the certificate is of "
+                f"{throttle[0]:.2f} throttle alone; {plant.what_to_fly()}"
+            )
+            return tuple(remarks)
+        if most >= schedule.high > 1:
+            remarks.append(
+                f"at {throttle[-1]:.2f} throttle b0 is at adrc_b0_scale_max, {schedule.high:g}"
+            )
+        if self.flew_adrc and scaled.law != schedule.law:
+            off = {law: f"{100 * share:.0f} %" for law, share in scaled.deviations.items()}
+            remarks.append(
+                f"adrc_b0_law {schedule.law} stays as it flew: it is off by up to "
+                f"{off[schedule.law]}, and {scaled.law} by {off[scaled.law]}"
+            )
+        if scaled.extrapolated:
+            remarks.append(
+                f"the hover throttle of {scaled.hover:.2f} lies outside of what was flown, "
+                f"{float(plant.low.min()):.2f} to {float(plant.high.max()):.2f}"
+            )
         return tuple(remarks)
 
     def write(self, folder: str | Path) -> list[Path]:
@@ -248,33 +279,6 @@ def doubted_throttle(again: Mapping[float, Reproduction]) -> float | None:
     off = [throttle for throttle, check in again.items() if check.kind == "not flown"]
     blind = all(check.kind == "unknown" for check in again.values())
     return next(iter(off or (again if blind else ())), None)
-
-
-def _remarks_on_b0(plant: GainOverThrottle, proposal: ADRCProposal, flew: bool) -> list[str]:
-    schedule, scaled = proposal.schedule, proposal.scaled
-    if scaled is None:
-        return [
-            f"b0 over the throttle is not known, and adrc_b0_law {schedule.law} is "
-            f"{'what flew' if flew else 'the default'}: the certificate is of "
-            f"{proposal.throttle[0]:.2f} throttle alone; {plant.what_to_fly()}"
-        ]
-    remarks, most = [], float(schedule.scale(proposal.throttle[-1]))
-    if most >= schedule.high > 1:
-        remarks.append(
-            f"at {proposal.throttle[-1]:.2f} throttle b0 is at adrc_b0_scale_max, {schedule.high:g}"
-        )
-    if flew and scaled.law != schedule.law:
-        off = scaled.deviations
-        remarks.append(
-            f"adrc_b0_law {schedule.law} stays as it flew: it is off by up to "
-            f"{100 * off[schedule.law]:.0f} %, and {scaled.law} by {100 * off[scaled.law]:.0f} %"
-        )
-    if scaled.extrapolated:
-        remarks.append(
-            f"the hover throttle of {scaled.hover:.2f} lies outside of what was flown, "
-            f"{float(plant.low.min()):.2f} to {float(plant.high.max()):.2f}"
-        )
-    return remarks
 
 
 _PLANTS, _SEED = 100, 77  # of the steps' bands

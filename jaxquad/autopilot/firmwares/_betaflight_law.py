@@ -1,7 +1,7 @@
 """Betaflight's PID, its proposed ADRC, its angle mode, and what changes them in flight."""
 
 import dataclasses
-from typing import ClassVar, Literal, Self, TYPE_CHECKING
+from typing import ClassVar, Literal, TYPE_CHECKING
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
 from jaxquad._core import as_float, broadcast_gain, per_member, require_positive
-from jaxquad.control import Reference
+from jaxquad.control import Reference, Setpoint
 
 from .._filters import Filter, FilterChain, PT2, PT3
 from .._law import (
@@ -123,7 +123,7 @@ class BetaflightRate(RateLoop):
     def gyro_chains(self) -> list[FilterChain]:
         return [self.gyro, FilterChain(self.filters, 1 / self.dt)] if self.filters else [self.gyro]
 
-    def without_gyro_filters(self) -> Self:
+    def without_gyro_filters(self) -> "BetaflightRate":
         return dataclasses.replace(self, gyro=FilterChain(), filters=())
 
 
@@ -192,6 +192,13 @@ class BetaflightPID(BetaflightRate):
 
     def derivative_chain(self, axis: int) -> FilterChain:
         return FilterChain(self.dterm, 1 / self.dt)
+
+    def levelled(self) -> "BetaflightPID":
+        """Inside of an angle loop, the integral is held from a fifth of the speed on."""
+        if self.relax is None:
+            return self
+        relax = dataclasses.replace(self.relax, threshold=0.2 * self.relax.threshold)
+        return dataclasses.replace(self, relax=relax)
 
     def holds_integral(self, axis: int) -> bool:
         return self.relax is not None and float(np.broadcast_to(self.relax.share, (3,))[axis]) > 0
@@ -348,13 +355,10 @@ def adrc_b0(gain: Float[ArrayLike, "..."], lag: Float[ArrayLike, "..."]) -> Floa
 def tpa_factor(
     throttle: Float[ArrayLike, "..."], rate: float = 65.0, breakpoint: float = 0.35
 ) -> Float[Array, "..."]:
-    """Betaflight's throttle PID attenuation: 1 up to the breakpoint, then falling.
+    """Betaflight's throttle PID attenuation at a throttle of 0 to 1.
 
-    **Arguments:**
-
-    - `throttle`: 0 to 1.
-    - `rate`: tpa_rate in percent, at full throttle.
-    - `breakpoint`: (tpa_breakpoint - 1000)/1000.
+    It is 1 up to the `breakpoint`, (tpa_breakpoint - 1000)/1000, then falls by `rate` percent
+    (tpa_rate) at full throttle.
     """
     above = jnp.clip((as_float(throttle) - breakpoint) / (1 - breakpoint), 0.0, 1.0)
     return 1 - rate / 100 * above
@@ -402,18 +406,14 @@ class BetaflightAngle(AngleLoop):
         return FilterChain((PT3(50.0),) if self.smooth is None else self.smooth, 1 / self.dt)
 
     def inner(self) -> BetaflightPID:
-        relax = self.rate.relax
-        if relax is not None:
-            relax = dataclasses.replace(relax, threshold=0.2 * relax.threshold)
-        return dataclasses.replace(self.rate, f=jnp.zeros_like(self.rate.f), relax=relax)
+        return dataclasses.replace(self.rate.levelled(), f=jnp.zeros_like(self.rate.f))
 
     def outer_rest(self, zero: Signal) -> dict[str, PyTree]:
         return {"smooth": self._smooth.init(zero)}
 
     def wanted_rate(
-        self, memory: Memories, reference: Reference, angle: Signal, rate: Signal
+        self, memory: Memories, aim: Setpoint, angle: Signal, rate: Signal
     ) -> tuple[dict[str, PyTree], Signal]:
-        aim, _ = split_reference(reference, angle, self.dt)
         level = broadcast_gain(self.level, angle) / 10
-        smooth, wanted = self._smooth.step(memory["smooth"], level * (aim - angle))
+        smooth, wanted = self._smooth.step(memory["smooth"], level * (aim.angle - angle))
         return {"smooth": smooth}, wanted

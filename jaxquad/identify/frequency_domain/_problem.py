@@ -126,14 +126,7 @@ def make_problem(
 ) -> Problem:
     """The least-squares problem of a fit, under weights of zero: see `Problem.weighted`.
 
-    **Arguments:**
-
-    - `model`, `frfs`, `conditions`, `priors`: as in `jq.fit`.
-    - `parameters`: of `jq.identify.select_parameters`.
-
-    **Raises:**
-
-    - `ValueError`: another number of conditions than of responses, or what is no condition.
+    **Raises:** ValueError for another number of conditions than of responses, or no condition.
     """
     changes = require_conditions(model, conditions, len(frfs))
     numbers = [[prior.value, prior.standard_error] for prior in priors]

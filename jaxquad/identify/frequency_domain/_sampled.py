@@ -165,12 +165,7 @@ class SampledModel(eqx.Module):
 def as_sampled(model: PyTree, frf: FrequencyResponse) -> PyTree:
     """The model whose frequency response is to be compared with a measured one.
 
-    **Arguments:**
-
-    - `model`: with `frequency_response(omega)`.
-    - `frf`: a measured response, which knows how its input was held.
-
-    **Returns:** the model itself, or one whose response has the hold and its aliases.
+    It is the model itself, or one whose response has the hold of the input and its aliases.
     """
     return behind_hold(model, hold_of(frf))
 
@@ -191,16 +186,13 @@ def hold_of(frf: FrequencyResponse) -> float:
 def remarks_on_hold(
     frfs: Sequence[FrequencyResponse], used: Sequence[Bool[np.ndarray, "..."]]
 ) -> list[Message]:
-    """Remark on inputs of which nobody said how they are held, where it would show.
-
-    What is held for a sample loses (w dt)^2 / 24 of its magnitude, beside a delay of half a sample.
-    """
+    """Remark on inputs of which nobody said how they are held, where it would show."""
     for frf, mine in zip(frfs, used, strict=True):
         if frf.hold is not None or not frf.dt or not np.any(mine):
             continue
-        lost = np.broadcast_to(
-            (np.asarray(frf.omega) * frf.dt)[:, None, None] ** 2 / 24, mine.shape
-        )
+        # What a hold takes off the magnitude, beside a delay of half a sample.
+        lost = (np.asarray(frf.omega) * frf.dt)[:, None, None] ** 2 / 24
+        lost = np.broadcast_to(lost, mine.shape)
         over = np.where(mine, lost / np.maximum(np.asarray(frf.random_error), 1e-7), 0.0)
         k = np.unravel_index(np.argmax(over), over.shape)
         if over[k] > 1:

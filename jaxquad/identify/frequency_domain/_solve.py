@@ -210,19 +210,12 @@ def least_squares(
 
     **Arguments:**
 
-    - `residual`: a function of `z` and `args` that returns a vector.
-    - `z0`: where to start. `z` should be relative or logarithmic, so that one unit means the same
-        for all elements.
-    - `args`: passed on to `residual`.
+    - `residual`: a function of `z` and `args` that returns a vector. `z` should be relative or
+        logarithmic, so that one unit means the same for all elements.
     - `solver`: any optimistix least-squares solver, with its own tolerance; `None` for damped
         Gauss-Newton (Levenberg-Marquardt) on the normal equations.
-    - `max_steps`: of the solver.
     - `tolerance`: of the default solver, for steps relative to 1 + |z|.
     - `normal`: a faster way to the normal equations of the same residuals, for the default solver.
-
-    **Returns:**
-
-    `z` where the solver stopped, whether it converged, the reason and the number of steps.
     """
     # Imported late: optimistix doubles the time of `import jaxquad`.
     import optimistix as optx

@@ -51,15 +51,10 @@ def spread_starts(
 
     **Arguments:**
 
-    - `parameters`: of `jq.identify.select_parameters`.
-    - `count`: how many starts.
     - `fastest`: the highest frequency in rad/s.
     - `factor`: how far to spread to both sides, above 1.
-    - `seed`: of the random numbers.
 
-    **Raises:**
-
-    - `ValueError`: no starts, or a factor that spreads nothing.
+    **Raises:** ValueError for no starts, or a factor that spreads nothing.
     """
     if count < 1:
         raise ValueError(f"starts is {count}: give 1 for the given start alone, or more")
@@ -93,21 +88,10 @@ def solve_from_many(
     Starts of the default solver run side by side, those of an optimistix solver one by one, since
     its LAPACK calls can hang under `vmap`.
 
-    **Arguments:**
+    **Returns:** the best solution, a minimum before a lower point that is none; and all distinct
+    points, sorted by cost.
 
-    - `problem`: of `jq.identify.make_problem`.
-    - `starts`: vectors `z`, of `spread_starts`.
-    - `solver`: `None` for the default, or an optimistix least-squares solver.
-    - `max_steps`: of the solver.
-
-    **Returns:**
-
-    The best solution, a minimum before a lower point that is none; and all distinct points, sorted
-    by cost.
-
-    **Raises:**
-
-    - `ValueError`: no start has a finite response.
+    **Raises:** ValueError where no start has a finite response.
     """
     stops = jax.tree.map(np.asarray, _solve_all(problem, np.asarray(starts), solver, max_steps))
     z, status, steps, normal, left, bent = stops

@@ -2,7 +2,7 @@
 
 import dataclasses
 import functools as ft
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Float, PyTree
@@ -155,29 +155,75 @@ def assess(
     parts = [frf.remarks_about(mine) for frf, mine in zip(frfs, used, strict=True) if frf.remarks]
     remarks = list(dict.fromkeys(remark for part in parts for remark in part))
     remarks += remarks_on_hold(frfs, used)
+    # Few points of independent noise reach a large misfit by chance: the discrepancy has to say so,
+    # too.
+    doubted = misfit if budget.discrepancy.none < DOUBT else min(misfit, 1.0)
+
+    def remark(kind: str, text: str) -> None:
+        remarks.append(Message(text, kind))
+
     if not fed_back:
-        saddle = solution.converged and is_saddle(problem, solution, budget.cost, bread)
-        # Few points of independent noise reach a large misfit by chance: the discrepancy has to
-        # say so, too.
-        doubted = misfit if budget.discrepancy.none < DOUBT else min(misfit, 1.0)
+        ran = runaways(problem, solution, verdict)
+        remarks += ran
+        stopped = decrement > 1e-3 * max(cost, _EXACT)
+        if not solution.converged and (stopped or not (ran or cost < _EXACT)):
+            remark("stopped early", f"the solver stopped early: {solution.message}")
+        if stopped:
+            more = "take more steps (max_steps=), or " if solution.message else ""
+            turned = "; the phase is off by about 180 deg: try the other sign of the gain"
+            remark(
+                NO_MINIMUM,
+                f"no minimum: one more Gauss-Newton step would lower the cost, {cost:.4g}, by "
+                f"{2 * decrement:.3g}; {more}«try other starting values»"
+                f"{turned if _is_opposite(problem, solution) else ''}",
+            )
+        if doubted > MISFIT**2:
+            ratio = np.sqrt(doubted)
+            local = ", or this is a local minimum: «try other starting values»"
+            remark(
+                "misfit",
+                f"the misfit is {ratio:.1f} times the random error: the model's structure does not "
+                f"explain the whole response{local if ratio > _POOR else ''}",
+            )
+        # Parameters at zero that the data want to have the other sign, by random errors.
         unbounded, steps = without_bounds(budget.by_noise, budget, zeros)
-        errors = {k: float(np.sqrt(max(unbounded[k, k], 1e-300))) for k in steps}
-        pulls = {names[k]: -optimum / errors[k] for k, optimum in steps.items()}
-        remarks += [
-            *_remarks_on_stop(problem, solution, cost, decrement, verdict),
-            *_remarks_on_misfit(doubted),
-            *_remarks_on_pulls(pulls, verdict),
-            *_remarks_on_growth(solution.model, budget),
-            *_remarks_on_minima(names, saddle, minima),
-            *remarks_on_priors(budget.prior.misfit, verdict, by_data, chi_squared=doubted),
-        ]
+        pulls = {k: -x / float(np.sqrt(max(unbounded[k, k], 1e-300))) for k, x in steps.items()}
+        lost = verdict.undetermined
+        far = {names[k]: x for k, x in pulls.items() if names[k] not in lost and x > _BEYOND}
+        if far:
+            both, real = " and ".join(far), ", ".join(f"jq.identify.Real({name!r})" for name in far)
+            remark(
+                "sign",
+                f"{both} came out as 0, and the data pull {'it' if len(far) == 1 else 'them'} "
+                f"beyond by {max(far.values()):.0f} random errors«other sign|: start with the "
+                f"other sign, or let the sign change with {real}; where that cannot be, the model» "
+                "lacks something, or the time stamps of input and output are shifted",
+            )
+        remarks += _remarks_on_model(solution.model, budget)
+        if solution.converged and is_saddle(problem, solution, budget.cost, bread):
+            remark(
+                "saddle",
+                "stationary, but no minimum: the cost falls to one side; «start from other values»"
+                "«, or give starts=20»",
+            )
+        true = [point for point in minima if point.is_minimum]
+        rivals = [point for point in true[1:] if point.cost <= _RIVAL * true[0].cost]
+        if rivals:
+            values = ", ".join(f"{x:.4g}" for x in rivals[0].values)
+            remark(
+                "other minima",
+                f"{len(rivals)} other minima cost less than {_RIVAL:g} times the best; the next "
+                f"costs {rivals[0].cost:.4g} at {', '.join(names)} = {values}: record more, or "
+                "over a wider band, to know which is right",
+            )
+        remarks += remarks_on_priors(budget.prior.misfit, verdict, by_data, chi_squared=doubted)
         if _LARGE < amplitude <= _NO_MODEL:
-            text = (
+            remark(
+                "discrepancy",
                 f"the model leaves {100 * amplitude:.0f} % of the response unexplained: the "
                 "intervals are rough; fit the part of the band where it holds («band=»), or a "
-                "model that explains more («Fit.explain()» names terms)"
+                "model that explains more («Fit.explain()» names terms)",
             )
-            remarks.append(Message(text, "discrepancy"))
     return make_fit(
         problem,
         solution,
@@ -263,54 +309,7 @@ def _is_opposite(problem: Problem, solution: Solution) -> bool:
     return False
 
 
-def _remarks_on_stop(
-    problem: Problem, solution: Solution, cost: float, decrement: float, verdict: Verdict
-) -> list[Message]:
-    """Runaway parameters and missing convergence."""
-    remarks = runaways(problem, solution, verdict)
-    no_minimum = decrement > 1e-3 * max(cost, _EXACT)
-    if not solution.converged and (no_minimum or not (remarks or cost < _EXACT)):
-        remarks.append(Message(f"the solver stopped early: {solution.message}", "stopped early"))
-    if no_minimum:
-        more = "take more steps (max_steps=), or " if solution.message else ""
-        turned = "; the phase is off by about 180 deg: try the other sign of the gain"
-        text = (
-            f"no minimum: one more Gauss-Newton step would lower the cost, {cost:.4g}, by "
-            f"{2 * decrement:.3g}; {more}«try other starting values»"
-            f"{turned if _is_opposite(problem, solution) else ''}"
-        )
-        remarks.append(Message(text, NO_MINIMUM))
-    return remarks
-
-
-def _remarks_on_misfit(chi_squared: float) -> list[Message]:
-    if not chi_squared > MISFIT**2:
-        return []
-    ratio, local = np.sqrt(chi_squared), ", or this is a local minimum: «try other starting values»"
-    text = (
-        f"the misfit is {ratio:.1f} times the random error: the model's structure does not "
-        f"explain the whole response{local if ratio > _POOR else ''}"
-    )
-    return [Message(text, "misfit")]
-
-
-def _remarks_on_pulls(pulls: Mapping[str, float], verdict: Verdict) -> list[Message]:
-    """Remark on parameters at zero that the data want to have the other sign."""
-    lost = verdict.undetermined
-    far = {name: pull for name, pull in pulls.items() if name not in lost and pull > _BEYOND}
-    if not far:
-        return []
-    names, free = " and ".join(far), ", ".join(f"jq.identify.Real({name!r})" for name in far)
-    text = (
-        f"{names} came out as 0, and the data pull {'it' if len(far) == 1 else 'them'} beyond by "
-        f"{max(far.values()):.0f} random errors«other sign|: start with the other sign, or let the "
-        f"sign change with {free}; where that cannot be, the model» lacks something, or the time "
-        "stamps of input and output are shifted"
-    )
-    return [Message(text, "sign")]
-
-
-def _remarks_on_growth(model: PyTree, budget: ErrorBudget) -> list[Message]:
+def _remarks_on_model(model: PyTree, budget: ErrorBudget) -> list[Message]:
     """Remark on a model that grows within the band of a direct estimate: no open loop does."""
     lags = isinstance(model, LaggedIntegrator) and not np.asarray(model.lag) < 0
     if lags or not any(record.frf.method == "direct" for record in budget.records):
@@ -330,30 +329,6 @@ def _remarks_on_growth(model: PyTree, budget: ErrorBudget) -> list[Message]:
         "its -1/C; name an external reference («references=»)"
     )
     return [Message(text, "growth")]
-
-
-def _remarks_on_minima(
-    names: tuple[str, ...], is_saddle: bool, minima: tuple[Minimum, ...]
-) -> list[Message]:
-    """Remarks on a saddle instead of a minimum, and on other minima of nearly the best cost."""
-    remarks = []
-    if is_saddle:
-        text = (
-            "stationary, but no minimum: the cost falls to one side; «start from other values»"
-            "«, or give starts=20»"
-        )
-        remarks.append(Message(text, "saddle"))
-    true = [point for point in minima if point.is_minimum]
-    rivals = [point for point in true[1:] if point.cost <= _RIVAL * true[0].cost]
-    if rivals:
-        values = ", ".join(f"{x:.4g}" for x in rivals[0].values)
-        text = (
-            f"{len(rivals)} other minima cost less than {_RIVAL:g} times the best; the next costs "
-            f"{rivals[0].cost:.4g} at {', '.join(names)} = {values}: record more, or over a wider "
-            "band, to know which is right"
-        )
-        remarks.append(Message(text, "other minima"))
-    return remarks
 
 
 def remarks_on_priors(

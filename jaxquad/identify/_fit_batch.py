@@ -1,6 +1,7 @@
 """Fits of one model to many responses, in one compiled call."""
 
-from collections.abc import Sequence
+import functools as ft
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
@@ -8,25 +9,26 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Complex, Float, Int, PyTree
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from jaxquad._compile import Jit
+from jaxquad._compile import evaluate_once, Jit
 from jaxquad._core import (
     advance,
     available_cores,
     begin,
     CONVERGED,
     decrement,
+    Normal,
     require_x64,
     RUNNING,
     settle,
     STALLED,
     TOLERANCE,
 )
-from jaxquad.models import evaluate_response, with_arrays
+from jaxquad.models import evaluate_response, StateSpace, with_arrays
 from jaxquad.spectra import FrequencyResponse
 
-from ..frequency_domain._cost import (
+from .frequency_domain._cost import (
     Cost,
     least_coherence,
     MaximumLikelihood,
@@ -37,15 +39,189 @@ from ..frequency_domain._cost import (
     Range,
     usable,
 )
-from ..frequency_domain._fit import check_options
-from ..frequency_domain._parameters import Free, Numbers, Parameters, select_parameters, Tie
-from ..frequency_domain._problem import make_problem
-from ..frequency_domain._result import Fit
-from ..frequency_domain._sampled import behind_hold, hold_of
-from ..frequency_domain._solve import solution_at, stopped_early
-from ..uncertainty._assess import assess
-from ..uncertainty._error_budget import weighting_at
-from ._normal import Batch, Evaluate, evaluates_singly, Member, normal_equations_of
+from .frequency_domain._fit import check_options
+from .frequency_domain._parameters import (
+    Free,
+    Numbers,
+    Parameters,
+    Place,
+    select_parameters,
+    Tie,
+    UNCHANGED,
+)
+from .frequency_domain._problem import make_problem, Problem, problem_normal
+from .frequency_domain._result import Fit
+from .frequency_domain._sampled import behind_hold, hold_of
+from .frequency_domain._solve import solution_at, stopped_early
+from .uncertainty._assess import assess
+from .uncertainty._error_budget import weighting_at
+
+
+class Member(NamedTuple):
+    """What members are fitted to, after the axes of each array that are named here.
+
+    Frequencies are filled up to a length that many records share, with weights of 0.
+    """
+
+    inverse: tuple[Numbers, Numbers]  # frequencies outputs inputs: 1 / measured, real, imaginary
+    weights: Numbers  # frequencies outputs inputs parts
+    factor: tuple[Numbers, Numbers] | None  # frequencies frequencies outputs inputs, a `Mixing`'s
+    across: tuple[Numbers, Numbers] | None = None  # frequencies pairs pairs, of several pairs
+
+
+class Batch(NamedTuple):
+    """One structure and where it is evaluated."""
+
+    model: PyTree
+    parameters: Parameters
+    hold: float  # s
+    omega: Float[Numbers, " frequencies"]
+
+    @property
+    def evaluates_singly(self) -> bool:
+        """Whether members are evaluated one after the other: a `jq.StateSpace` without ties."""
+        return type(self.model) is StateSpace and not self.parameters.ties and not self.hold
+
+
+Active = Bool[Array, " members"]
+Evaluate = Callable[[Float[Array, "parameters members"], Active], Normal]
+
+
+def normal_equations_of(batch: Batch, member: Member) -> Evaluate:
+    """Cost, gradient and Gauss-Newton Hessian of members on the last axis of `member`.
+
+    A `jq.StateSpace` is evaluated one member after the other, without those that are not active:
+    its states are a loop of their own. Any other model of plain arithmetic becomes one kernel, at a
+    quarter of the cost of what evaluates the rest: at all frequencies at once.
+    """
+    if batch.evaluates_singly:
+        return _one_by_one(batch, member)
+    return lambda z, active: _at_all_frequencies(batch, z, member)
+
+
+def _one_by_one(batch: Batch, member: Member) -> Evaluate:
+    # With the members first: transposed once, not at each evaluation.
+    measured = jnp.moveaxis(1 / jax.lax.complex(*member.inverse), (3, 0), (0, 3))
+    weights = jnp.moveaxis(member.weights, (4, 3, 0), (0, 1, 4))
+    factor = across = None
+    if member.factor is not None:
+        factor = tuple(jnp.moveaxis(x, (4, 0, 1), (0, 3, 4)) for x in member.factor)
+    if member.across is not None:
+        across = tuple(jnp.moveaxis(x, -1, 0) for x in member.across)
+    members = (jnp.real(measured), jnp.imag(measured)), weights, factor, across
+
+    def normal(z, member):
+        measured, weights, factor, across = member
+        mixing = None
+        if factor is not None:
+            factor = jax.lax.complex(*factor)
+            across = None if across is None else jax.lax.complex(*across)
+            # Traced, in the place of NumPy's arrays; correlations matter to nothing here.
+            mixing = Mixing(factor, factor, across, across)  # pyright: ignore[reportArgumentType]
+        problem = Problem(
+            model=batch.model,
+            parameters=batch.parameters,
+            conditions=(UNCHANGED,),
+            quantities=(),
+            omega=(batch.omega,),
+            measured=(jnp.moveaxis(jax.lax.complex(*measured), -1, 0),),
+            weights=(jnp.moveaxis(weights, (3, 0), (0, 3)),),
+            prior=np.zeros((0, 2)),
+            aliases=(None,),
+            silent=((),),
+            mixings=(mixing,),
+        )
+        return problem_normal(z, problem)
+
+    def one(parts):
+        active, z, member = parts
+        shapes = jax.eval_shape(normal, z, member)
+        skip = lambda *_: jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
+        return jax.lax.cond(active, normal, skip, z, member)
+
+    def evaluate(z: Float[Array, "parameters members"], active: Active) -> Normal:
+        normals = jax.lax.map(one, (active, z.T, members))
+        return jax.tree.map(lambda x: jnp.moveaxis(x, 0, -1), normals)
+
+    return evaluate
+
+
+def _at_all_frequencies(batch: Batch, z: Array, member: Member) -> Normal:
+    """Frequencies outside and members inside."""
+    members = jax.vmap(ft.partial(_columns, batch), in_axes=(0, None, -1, -1, -1), out_axes=-1)
+    everywhere = evaluate_once(jax.vmap(members, in_axes=(None, 0, 0, 0, 0)))
+    columns = everywhere(list(z), batch.omega, *member.inverse, member.weights)
+    real, imag = map(jnp.stack, zip(*columns, strict=True))
+    if member.factor is not None:
+        factor = jax.lax.complex(*member.factor)
+        mixed = jnp.einsum("fgoib,cgoib->cfoib", factor, jax.lax.complex(real, imag))
+        if member.across is not None:
+            flat = mixed.reshape(*mixed.shape[:2], -1, mixed.shape[-1])
+            turned = jnp.einsum("fpqb,cfqb->cfpb", jax.lax.complex(*member.across), flat)
+            mixed = turned.reshape(mixed.shape)
+        real, imag = jnp.real(mixed), jnp.imag(mixed)
+    points = [part.reshape(len(columns), -1, z.shape[1]) for part in (real, imag)]
+    points = jnp.concatenate(points, axis=1)
+    # All scalar products of the columns in one pass over the points.
+    first, second = np.tril_indices(len(points))
+
+    def add(k, total):
+        point = points[:, k]
+        return total + point[first] * point[second]
+
+    start = jnp.zeros((first.size, points.shape[-1]), points.dtype)
+    products = jax.lax.fori_loop(0, points.shape[1], add, start)
+    n, place = len(points) - 1, np.zeros((len(points), len(points)), int)
+    place[first, second] = place[second, first] = np.arange(first.size)
+    matrix = jnp.stack([products[k] for k in place.reshape(-1)]).reshape(n + 1, n + 1, -1)
+    return Normal(0.5 * matrix[n, n], matrix[n, :n], matrix[:n, :n])
+
+
+def _columns(
+    batch: Batch, z: list[Array], omega: Array, real: Array, imag: Array, weights: Array
+) -> list[tuple[Array, Array]]:
+    """Weighted slopes by each parameter, and then the weighted misfit, at one frequency.
+
+    Each in magnitude and in phase.
+    """
+
+    def response(z):
+        model = behind_hold(_insert(batch.model, batch.parameters, z), batch.hold)
+        return evaluate_response(model, omega[None])[0]
+
+    here, columns = response(z), []
+    for k in range(len(z)):
+        # One parameter at a time: what does not depend on it costs nothing.
+        along = lambda x, k=k: response([*z[:k], x, *z[k + 1 :]])
+        slope = jax.jvp(along, (z[k],), (jnp.ones_like(z[k]),))[1] / here
+        columns.append((jnp.real(slope) * weights[..., 0], jnp.imag(slope) * weights[..., 1]))
+    ratio = here * jax.lax.complex(real, imag)
+    size = jnp.real(ratio) ** 2 + jnp.imag(ratio) ** 2
+    phase = jnp.arctan2(jnp.imag(ratio), jnp.real(ratio))
+    return [*columns, (0.5 * jnp.log(size) * weights[..., 0], phase * weights[..., 1])]
+
+
+def _insert(model: PyTree, parameters: Parameters, z: list[Float[Array, ""]]) -> PyTree:
+    """As `Parameters.insert`, but without a vector that would make each depend on all."""
+    logs, scale = parameters.logarithmic, parameters.scale
+    values = [scale[k] * (jnp.exp(x) if logs[k] else x) for k, x in enumerate(z)]
+    model = _write(model, parameters.places, values)
+    for place, tie in parameters.ties:
+        model = _write(model, (place,), [jnp.asarray(tie(model))])
+    return model
+
+
+def _write(model: PyTree, places: tuple[Place, ...], values: list[Array]) -> PyTree:
+    arrays, rest = eqx.partition(model, eqx.is_inexact_array)
+    leaves, structure = jax.tree.flatten(arrays)
+    for leaf in {place.leaf for place, _ in zip(places, values, strict=False)}:
+        flat = list(leaves[leaf].reshape(-1))
+        for place, value in zip(places, values, strict=False):
+            if place.leaf == leaf:
+                flat[place.index] = value
+        shape = leaves[leaf].shape
+        leaves[leaf] = flat[0] if shape == () else jnp.stack(flat).reshape(shape)
+    return eqx.combine(jax.tree.unflatten(structure, leaves), rest)
 
 
 _CHUNK = 32  # fits side by side
@@ -67,48 +243,16 @@ class BatchSolution(NamedTuple):
 Mixings = Sequence[Mixing | None]
 
 
-def solve_batch(
-    model: PyTree,
-    parameters: Parameters,
-    omega: Float[Numbers, " frequencies"],
-    measured: Complex[Numbers, "batch frequencies outputs inputs"],
-    weights: Float[Numbers, "..."],
-    *,
-    mixings: Mixings = (),
-    start: Float[Numbers, "batch parameters"] | None = None,
-    hold: float = 0.0,
-    max_steps: int = 64,
-    tolerance: float = TOLERANCE,
-) -> BatchSolution:
-    """Fit every response of the batch, by Levenberg-Marquardt.
+def _members(measured: np.ndarray, weights: np.ndarray, mixings: Mixings) -> Member:
+    """What the members are fitted to, which are on the first axis.
 
-    `weights` (batch, frequencies, outputs, inputs, 2) are those of `ln|T/T^|` and of the wrapped
-    phase of `T/T^` in rad, as of `jq.fit`, 0 where a point does not count; `mixings`, one for each
-    member or none at all, take points together that share noise. All start from the model's values,
-    or from `start`. The model is evaluated at all frequencies at once, inputs held for `hold` s
-    (0: not held). A member that did not reach a stationary point has `converged` false, and its
-    decrement says how far it is; one in a local minimum shows by its cost alone.
-    Raises ValueError for shapes that do not match, no batch at all, or a response that at one
-    frequency depends on which others are asked for.
+    `mixings`, one for each member or none at all, take points together that share noise.
     """
-    if measured.shape[0] == 0 or (*measured.shape, 2) != weights.shape:
+    if (*measured.shape, 2) != weights.shape:
         raise ValueError(
             f"measured has shape {measured.shape} and weights {weights.shape}: give at least one "
             "response (batch, frequencies, outputs, inputs), and weights with a last axis of two"
         )
-    omega = np.asarray(omega)
-    where = Batch(model, parameters, hold, _pad(omega))
-    _check_pointwise(where, measured.shape[2:])
-    members = _members(np.asarray(measured), np.asarray(weights), mixings)
-    if start is None:
-        start = np.broadcast_to(
-            parameters.start[: parameters.count], (len(measured), parameters.count)
-        )
-    return _solve_calls(where, members, np.asarray(start), max_steps, tolerance)
-
-
-def _members(measured: np.ndarray, weights: np.ndarray, mixings: Mixings) -> Member:
-    """What the members are fitted to, which are on the first axis."""
     used = np.any(weights > 0, axis=-1)
     # Points that do not count may hold anything, NaN included.
     with np.errstate(invalid="ignore"):
@@ -135,18 +279,13 @@ def _members(measured: np.ndarray, weights: np.ndarray, mixings: Mixings) -> Mem
     return Member(parts, weights, split(factors), split(across) if pairs > 1 else None)
 
 
-def _padded(size: int) -> int:
-    """The frequencies of a program that takes this many: few lengths, few programs."""
-    step = max(8, 1 << max((size - 1).bit_length() - 3, 0))
-    return size + -size % step
-
-
 def _pad(array: np.ndarray, axis: int = 0) -> np.ndarray:
-    """Filled up with the last frequency; the array itself where it is full."""
+    """Filled up with the last frequency: few lengths, few programs. The array where it is full."""
     size = array.shape[axis]
-    if _padded(size) == size:
+    step = max(8, 1 << max((size - 1).bit_length() - 3, 0))
+    if not size % step:
         return array
-    return np.take(array, np.minimum(np.arange(_padded(size)), size - 1), axis)
+    return np.take(array, np.minimum(np.arange(size + -size % step), size - 1), axis)
 
 
 @eqx.filter_jit
@@ -174,9 +313,8 @@ def _places(batch: int, chunk: int) -> Int[np.ndarray, "chunks chunk"]:
     return np.minimum(np.arange(batch + -batch % chunk), batch - 1).reshape(-1, chunk)
 
 
-def _solve_calls(
-    where: Batch, members: Member, start: np.ndarray, max_steps: int, tolerance: float
-) -> BatchSolution:
+def _solve(where: Batch, members: Member, start: np.ndarray, max_steps: int) -> BatchSolution:
+    """Fit every member from its start, by Levenberg-Marquardt."""
     chunks = _CHUNKS if members.factor is None else 1  # factors are large
 
     def solve(places: Int[np.ndarray, "chunks chunk"]) -> BatchSolution:
@@ -188,11 +326,10 @@ def _solve_calls(
             return filled
 
         mine, z0 = jax.tree.map(arrange, (members, start))
-        options = np.asarray(len(places)), np.asarray(max_steps), tolerance
-        parts = _solve_call(where, mine, z0, *options)
+        parts = _solve_call(where, mine, z0, np.asarray(len(places)), np.asarray(max_steps))
         return BatchSolution(*(np.asarray(part)[: places.size] for part in parts))
 
-    places = _places(len(start), _CHUNK_OF_SINGLES if evaluates_singly(where) else _CHUNK)
+    places = _places(len(start), _CHUNK_OF_SINGLES if where.evaluates_singly else _CHUNK)
     count = max(-(-len(places) // chunks), min(len(places), available_cores()))
     calls = np.array_split(places, count)
     if len(calls) > 1:
@@ -205,14 +342,14 @@ def _solve_calls(
 
 
 @Jit
-def _solve_call(where, members, z0, chunks, max_steps, tolerance) -> BatchSolution:
+def _solve_call(where, members, z0, chunks, max_steps) -> BatchSolution:
     """Solve the first `chunks` of the chunks that there is room for."""
 
     def chunk(k):
         mine, start = jax.tree.map(
             lambda x: jax.lax.dynamic_index_in_dim(x, k, keepdims=False), (members, z0)
         )
-        return _descend(normal_equations_of(where, mine), start, max_steps, tolerance)
+        return _descend(normal_equations_of(where, mine), start, max_steps)
 
     def add(k, total):
         return jax.tree.map(lambda out, x: out.at[k].set(x), total, chunk(k))
@@ -224,7 +361,7 @@ def _solve_call(where, members, z0, chunks, max_steps, tolerance) -> BatchSoluti
     return BatchSolution(z, jax.vmap(where.parameters.values)(z), *facts)
 
 
-def _descend(evaluate: Evaluate, z0: Array, max_steps: Array, tolerance: float) -> tuple:
+def _descend(evaluate: Evaluate, z0: Array, max_steps: Array) -> tuple:
     """Where members stop, with the cost, what is left to save, steps, and whether they converged.
 
     As `minimise` does, and with one evaluation at the end, in the same loop: it compiles once.
@@ -236,7 +373,7 @@ def _descend(evaluate: Evaluate, z0: Array, max_steps: Array, tolerance: float) 
         ended = ~jnp.any(active)
         state = state._replace(change=jnp.where(ended, 0.0, state.change))
         normal = evaluate(state.z + state.change, active | ended)
-        return advance(lambda _: normal, state, max_steps, tolerance), normal, ended
+        return advance(lambda _: normal, state, max_steps, TOLERANCE), normal, ended
 
     start = begin(z0)
     walk = start, start.normal, jnp.asarray(False)
@@ -309,10 +446,6 @@ def fit_batch(
     - `frfs`: responses on the same frequencies, with the same channels.
     - `band`: (low, high) in rad/s.
 
-    **Returns:**
-
-    `jq.identify.BatchFit`.
-
     **Raises:**
 
     - `ValueError`: responses on different frequencies or channels, or without a usable frequency.
@@ -360,12 +493,15 @@ def fit_batch(
     weights, mixed = weights_at(np.ones(measured.shape)), isinstance(cost, MaximumLikelihood)
     # Without a floor on the errors, they do not depend on the weights.
     mixings = mixings_of(points, list(weights)) if mixed else ()
-    options = {"mixings": mixings, "hold": holds[0], "max_steps": max_steps}
-    solution = solve_batch(model, parameters, omega, measured, weights, **options)
-    again = weights_at(_ratios(Batch(model, parameters, holds[0], _pad(omega)), measured, solution))
+    where = Batch(model, parameters, holds[0], _pad(omega))
+    _check_pointwise(where, measured.shape[2:])
+    start = parameters.start[: parameters.count]
+    start = np.array(np.broadcast_to(start, (len(measured), parameters.count)))
+    solution = _solve(where, _members(measured, weights, mixings), start, max_steps)
+    again = weights_at(_ratios(where, measured, solution))
     if not np.allclose(weights, again, rtol=1e-4):
         weights, start = again, np.where(np.isfinite(solution.z), solution.z, 0.0)
-        solution = solve_batch(model, parameters, omega, measured, weights, start=start, **options)
+        solution = _solve(where, _members(measured, weights, mixings), start, max_steps)
     return BatchFit(
         parameters.names, *(np.asarray(part) for part in solution[1:]),
         model=model, parameters=parameters, points=tuple(points), weights=weights,
