@@ -26,7 +26,7 @@ _Pairs = Float[np.ndarray, "*groups frequencies outputs inputs"]
 
 
 class Segments(NamedTuple):
-    """Transforms by `Record.names` for each length, in absolute phase, with gaps between records."""
+    """Transforms by `Record.names` for each length, in absolute phase; records have gaps."""
 
     transforms: tuple[Complex[np.ndarray, "frequencies windows channels"], ...]
     slopes: tuple[Slopes, ...]  # empty where they are not needed, or nothing follows from them
