@@ -26,10 +26,7 @@ _Pairs = Float[np.ndarray, "*groups frequencies outputs inputs"]
 
 
 class Segments(NamedTuple):
-    """Transforms of windows for each length, in absolute phase, by the channels of `Record.names`.
-
-    The starts in `groups` are of the records one after the other, with gaps wider than any window.
-    """
+    """Transforms by `Record.names` for each length, in absolute phase; records have gaps."""
 
     transforms: tuple[Complex[np.ndarray, "frequencies windows channels"], ...]
     slopes: tuple[Slopes, ...]  # empty where they are not needed, or nothing follows from them
@@ -64,8 +61,7 @@ class Conditioned(NamedTuple):
 
 
 def condition(products: Products, channels: Channels, counts: Counts) -> Conditioned:
-    """`(Z* X)^-1 Z* Y` from the sums of `conj(a) b` (Bendat & Piersol, ch. 7; Tischler & Remple,
-    ch. 9)."""
+    """`(Z* X)^-1 Z* Y` from sums of `conj(a) b` (Bendat, Piersol ch. 7; Tischler, Remple ch. 9)."""
 
     def inverse(matrix: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
         """That of matrices in any units, which `rows` and `columns` are."""
@@ -97,16 +93,13 @@ def condition(products: Products, channels: Channels, counts: Counts) -> Conditi
     rest = np.maximum(total - explained, 0.0)
     answer = rest[..., None] + through
     count = counts[:, None, None]
+    share = 1 / (least * np.maximum(diagonal(moving), _TINY))
+    moved = np.minimum(diagonal(moving) / np.maximum(power[..., x], _TINY), 1.0)
+    multiple = np.clip(1 - rest / np.maximum(total, _TINY), 0.0, 1.0)
     return Conditioned(
-        response,
-        solver,
-        1 / (least * count),
-        1 / (least * np.maximum(diagonal(moving), _TINY)),
-        answer / count[..., None],
-        through / np.maximum(answer, _TINY),
-        np.minimum(diagonal(moving) / np.maximum(power[..., x], _TINY), 1.0),
-        np.clip(1 - rest / np.maximum(total, _TINY), 0.0, 1.0),
-    )
+        response, solver, 1 / (least * count), share, answer / count[..., None],
+        through / np.maximum(answer, _TINY), moved, multiple,
+    )  # fmt: skip
 
 
 class Combined(NamedTuple):
@@ -258,16 +251,8 @@ def average(
         with np.errstate(divide="ignore", invalid="ignore"):
             return np.stack([added, doubt]) / np.abs(combined.response)
 
+    multiple = np.einsum("fog,gfo->fo", weights, parts.multiple)
     return Averaged(
-        response,
-        coherence,
-        error,
-        direct,
-        np.einsum("fog,gfo->fo", weights, parts.multiple),
-        alone,
-        effect,
-        combined.share,
-        noise,
-        rest.freedom,
-        leakage,
-    )
+        response, coherence, error, direct, multiple, alone, effect, combined.share, noise,
+        rest.freedom, leakage,
+    )  # fmt: skip

@@ -32,7 +32,6 @@ from ._fourier_sums import (
     coefficients,
     fourier_sums,
     lattice_windows,
-    Layout,
     segment_starts,
     Taper,
 )
@@ -71,16 +70,32 @@ def transform_records(
         options = welch.overlap, float(np.max(omega)) * dt
         lengths = tuple(n for n, _ in lattice_windows(min(samples), lengths, *options))
         layouts = [lattice_windows(count, lengths, *options) for count in samples]
-    inputs, outputs = len(first.input_names), len(first.output_names)
+    inputs = len(first.input_names)
+    last = inputs + len(first.output_names)
     counts = [sum(len(mine) for _, mine in groups) for groups in zip(*layouts, strict=True)]
     enough = [shows_leakage(count, inputs) for count in counts]
     start = enough.index(True) if any(enough) else len(counts)
     shape = welch.shape
-    slopes = Taper(f"{shape}'", inputs + outputs, start), Taper(f"{shape}''", inputs, start)
+    slopes = Taper(f"{shape}'", last, start), Taper(f"{shape}''", inputs, start)
     tapers = Taper(shape, len(first.names)), *slopes[:derivatives]
+    n, late, angle = welch.integrators, int(round(welch.delay / dt)), omega * dt
+    factor = np.ones((omega.size, 1, len(first.names)), complex)
+    recolour = np.exp(-1j * (late + n // 2) * angle) / (1 - np.exp(-1j * angle)) ** n
+    factor[:, :, inputs:last] = recolour[:, None, None]
     parts, starts, origin = [], [[] for _ in members], 0
     for record, layout in zip(records, layouts, strict=True):
-        parts.append(_transform_record(record, omega, welch, layout, origin, tapers))
+        # The outputs differenced, and earlier by the delay.
+        outputs = np.diff(record.outputs, n, axis=0)
+        if late:
+            outputs = np.concatenate([outputs[late:], np.repeat(outputs[-1:], late, axis=0)])
+        # A difference delays by n/2 samples, and the window would act on it like on any delay.
+        centre = slice(n - n // 2, record.samples - n // 2)
+        columns = record.inputs[centre], outputs, record.references[centre]
+        options = {"detrend": welch.detrend, "origin": float(origin)}
+        transforms, *derived = fourier_sums(columns, angle, layout, tapers, **options)
+        if n or late:
+            transforms = [part * factor for part in transforms]
+        parts.append([transforms, *derived])
         for mine, (_, local) in zip(starts, layout, strict=True):
             mine += [origin + place for place in local]
         origin += record.samples + max(length for length, _ in layout)
@@ -98,34 +113,6 @@ def transform_records(
     none = Slopes(np.zeros((0, 0, 0), complex), np.zeros((0, 0, 0), complex))
     derived = tuple(map(Slopes, *slopes)) if derivatives else ()
     return Segments(joined, (none,) * (len(joined) - len(derived)) + derived, groups)
-
-
-def _transform_record(
-    record: Record,
-    omega: Grid,
-    welch: Welch,
-    layout: Layout,
-    origin: int,
-    tapers: tuple[Taper, ...],
-) -> list[list[Complex[np.ndarray, "frequencies _ _"]]]:
-    """By taper and then by length; the outputs differenced, and earlier by the delay."""
-    n, late = welch.integrators, int(round(welch.delay / record.dt))
-    outputs = np.diff(record.outputs, n, axis=0)
-    if late:
-        outputs = np.concatenate([outputs[late:], np.repeat(outputs[-1:], late, axis=0)])
-    # A difference delays by n/2 samples, and the window would act on it like on any delay.
-    centre = slice(n - n // 2, record.samples - n // 2)
-    columns, angle = (record.inputs[centre], outputs, record.references[centre]), omega * record.dt
-    transforms, *slopes = fourier_sums(
-        columns, angle, layout, tapers, detrend=welch.detrend, origin=float(origin)
-    )
-    if n or late:
-        factor = np.ones((omega.size, len(record.names)), complex)
-        first = len(record.input_names)
-        recolour = np.exp(-1j * (late + n // 2) * angle) / (1 - np.exp(-1j * angle)) ** n
-        factor[:, first : first + record.outputs.shape[1]] = recolour[:, None]
-        transforms = [part * factor[:, None] for part in transforms]
-    return [transforms, *slopes]
 
 
 def frequencies_for(
@@ -203,18 +190,13 @@ def average_windows(
     errors = ErrorCovariance(
         omega, averaged.effect, averaged.noise, averaged.share, windows, counts
     )
+    log_noise = smoothed(omega, noise, np.sum(weights * freedom, axis=1))
     return Estimate(
-        omega,
-        averaged.response,
-        averaged.coherence,
-        averaged.direct_coherence,
-        averaged.multiple_coherence,
-        errors,
-        averaged.random_error,
-        smoothed(omega, noise, np.sum(weights * freedom, axis=1)),
+        omega, averaged.response, averaged.coherence, averaged.direct_coherence,
+        averaged.multiple_coherence, errors, averaged.random_error, log_noise,
         ft.partial(_remarks, first, omega, averaged, float(np.max(independent))),
         resolution=2 * np.pi / (lengths[0] * dt),
-    )
+    )  # fmt: skip
 
 
 def _remarks(
@@ -342,25 +324,15 @@ _OFTEN = 0.5  # share of the windows
 
 
 class SpectralLine(NamedTuple):
-    """The strongest narrow line of a channel, as `find_line` returns it.
+    """The strongest narrow line of a channel, as `find_line` returns it."""
 
-    **Attributes:**
-
-    - `omega`: rad/s, median of the windows in which it stands out.
-    - `low`, `high`: rad/s, between which it lies in 90 % of these windows.
-    - `height`: dB above its surroundings, median.
-    - `share`: of the windows in which it stands out.
-    - `harmonics`: which multiples of it stand out, too.
-    - `follows`: rank correlation with another channel, -1 to 1; nan without one.
-    """
-
-    omega: float
-    low: float
+    omega: float  # rad/s, median of the windows in which it stands out
+    low: float  # rad/s; it lies between this and `high` in 90 % of these windows
     high: float
-    height: float
-    share: float
-    harmonics: tuple[int, ...]
-    follows: float
+    height: float  # dB above its surroundings, median
+    share: float  # of the windows in which it stands out
+    harmonics: tuple[int, ...]  # which multiples of it stand out, too
+    follows: float  # rank correlation with another channel, -1 to 1; nan without one
 
 
 def find_line(
