@@ -374,9 +374,9 @@ def frequency_response(
         print(response)
         ```
     """
+    from ._average import average_windows
     from ._local_polynomial import estimate_local_polynomial
     from ._periodic import estimate_periodic
-    from ._welch import average_windows
 
     require_x64("a frequency response")
     records = [record] if isinstance(record, Record) else list(record)

@@ -73,8 +73,7 @@ def remarks_on_linearity(
         tones = []
         for record in records:
             u = record.inputs[: fast_length(record.samples), i]
-            source = u if method == "direct" else record.references[: u.size, i]
-            swept = phase_of_sweep(source)
+            swept = phase_of_sweep(u if method == "direct" else record.references[: u.size, i])
             if swept is None:
                 tones = []
                 break

@@ -217,13 +217,6 @@ def _shared_power(shape: str, length: int, angle: tuple[float, ...]) -> Square:
     return (correlation / terms[0]) ** 2
 
 
-class Slopes(NamedTuple):
-    """Transforms behind the derivatives of the windows of one length."""
-
-    first: Complex[np.ndarray, "frequencies _ channels"]  # derivative: inputs, then outputs
-    second: Complex[np.ndarray, "frequencies _ inputs"]
-
-
 class Rest(NamedTuple):
     """What is left of the outputs' windows: sums of `conj(a) b`, and the energy of unit noise."""
 
@@ -270,7 +263,7 @@ def shows_leakage(windows: int, inputs: int) -> bool:
 def without_leakage(
     windows: Sequence[tuple[np.ndarray, np.ndarray]],
     response: Responses,
-    slopes: Sequence[Slopes],
+    slopes: Sequence[tuple[np.ndarray, np.ndarray]],
     overlap: Overlap,
     resolved: Resolved,
 ) -> Rest:

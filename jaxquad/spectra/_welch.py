@@ -1,7 +1,5 @@
 """Responses and spectral densities by averages over windows: one length, or several (Composite)."""
 
-import functools as ft
-import itertools
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -14,40 +12,38 @@ from jaxtyping import Array, ArrayLike, Complex, Float
 from jaxquad._core import Message, one_blas_thread, require_x64
 from jaxquad.records import Record
 
-from ._average import average, Averaged, Channels, Segments
-from ._error_covariance import ErrorCovariance, place_windows
 from ._estimators import (
     adjoint,
     check_band,
     check_compatible,
-    check_excitation,
-    Composite,
     Grid,
     in_hertz,
-    Method,
-    Remark,
     Welch,
 )
 from ._fourier_sums import (
     coefficients,
     fourier_sums,
     lattice_windows,
+    Layout,
     segment_starts,
     Taper,
 )
-from ._frequency_response import Estimate
-from ._noise import covariance_of_windows, shows_leakage, Slopes, smoothed
+from ._noise import shows_leakage
 
 
-_ROUNDING = 1e-14  # of a Fourier sum, relative to the largest value summed
-_CORRELATED = 0.5  # average coherence of inputs above which Tischler & Remple, ch. 9, warn
-_LOST = 0.9999
-_LEAKED = 3.0  # bias over random error, averaged over a third of an octave, that is remarked
-_AVERAGED = 0.2  # in ln(omega)
-_FEW = (
-    "only {count:.1f} independent windows: the coherence is near 1 for any signals, and the error "
-    "bars are rough. Record longer, or use a shorter window"
-)
+class Slopes(NamedTuple):
+    """Transforms behind the derivatives of the windows of one length."""
+
+    first: Complex[np.ndarray, "frequencies _ channels"]  # derivative: inputs, then outputs
+    second: Complex[np.ndarray, "frequencies _ inputs"]
+
+
+class Segments(NamedTuple):
+    """Transforms by `Record.names` for each length, in absolute phase; records have gaps."""
+
+    transforms: tuple[Complex[np.ndarray, "frequencies windows channels"], ...]
+    slopes: tuple[Slopes, ...]  # empty where they are not needed, or nothing follows from them
+    groups: Layout
 
 
 def transform_records(
@@ -144,104 +140,6 @@ def frequencies_for(
             f"longer than {2 * np.pi / omega[0]:.4g} s"
         )
     return omega
-
-
-@one_blas_thread()
-def average_windows(
-    records: Sequence[Record], omega: Grid | None, spectra: Welch | Composite, method: Method
-) -> Estimate:
-    """Response by averages over tapered windows of one or several lengths."""
-    single = isinstance(spectra, Welch)
-    members = (spectra,) if single else spectra.windowed(records, omega)
-    omega, welch = frequencies_for(omega, records, members[0]), members[0]
-    segments = transform_records(records, omega, members, derivatives=2)
-    first, dt, groups = records[0], records[0].dt, segments.groups
-    instruments = len(first.reference_names) if method == "joint" else 0
-    channels = Channels(len(first.input_names), len(first.output_names), instruments)
-    lengths = [length for length, _ in groups]
-    independent = sum(record.samples for record in records) / np.array(lengths)  # n_d
-    sums = np.stack([adjoint(part) @ part for part in segments.transforms])
-    for count, (_, starts) in zip(independent, groups, strict=True):
-        if len(starts) <= channels.inputs or count < channels.inputs:
-            raise ValueError(
-                f"{count:.1f} independent windows are too few for {channels.inputs} inputs: use "
-                f"a window shorter than 1/{channels.inputs + 2} of the record, or record longer"
-            )
-    # Mean power of the inputs and of the instruments, in the longest windows.
-    power = np.real(np.diagonal(sums[0], axis1=1, axis2=2)) / len(groups[0][1])
-    largest = check_excitation(records, method)
-    for name in first.input_names + first.reference_names[:instruments]:
-        place = first.names.index(name)
-        least = _ROUNDING * coefficients(welch.shape)[0] * welch.length(records) * largest[place]
-        lost = np.flatnonzero(~(np.sqrt(power[:, place]) > least))
-        if lost.size:
-            raise ValueError(
-                f"no excitation at {in_hertz(omega[lost[:1]])}: the spectrum of {name!r} is zero "
-                "there. Keep the frequencies within the band that was excited"
-            )
-    options = channels, omega, dt, welch.shape, independent
-    averaged = average(segments, sums, *options)
-    weights = np.mean(averaged.share, axis=(1, 2))
-    freedom = np.mean(averaged.freedom, axis=1)
-    levels = weights / np.sqrt(freedom)
-    noise = covariance_of_windows(omega * dt, levels, welch.shape, tuple(lengths))
-    windows = place_windows(groups, welch.shape, dt, omega[-1] - omega[0])
-    counts = tuple(len(starts) for _, starts in groups)
-    errors = ErrorCovariance(
-        omega, averaged.effect, averaged.noise, averaged.share, windows, counts
-    )
-    log_noise = smoothed(omega, noise, np.sum(weights * freedom, axis=1))
-    return Estimate(
-        omega, averaged.response, averaged.coherence, averaged.direct_coherence,
-        averaged.multiple_coherence, errors, averaged.random_error, log_noise,
-        ft.partial(_remarks, first, omega, averaged, float(np.max(independent))),
-        resolution=2 * np.pi / (lengths[0] * dt),
-    )  # fmt: skip
-
-
-def _remarks(
-    record: Record, omega: Grid, averaged: Averaged, independent: float
-) -> tuple[Remark, ...]:
-    """On inputs that are alike, on leakage, and on few windows."""
-    remarks, names = [], record.input_names
-    coherence = 1 - np.nan_to_num(averaged.alone)  # of each input with all others
-    for i, name in enumerate(names if len(names) > 1 else ()):
-        lost = coherence[:, i] > _LOST
-        if np.any(lost):
-            text = (
-                f"input {name} cannot be separated from the other inputs {{where}}; they are left "
-                "out. Excite the inputs independently, one after the other or with interleaved "
-                "multisines"
-            )
-            remarks.append(Remark(text, omega[lost], kind="undetermined"))
-        elif np.mean(coherence[:, i]) > _CORRELATED:
-            text = (
-                f"input {name} is correlated with the other inputs: their average coherence is "
-                f"{coherence[:, i].mean():.2f} (limit {_CORRELATED}), so the errors of conditioned "
-                f"responses are larger. Excite the inputs independently"
-            )
-            remarks.append(Remark(text, kind="correlated inputs"))
-    # Pairs whose response leakage biases, clearly and beyond the random error.
-    kernel = np.exp(-0.5 * (np.log(omega[:, None] / omega) / _AVERAGED) ** 2)
-    bias, doubt = averaged.leakage()
-    least = np.maximum(doubt, averaged.random_error)
-    with np.errstate(invalid="ignore"):
-        ratio = np.where(np.isfinite(least) & np.isfinite(bias), bias / least, 0.0)
-    for (o, output), (i, source) in itertools.product(
-        enumerate(record.output_names), enumerate(names)
-    ):
-        leaked = kernel @ ratio[:, o, i] ** 2 > _LEAKED**2 * np.sum(kernel, axis=1)
-        if np.any(leaked):
-            text = (
-                f"leakage through the window biases the response by about "
-                f"{100 * np.median(bias[leaked, o, i]):.2g} % {{where}}; the random error does not "
-                "include it. Use «jq.spectra.LocalPolynomial()», which estimates leakage, a longer "
-                "window, or «integrators=» where the plant integrates"
-            )
-            remarks.append(Remark(text, omega[leaked], (output, source), "leakage"))
-    if independent < 3:
-        remarks.append(Remark(_FEW.format(count=independent), kind="few windows"))
-    return tuple(remarks)
 
 
 class SpectralDensity(eqx.Module):
