@@ -20,7 +20,7 @@ from jaxtyping import Array, Complex, Float
 
 import jaxquad as jq
 from jaxquad import design as jd
-from jaxquad._core._arrays import as_float
+from jaxquad._core import as_float
 
 
 jq.enable_x64()

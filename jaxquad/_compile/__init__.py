@@ -4,19 +4,17 @@ What knows XLA, MLIR and CUDA is `jaxquad._xla`, which nothing else imports. Wit
 is the same, by plain scans. See docs/compilers.md.
 """
 
-from ._compile_cache import (
-    enable_compile_cache as enable_compile_cache,
-    share_programs as share_programs,
-)
 from ._door import (
     brief_options as brief_options,
     compiler_options as compiler_options,
+    enable_compile_cache as enable_compile_cache,
     Engine as Engine,
     engine as engine,
     evaluate_once as evaluate_once,
     FEW as FEW,
     hasty_options as hasty_options,
     no_fuse as no_fuse,
+    share_programs as share_programs,
 )
 from ._programs import Jit as Jit, KeptPrograms as KeptPrograms
 from ._scan import (

@@ -43,14 +43,9 @@ class Queue(NamedTuple):
 
 
 def scan_members(
-    step: Step,
-    carry: PyTree,
-    parts: PyTree,
-    signals: PyTree,
-    *,
-    members: int | None = None,
+    step: Step, carry: PyTree, parts: PyTree, signals: PyTree, *, members: int | None = None,
     queue: Queue | None = None,
-) -> tuple[PyTree, PyTree]:
+) -> tuple[PyTree, PyTree]:  # fmt: skip
     """`jax.lax.scan` of `step(carry, parts, now)`: the last carry, and what each sample stored.
 
     A CPU runs it as one kernel, and an NVIDIA GPU the loop of an ensemble, where the compilers can
@@ -156,14 +151,9 @@ _WIDEST = 4095  # numbers of an array in a kernel
 
 
 def run_ensemble(
-    step: Callable[[PyTree, PyTree, PyTree], tuple[PyTree, PyTree]],
-    carry: PyTree,
-    parts: PyTree,
-    signals: PyTree,
-    *,
-    of_members: PyTree,
-    chunk: int | None = None,
-) -> tuple[PyTree, PyTree]:
+    step: Callable[[PyTree, PyTree, PyTree], tuple[PyTree, PyTree]], carry: PyTree, parts: PyTree,
+    signals: PyTree, *, of_members: PyTree, chunk: int | None = None,
+) -> tuple[PyTree, PyTree]:  # fmt: skip
     """`jax.lax.scan` of an ensemble of loops: the last carry, and what each sample left.
 
     On a CPU each chunk of members is one compiled kernel, if it is plain arithmetic. Other devices

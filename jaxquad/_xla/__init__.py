@@ -3,9 +3,10 @@
 `jaxquad._compile` is the only one that imports it; its `_plain.py` has the same names without it.
 """
 
-from ._fusion import evaluate_once as evaluate_once, no_fuse as no_fuse
 from ._kernel import (
     as_one_kernel as as_one_kernel,
+    evaluate_once as evaluate_once,
+    no_fuse as no_fuse,
     or_plain as or_plain,
     scan_on_device as scan_on_device,
     why_no_device_kernels as why_no_device_kernels,

@@ -1,4 +1,4 @@
-"""A whole time loop as one compiled kernel on a CPU.
+"""A whole time loop as one compiled kernel on a CPU, and expensive operations computed once.
 
 XLA's CPU runtime dispatches every small operation of a loop by itself, which costs more than the
 arithmetic of one vehicle does. A call with two attributes becomes one kernel instead. They are
@@ -6,17 +6,20 @@ internal to XLA, so they are used only where the installed version is known to t
 goes in is bounded; all else is compiled as any other program.
 """
 
-from collections.abc import Callable, Iterator
-from typing import TypeGuard
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, TypeGuard
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax.extend.core import Primitive
+import numpy as np
+from jax.experimental.xla_metadata import set_xla_metadata
+from jax.extend.core import Jaxpr, JaxprEqn, Literal, Primitive
 from jax.extend.mlir import ir
 from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array, PyTree
 
+from . import _switch
 from ._stablehlo import (
     ATTRIBUTE,
     calls_within,
@@ -27,18 +30,7 @@ from ._stablehlo import (
     text,
     why_not,
 )
-from ._switch import (
-    device_kernels,
-    is_off,
-    MOST_CELLS,
-    note,
-    plain_loops,
-    Result,
-    Scan,
-    Step,
-    warn_once,
-)
-from ._trial import why_no_trust_in_gpu, why_not_trusted
+from ._switch import device_kernels, is_off, MOST_CELLS, note, plain_loops, Result, Scan, Step
 
 
 def as_one_kernel(function: Callable[..., PyTree], *args: PyTree) -> PyTree:
@@ -65,7 +57,7 @@ def why_no_kernels() -> str | None:
         return f"the platform is {jax.default_backend()}, and kernels are for CPUs"
     if device_kernels.value != "auto":
         return "kernels of a GPU are being tried"
-    return why_not_trusted()
+    return _switch.why_not_trusted()
 
 
 def why_plain() -> str | None:
@@ -96,7 +88,7 @@ def or_plain(name: str, kind: Callable[[], object], run: Callable[[], PyTree]) -
             result = run()  # If the kernel is not at fault, this raises too.
         _failed.add(kind())
         reason = str(error).strip().splitlines()[0][:200]
-        warn_once(f"{name} did not compile as one kernel ({reason})")
+        _switch.warn_once(f"{name} did not compile as one kernel ({reason})")
         return result
 
 
@@ -112,9 +104,9 @@ def why_no_device_kernels() -> str | None:
         return None
     if jax.default_backend() != "gpu":
         return f"the platform is {jax.default_backend()}, and these kernels are for GPUs"
-    reason = why_no_trust_in_gpu()
+    reason = _switch.why_no_trust_in_gpu()
     if reason is not None:
-        warn_once(reason)
+        _switch.warn_once(reason)
     return reason
 
 
@@ -165,7 +157,9 @@ def _tag(ctx: mlir.LoweringRuleContext, x: ir.Value) -> list[ir.Value]:
             for kernel in (call, *_forward_passes(call, program)):
                 _make_kernel(kernel, program)
     except Exception as error:  # The compiler's interfaces have changed: do without the kernel.
-        warn_once(f"JAX {jax.__version__} cannot mark a kernel ({type(error).__name__}: {error})")
+        _switch.warn_once(
+            f"JAX {jax.__version__} cannot mark a kernel ({type(error).__name__}: {error})"
+        )
     return [x]
 
 
@@ -174,10 +168,8 @@ def _owner(x: ir.Value) -> Op | ir.Block:
 
 
 def _forward_passes(call: Op, program: mlir.ModuleContext) -> Iterator[Op]:
-    """The calls whose results a call takes, without their marks where nothing else was asked of.
-
-    What is in a function takes them as its arguments; its forward pass is in one written before.
-    """
+    """The calls whose results a call takes. What is in a function takes them as its arguments; its
+    forward pass is in one written before."""
     owners = [_owner(operand) for operand in call.operands]
     yield from filter(_is_plain_call, owners)
     alone = isinstance(program.axis_context, mlir.ShardingContext)  # then all functions are for one
@@ -229,3 +221,113 @@ def _is_for_one_cpu(program: mlir.ModuleContext) -> bool:
 
 mlir.register_lowering(enter, lambda ctx, x: [x])
 mlir.register_lowering(leave, _tag, cacheable=False)
+
+
+# Expensive operations computed once: what a CPU's compiler fuses, it computes for each user anew.
+#
+# Derivatives share exponentials and quotients with the response. Fused into ten outputs, each of
+# them computes them again.
+
+Value = Any  # an array, or the number of a literal
+
+
+def no_fuse(function: Callable[..., PyTree], *args: PyTree) -> PyTree:
+    """`function(*args)` as a call that the CPU's compiler does not fuse with what is around it."""
+
+    def run(*args: PyTree) -> PyTree:
+        with set_xla_metadata(inlineable="true"):  # `jnp.where` and its like are calls themselves
+            return function(*args)
+
+    with set_xla_metadata(inlineable="false"):
+        return jax.jit(run)(*args)
+
+
+_COSTLY = {"exp", "log", "sin", "cos", "tan", "div", "atan2", "sqrt", "rsqrt", "pow", "tanh"}
+_INLINED = {"jit": "jaxpr", "pjit": "jaxpr", "closed_call": "call_jaxpr"}
+_LARGE = 1024  # elements, from which on no call costs more than recomputing
+
+
+def evaluate_once(function: Callable[..., PyTree], *, least: int) -> Callable[..., PyTree]:
+    """See the door's, `jaxquad._compile.evaluate_once`."""
+    if jax.default_backend() != "cpu":
+        return function
+
+    def run(*args: PyTree) -> PyTree:
+        leaves, structure = jax.tree.flatten(args)
+        flat = lambda *xs: function(*jax.tree.unflatten(structure, xs))
+        closed, shape = jax.make_jaxpr(flat, return_shape=True)(*leaves)
+        values = _Evaluation(least).evaluate(closed.jaxpr, closed.consts, leaves)
+        return jax.tree.unflatten(jax.tree.structure(shape), values)
+
+    return run
+
+
+class _Evaluation:
+    """Evaluates jaxprs, and remembers what it has computed: slopes by different parameters were
+    traced apart, and what they share has to be found again."""
+
+    def __init__(self, least: int):
+        self.least, self.computed = least, dict[tuple, tuple[Sequence[Value], list[Value]]]()
+
+    def evaluate(self, jaxpr: Jaxpr, consts: Sequence[Value], args: Sequence[Value]) -> list[Value]:
+        values = dict(zip(jaxpr.constvars, consts, strict=True))
+        values.update(zip(jaxpr.invars, args, strict=True))
+        read = lambda var: var.val if isinstance(var, Literal) else values[var]
+        for equation in jaxpr.eqns:
+            results = self._apply(equation, [read(var) for var in equation.invars])
+            values.update(zip(equation.outvars, results, strict=True))
+        return [read(var) for var in jaxpr.outvars]
+
+    def _apply(self, equation: JaxprEqn, args: list[Value]) -> list[Value]:
+        name, params = equation.primitive.name, equation.params
+        sizes = [getattr(var.aval, "size", 0) for var in equation.outvars]
+        if name in _INLINED:
+            inner = params[_INLINED[name]]
+            is_marked = (equation.ctx.xla_metadata or {}).get("inlineable") == "false"
+            if is_marked and max(sizes) >= _LARGE:  # by `no_fuse`, and longer than a call
+                return self._remembered(("call", id(inner)), args, lambda: _bind(equation, args))
+            return self.evaluate(inner.jaxpr, inner.consts, args)
+        if equation.primitive.multiple_results:
+            return _bind(equation, args)
+
+        def compute() -> list[Value]:
+            if sizes[0] < self.least:
+                return _bind(equation, args)
+            if name == "div" and jnp.iscomplexobj(args[1]):
+                return [args[0] * self._reciprocal(args[1])]
+            if name == "integer_pow" and params["y"] < 0 and jnp.iscomplexobj(args[0]):
+                return [jax.lax.integer_pow(self._reciprocal(args[0]), -params["y"])]
+            if name in _COSTLY:
+                return [no_fuse(lambda *xs: _bind(equation, xs)[0], *args)]
+            return _bind(equation, args)
+
+        return self._remembered((name, str(params)), args, compute)
+
+    def _remembered(
+        self, what: tuple, args: Sequence[Value], compute: Callable[[], list[Value]]
+    ) -> list[Value]:
+        key = (*what, *map(_key_of, args))
+        if key not in self.computed:
+            self.computed[key] = args, compute()  # holding the arguments keeps their ids their own
+        return self.computed[key][1]
+
+    def _reciprocal(self, value: Value) -> Value:
+        def reciprocal(value: Value) -> Value:
+            squared = jnp.real(value) ** 2 + jnp.imag(value) ** 2
+            return jax.lax.complex(jnp.real(value) / squared, -jnp.imag(value) / squared)
+
+        return self._remembered(("reciprocal",), [value], lambda: [no_fuse(reciprocal, value)])[0]
+
+
+def _key_of(arg: Value) -> Value:
+    # Literals are new objects at every place where they stand.
+    is_number = isinstance(arg, np.ndarray | np.generic) and arg.ndim == 0
+    return (str(arg.dtype), repr(arg.item())) if is_number else id(arg)
+
+
+def _bind(equation: JaxprEqn, args: Sequence[Value]) -> list[Value]:
+    bound = equation.primitive.get_bind_params(equation.params)
+    functions, params = bound if isinstance(bound, tuple) else ((), bound)  # before jax 0.10, both
+    with equation.ctx.manager:  # without it `no_fuse` would be lost
+        results = equation.primitive.bind(*functions, *args, **params)
+    return list(results) if equation.primitive.multiple_results else [results]

@@ -10,7 +10,6 @@ The members' axis is kept as one of length 1, so that axes have the same numbers
 sum over it is allowed, it stays undone: the result has each member's share of it.
 """
 
-import functools as ft
 import math
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -81,9 +80,11 @@ class Lanes:
         name, params = equation.primitive.name, equation.params
         if name in CALLS:
             called = params[CALLS[name]]
-            in_its_place = _known_function(called)
-            if in_its_place:
-                return [self._of_lanes(operation, *args) for operation in in_its_place]
+            first = called.eqns[0] if called.eqns else None
+            if first is not None and first.primitive.name == "name":
+                # What a kernel computes in place of a function, which tells its name first.
+                if in_its_place := FUNCTIONS.get(first.params["name"], ()):
+                    return [self._of_lanes(operation, *args) for operation in in_its_place]
             return self.call(called, args)
         if name in _KEPT:
             return args
@@ -135,14 +136,6 @@ class Lanes:
 
     def is_members(self, shape: Shape, axis: int | np.integer) -> bool:
         return shape[axis] == self.members
-
-
-def _known_function(jaxpr: ClosedJaxpr | Jaxpr) -> tuple[Primitive, ...]:
-    """What a kernel computes in place of a function, which tells its name first."""
-    first = jaxpr.eqns[0] if jaxpr.eqns else None
-    if first is None or first.primitive.name != "name":
-        return ()
-    return FUNCTIONS.get(first.params["name"], ())
 
 
 def numbers(shape: Shape, members: int) -> int:
@@ -253,15 +246,12 @@ def _transpose(lanes: Lanes, equation: JaxprEqn, x: Cells) -> Cells:
 
 @_rule("rev")
 def _reverse(lanes: Lanes, equation: JaxprEqn, x: Cells) -> Cells:
-    axes = equation.params["dimensions"]
-    _keep_apart(lanes, equation, axes)
-    return np.flip(x, axes)
+    return np.flip(x, _other_axes(lanes, equation, equation.params["dimensions"]))
 
 
 @_rule("concatenate")
 def _concatenate(lanes: Lanes, equation: JaxprEqn, *parts: Cells) -> Cells:
-    axis = equation.params["dimension"]
-    _keep_apart(lanes, equation, (axis,))
+    [axis] = _other_axes(lanes, equation, (equation.params["dimension"],))
     lanes.small(_result(equation))
     return np.concatenate(parts, axis)
 
@@ -274,15 +264,13 @@ def _stack(lanes: Lanes, equation: JaxprEqn, *parts: Cells) -> Cells:
 
 @_rule("unstack")
 def _unstack(lanes: Lanes, equation: JaxprEqn, x: Cells) -> list[Cells]:
-    axis = equation.params["axis"]
-    _keep_apart(lanes, equation, (axis,))
+    [axis] = _other_axes(lanes, equation, (equation.params["axis"],))
     return [as_cells(part) for part in np.moveaxis(x, axis, 0)]
 
 
 @_rule("split")
 def _split(lanes: Lanes, equation: JaxprEqn, x: Cells) -> list[Cells]:
-    axis = equation.params["axis"]
-    _keep_apart(lanes, equation, (axis,))
+    [axis] = _other_axes(lanes, equation, (equation.params["axis"],))
     return np.split(x, np.cumsum(equation.params["sizes"])[:-1], axis)
 
 
@@ -366,7 +354,7 @@ def _empty(lanes: Lanes, equation: JaxprEqn) -> Cells:
 def _reduce(lanes: Lanes, equation: JaxprEqn, x: Cells) -> Cells:
     name, axes = equation.primitive.name, equation.params["axes"]
     if not (lanes.leave_sums and name == "reduce_sum"):
-        _keep_apart(lanes, equation, axes)
+        _other_axes(lanes, equation, axes)
     kept = [axis for axis in range(x.ndim) if axis not in axes]
     shape = tuple(x.shape[axis] for axis in kept)
     rows = x.transpose(*kept, *axes).reshape(math.prod(shape), -1)
@@ -375,8 +363,7 @@ def _reduce(lanes: Lanes, equation: JaxprEqn, x: Cells) -> Cells:
 
 @_rule("cumsum")
 def _accumulate(lanes: Lanes, equation: JaxprEqn, x: Cells) -> Cells:
-    axis, out = equation.params["axis"], np.empty_like(x)
-    _keep_apart(lanes, equation, (axis,))
+    [axis], out = _other_axes(lanes, equation, (equation.params["axis"],)), np.empty_like(x)
     turned = (lambda a: np.flip(a, axis)) if equation.params["reverse"] else (lambda a: a)
     rows, totals = (np.moveaxis(turned(a), axis, 0) for a in (x, out))
     for k, row in enumerate(rows):
@@ -391,7 +378,7 @@ def _accumulate(lanes: Lanes, equation: JaxprEqn, x: Cells) -> Cells:
 def _dot(lanes: Lanes, equation: JaxprEqn, a: Cells, b: Cells) -> Cells:
     (shared_a, shared_b), (batch_a, batch_b) = equation.params["dimension_numbers"]
     if not lanes.leave_sums:
-        _keep_apart(lanes, equation, shared_a)
+        _other_axes(lanes, equation, shared_a)
     kind = equation.outvars[0].aval.dtype  # pyright: ignore[reportAttributeAccessIssue]
     a, free_a = _matrices(a, batch_a, shared_a)
     b, free_b = _matrices(b, batch_b, shared_b)
@@ -420,14 +407,13 @@ def _cond(lanes: Lanes, equation: JaxprEqn, index: Cells, *args: Cells) -> list[
     chosen = branches[0]
     for k, branch in enumerate(branches[1:], 1):
         takes = choice if choice.dtype == bool else jax.lax.ge(choice, choice.dtype.type(k))
-        pick = ft.partial(_choose, takes)
-        chosen = [pick(new, old) for new, old in zip(branch, chosen, strict=True)]
+        selected = []
+        for new, old in zip(branch, chosen, strict=True):
+            pairs = zip(new.reshape(-1), old.reshape(-1), strict=True)
+            row = [jax.lax.select(takes, *pair) for pair in pairs]
+            selected.append(cells_of(row, new.shape))
+        chosen = selected
     return chosen
-
-
-def _choose(takes: Lane, new: Cells, old: Cells) -> Cells:
-    pairs = zip(new.reshape(-1), old.reshape(-1), strict=True)
-    return cells_of([jax.lax.select(takes, *pair) for pair in pairs], new.shape)
 
 
 @_rule("scan")
@@ -435,7 +421,12 @@ def _scan(lanes: Lanes, equation: JaxprEqn, *args: Cells) -> list[Cells]:
     """A loop of a few iterations, one after the other."""
     params, length = equation.params, equation.params["length"]
     _require(length <= _LONGEST, f"a loop of {length} iterations within a sample")
-    n, m = _counts(equation)
+    # Its names for the numbers of constants and carries differ between JAX versions. What is
+    # scanned has one axis less in the body.
+    rank, body = lambda v: len(v.aval.shape), params["jaxpr"].jaxpr
+    alike = lambda outer, inner: sum(rank(a) == rank(b) for a, b in zip(outer, inner, strict=True))
+    m = alike(equation.outvars, body.outvars)
+    n = alike(equation.invars, body.invars) - m
     consts, carry, xs = args[:n], list(args[n : n + m]), args[n + m :]
     stored: list[list[Cells]] = []
     order = range(length - 1, -1, -1) if params["reverse"] else range(length)
@@ -447,21 +438,14 @@ def _scan(lanes: Lanes, equation: JaxprEqn, *args: Cells) -> list[Cells]:
     return [*carry, *(np.stack(column) for column in zip(*rows, strict=True))]
 
 
-def _counts(equation: JaxprEqn) -> tuple[int, int]:
-    """How many constants a scan has, and carries: its names for these differ between JAX versions.
-
-    What is scanned has one axis less in the body.
-    """
-    rank, body = lambda v: len(v.aval.shape), equation.params["jaxpr"].jaxpr
-    kept = lambda outer, inner: sum(rank(a) == rank(b) for a, b in zip(outer, inner, strict=True))
-    carry = kept(equation.outvars, body.outvars)
-    return kept(equation.invars, body.invars) - carry, carry
+Axes = Sequence[int | np.integer]
 
 
-def _keep_apart(lanes: Lanes, equation: JaxprEqn, axes: Sequence[int | np.integer]) -> None:
-    shape = _shape(equation)
-    name = equation.primitive.name
+def _other_axes(lanes: Lanes, equation: JaxprEqn, axes: Axes) -> tuple[int | np.integer, ...]:
+    """The axes, none of which is that of the members."""
+    shape, name = _shape(equation), equation.primitive.name
     _require(not any(lanes.is_members(shape, axis) for axis in axes), f"{name} over the members")
+    return tuple(axes)
 
 
 def _require(condition: bool, otherwise: str) -> None:

@@ -8,13 +8,13 @@ computes a segment's carries again, writes them to memory, and goes back over th
 
 import functools as ft
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend.core import ClosedJaxpr, Jaxpr, jaxpr_as_fun, JaxprEqn, Var
+from jax.extend.core import ClosedJaxpr, jaxpr_as_fun, JaxprEqn, Var
 from jax.typing import DTypeLike
 from jaxtyping import Array
 
@@ -22,17 +22,12 @@ from ._cuda_text import EXPRESSIONS
 from ._lanes import as_cells, CALLS, cells_of, Lane, Lanes, NotInLanes, NUMBERS, numbers
 
 
-# How often the forward kernel of a time loop keeps the carry for the reverse one.
-#
-# The reverse kernel computes the samples between two kept carries once more, and puts their
-# carries down until it comes back to them. In the memory that a processor of the GPU shares among
-# its threads they cost next to nothing, but few have room there: so carries are kept as often as a
-# part of the device's memory allows. Where that is not often enough, they are kept every
-# sqrt(samples) samples, and put down in the device's memory.
-#
-# What a thread holds from sample to sample (constants, the sums of their cotangents, the carry's
-# cotangents) goes to the shared memory first where its registers have no room for it, as in double
-# precision: what the compiler has no register for it puts down in memory that is slow.
+# The reverse kernel computes the samples between two kept carries once more. In the memory that a
+# processor of the GPU shares among its threads their carries cost next to nothing, but few have
+# room there: so carries are kept as often as a part of the device's memory allows. Where that is
+# not often enough, they are kept every sqrt(samples) samples, and put down in the device's memory.
+# What a thread holds from sample to sample goes to the shared memory first where its registers have
+# no room for it, as in double precision.
 
 _LEAST = 2  # samples: a carry is then written in less time than a sample takes
 _SHARE = 0.15  # of the device's free memory, for what is kept: a program may have some loops
@@ -59,10 +54,7 @@ class Segments(NamedTuple):
 
 
 def segments_of(count: int, carry: int, members: int, block: int, shared: int = 0) -> Segments:
-    """For `members` whose carry has so many bytes, in blocks of so many threads.
-
-    `held` are the bytes of each that `held_bytes` found.
-    """
+    """For `members` whose carry has so many bytes; `shared` are those that `held_bytes` found."""
     room = _memory()[0]
     most = (_shared_by_block() - shared * block) // max(carry * block, 1)
     length = max(_LEAST, math.ceil(count * carry * members / (_SHARE * room))) if room else count
@@ -72,11 +64,8 @@ def segments_of(count: int, carry: int, members: int, block: int, shared: int = 
 
 
 def held_bytes(in_registers: int, of_eight: int, block: int) -> int:
-    """Bytes of a thread that go to shared memory, of those that it holds from sample to sample.
-
-    `of_eight` are those of numbers with eight bytes. None where registers have room for all, and
-    where that memory has none.
-    """
+    """Bytes of a thread, of those in numbers of eight bytes, that go to shared memory; 0 where
+    registers have room for all, and where that memory has none."""
     registers = in_registers // 4
     return of_eight if registers > _HELD and of_eight * block <= _shared_by_block() else 0
 
@@ -241,57 +230,51 @@ def without_invariants(
     """A step of (consts, carry, now) as one of other consts, which are computed from these."""
     body = step.jaxpr
     constants, rest = body.invars[: len(consts)], body.invars[len(consts) :]
-    parts = _Parts(body, constants)
-    per_sample = _used(parts.in_sample, parts.outs)
+    steady: list[JaxprEqn] = []  # what is the same in every sample, each once
+    in_sample: list[JaxprEqn] = []  # what a sample has to compute
+    before: set[Var] = set()  # results that need not be computed in a sample
+    still, from_own = {*constants, *body.constvars}, {*constants}
+    same: dict[Any, Var] = {}
+    first_of: dict[Any, Sequence[Var]] = {}
+    for equation in body.eqns:
+        equation = equation.replace(invars=[_first(v, same) for v in equation.invars])
+        read = [v for v in equation.invars if isinstance(v, Var)]
+        if not still.issuperset(read):
+            in_sample.append(equation)
+            continue
+        first = first_of.setdefault(_content(equation), equation.outvars)
+        if first is not equation.outvars:
+            same.update(zip(equation.outvars, first, strict=True))
+            continue
+        still.update(equation.outvars)
+        steady.append(equation)
+        if not from_own.isdisjoint(read):
+            from_own.update(equation.outvars)
+            name = equation.primitive.name
+            kinds = {v.aval.dtype for v in equation.outvars}  # pyright: ignore[reportAttributeAccessIssue]
+            if (name in EXPRESSIONS or name in CALLS) and kinds.issubset(NUMBERS):
+                before.update(equation.outvars)
+                continue
+        in_sample.append(equation)  # what only moves numbers costs nothing there
+    outs = [_first(v, same) for v in body.outvars]
+    per_sample = _used(in_sample, outs)
     read = dict.fromkeys(
         v
-        for v in (*(v for equation in per_sample for v in equation.invars), *parts.outs)
+        for v in (*(v for equation in per_sample for v in equation.invars), *outs)
         if isinstance(v, Var)
     )
-    needed = [v for v in read if v in parts.before or v in constants]
+    needed = [v for v in read if v in before or v in constants]
     grown = max(_size(needed, members) - _size(constants, members), len(needed) - len(constants))
     if grown > _MORE:
         return step, list(consts)
-    first = body.replace(invars=constants, outvars=needed, eqns=_used(parts.steady, needed))
-    within = body.replace(invars=[*needed, *rest], outvars=parts.outs, eqns=per_sample)
+    first = body.replace(invars=constants, outvars=needed, eqns=_used(steady, needed))
+    within = body.replace(invars=[*needed, *rest], outvars=outs, eqns=per_sample)
     computed = jaxpr_as_fun(ClosedJaxpr(first, step.consts))(*consts)
     return ClosedJaxpr(within, step.consts), computed
 
 
-class _Parts:
-    """A step's equations, sorted, with one of each that are the same."""
-
-    def __init__(self, body: Jaxpr, constants: Sequence[Var]):
-        self.steady: list[JaxprEqn] = []  # what is the same in every sample
-        self.in_sample: list[JaxprEqn] = []  # what a sample has to compute
-        self.before: set[Var] = set()  # results that need not be computed in a sample
-        self._still, self._from_own = {*constants, *body.constvars}, {*constants}
-        self._same: dict[Var, Var] = {}
-        self._first_of: dict[Any, Sequence[Var]] = {}
-        for equation in body.eqns:
-            self._sort(equation.replace(invars=[self._first(v) for v in equation.invars]))
-        self.outs = [self._first(v) for v in body.outvars]
-
-    def _first(self, v: Any) -> Any:
-        return self._same.get(v, v) if isinstance(v, Var) else v
-
-    def _sort(self, equation: JaxprEqn) -> None:
-        read = [v for v in equation.invars if isinstance(v, Var)]
-        if not self._still.issuperset(read):
-            self.in_sample.append(equation)
-            return
-        first = self._first_of.setdefault(_content(equation), equation.outvars)
-        if first is not equation.outvars:
-            self._same.update(zip(equation.outvars, first, strict=True))
-            return
-        self._still.update(equation.outvars)
-        self.steady.append(equation)
-        if not self._from_own.isdisjoint(read):
-            self._from_own.update(equation.outvars)
-            if _computes(equation):
-                self.before.update(equation.outvars)
-                return
-        self.in_sample.append(equation)  # what only moves numbers costs nothing there
+def _first(v: Any, same: Mapping[Any, Var]) -> Any:
+    return same.get(v, v) if isinstance(v, Var) else v
 
 
 def _content(equation: JaxprEqn) -> Any:
@@ -300,12 +283,6 @@ def _content(equation: JaxprEqn) -> Any:
         return id(equation)
     operands = [v if isinstance(v, Var) else (str(v.val), v.aval) for v in equation.invars]
     return equation.primitive, str(equation.params), *operands
-
-
-def _computes(equation: JaxprEqn) -> bool:
-    name = equation.primitive.name
-    kinds = {v.aval.dtype for v in equation.outvars}  # pyright: ignore[reportAttributeAccessIssue]
-    return (name in EXPRESSIONS or name in CALLS) and kinds.issubset(NUMBERS)
 
 
 def _used(equations: Sequence[JaxprEqn], results: Iterable[Any]) -> list[JaxprEqn]:

@@ -1,12 +1,4 @@
-from ._files import (
-    change_table as change_table,
-    parameter_file as parameter_file,
-    ParameterChange as ParameterChange,
-    ParameterFiles as ParameterFiles,
-    propose_changes as propose_changes,
-    WordChange as WordChange,
-    write_parameter_files as write_parameter_files,
-)
+from ._filter_bank import filter_choices as filter_choices
 from ._filters import (
     ardupilot_notch as ardupilot_notch,
     BandwidthNotch as BandwidthNotch,
@@ -36,6 +28,7 @@ from ._firmware import (
     rows_of_axes as rows_of_axes,
 )
 from ._flight_channels import (
+    best_filters as best_filters,
     FlightChannels as FlightChannels,
     FlownAutopilot as FlownAutopilot,
     read_channels_if_any as read_channels_if_any,
@@ -43,7 +36,6 @@ from ._flight_channels import (
     settings_of as settings_of,
 )
 from ._flown_law import (
-    best_filters as best_filters,
     flown_law as flown_law,
     FlownLaw as FlownLaw,
     loop_of_law as loop_of_law,
@@ -82,27 +74,29 @@ from ._page import (
 )
 from ._parameters import (
     change_filters as change_filters,
+    change_table as change_table,
     check_ranges as check_ranges,
-    filter_choices as filter_choices,
     find_parameter as find_parameter,
     firmware_of as firmware_of,
     flown_loop as flown_loop,
     list_parameters as list_parameters,
+    parameter_file as parameter_file,
+    ParameterChange as ParameterChange,
+    ParameterFiles as ParameterFiles,
     PARAMETERS as PARAMETERS,
+    propose_changes as propose_changes,
     store_parameters as store_parameters,
     with_parameters as with_parameters,
+    WordChange as WordChange,
+    write_parameter_files as write_parameter_files,
 )
 from ._proposal import AutopilotProposal as AutopilotProposal, AxesProposal as AxesProposal
 from ._rate_design import design_gains as design_gains
 from ._replay import (
-    fly_again as fly_again,
-    HeldPlant as HeldPlant,
+    FlownController as FlownController,
     hold_response as hold_response,
     predict_loop as predict_loop,
     replay_terms as replay_terms,
-)
-from ._reproduce_flight import (
-    FlownController as FlownController,
     reproduce_flight as reproduce_flight,
     Reproduction as Reproduction,
 )
@@ -120,19 +114,16 @@ from .firmwares._betaflight import (
     FlownBetaflight as FlownBetaflight,
 )
 from .firmwares._betaflight_adrc import (
-    adrc_b0 as adrc_b0,
     adrc_parameters as adrc_parameters,
     b0_law as b0_law,
     betaflight_adrc_loop as betaflight_adrc_loop,
-    BetaflightADRC as BetaflightADRC,
+    Flown as Flown,
     FlownADRC as FlownADRC,
 )
 from .firmwares._betaflight_adrc_design import (
     ADRCProposal as ADRCProposal,
     ADRCStage as ADRCStage,
     ADRCTargets as ADRCTargets,
-    Flown as Flown,
-    gyro_filters as gyro_filters,
     propose_adrc as propose_adrc,
 )
 from .firmwares._betaflight_adrc_result import (
@@ -144,6 +135,8 @@ from .firmwares._betaflight_demo import (
     write_chirp_log as write_chirp_log,
 )
 from .firmwares._betaflight_law import (
+    adrc_b0 as adrc_b0,
+    BetaflightADRC as BetaflightADRC,
     BetaflightAngle as BetaflightAngle,
     BetaflightPID as BetaflightPID,
     DMax as DMax,

@@ -1,17 +1,17 @@
-"""What a proposal reads of a flight beside the record: gyros, set-point, terms, motors."""
+"""What a proposal reads of a flight: gyros, set-point, terms, motors, and the loop that flew."""
 
 import dataclasses
 import re
 import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
 
 from jaxquad._core import Message, Number
-from jaxquad.identify import KnownFilter, MeasuredChain
+from jaxquad.identify import Fit, KnownFilter, measured_chain, MeasuredChain
 from jaxquad.records import (
     AXES,
     channels,
@@ -25,64 +25,76 @@ from jaxquad.records import (
     Settings as LogSettings,
 )
 
+from ._filters import FilterChain
 from ._firmware import firmware_named, HOVER, OuterLoop, Span
-from ._identified import RecordSettings
 from ._law import FlownLoop, RateLoop
-from ._parameters import change_filters, flown_loop
-from ._rate_loops import gains_of, parameters_of
+from ._parameters import change_filters, flown_loop, gains_of, parameters_of
 
 
 Samples = Float[np.ndarray, " samples"]
+_AT_END = 0.002  # of a motor's range
+
+
+@runtime_checkable
+class RecordSettings(Protocol):
+    """Which part of a log is identified, in s, and in which band, in Hz; None: all of it."""
+
+    @property
+    def segments(self) -> Sequence[tuple[float, float]]: ...
+    @property
+    def start(self) -> float | None: ...
+    @property
+    def stop(self) -> float | None: ...
+    @property
+    def band(self) -> tuple[float, float] | None: ...
+    def content(self) -> dict[str, Any]: ...
+
+
+@runtime_checkable
+class IdentifiedPlant(Protocol):
+    """A log's plant up to what the gyro's filters are given, as `jq.workflows.identify` has it."""
+
+    @property
+    def path(self) -> Path: ...
+    @property
+    def settings(self) -> RecordSettings: ...
+    @property
+    def records(self) -> tuple[Record, ...]: ...
+    @property
+    def fit(self) -> Fit: ...
+    @property
+    def band(self) -> tuple[float, float]: ...  # rad/s
 
 
 @dataclasses.dataclass(frozen=True)
 class FlightChannels:
     """Channels of the analysed part of a log; those that are not in it are empty.
 
-    **Attributes:**
-
-    - `rates`: behind the gyro's filters, of roll, pitch and yaw, in rad/s, on `dt`.
-    - `unfiltered`: before them, on `unfiltered_dt`.
-    - `setpoint`: of the axis in rad/s, on `dt`.
-    - `axis`: 0 for roll; `start`: the time of the first sample in s.
-    - `terms`: "P", "I", "D" and "F" of the axis, in the firmware's units, on `dt`; `output`: what
-        the law gave, with an injection into the mixer; `injected`: that alone.
-    - `not_carried`: what the motors made of the law's output, less that output within its limit;
-        None where the log does not show it.
-    - `reference`: what no feedback computes, where the log has it beside the set-point.
-    - `motors`: a column each, on `dt`; `motor_ends`: lowest and highest command.
-    - `throttle`: 0 to 1, on `dt`; `stick`: likewise what the filters and TPA follow, where that is
-        another one.
-    - `slewed`: by which P and D were lowered (ArduPilot's SMAX); None where the log does not say.
-    - `late`: s after its stamp at which the set-point acts.
-    - `resolution`: steps in which set-point and rates are logged, in rad/s, and the terms; 0 where
-        they are not rounded.
-    - `names`: of the gyro's channels, filtered and unfiltered.
-    - `tracked_hz`: medians of what ArduPilot's harmonic notches follow, by INS_HNTCH_MODE: the
-        speeds of the motors (3) and of RPM sensors (2, 5).
+    Rates are in rad/s; all but the unfiltered ones are on `dt`.
     """
 
-    rates: tuple[Samples, ...]
-    dt: float
-    setpoint: Samples
-    axis: int = 0
-    start: float = 0.0
-    unfiltered: tuple[Float[np.ndarray, " raw_samples"], ...] = ()
-    unfiltered_dt: float = 0.0
+    rates: tuple[Samples, ...]  # behind the gyro's filters, of roll, pitch and yaw
+    dt: float  # s
+    setpoint: Samples  # of the axis in rad/s
+    axis: int = 0  # 0 for roll
+    start: float = 0.0  # s, of the first sample
+    unfiltered: tuple[Float[np.ndarray, " raw_samples"], ...] = ()  # before the gyro's filters
+    unfiltered_dt: float = 0.0  # s
     averaged: bool = False  # whether the unfiltered rate is the mean over its sample
-    terms: Mapping[str, Samples] = dataclasses.field(default_factory=dict)
-    output: Samples | None = None
-    injected: Samples | None = None
-    not_carried: Samples | None = None
-    reference: Samples | None = None
+    terms: Mapping[str, Samples] = dataclasses.field(default_factory=dict)  # P, I, D, F of the law
+    output: Samples | None = None  # of the law, with an injection into the mixer
+    injected: Samples | None = None  # that alone
+    not_carried: Samples | None = None  # what the motors made of the output, less that in its limit
+    reference: Samples | None = None  # what no feedback computes, beside the set-point
     motors: Float[np.ndarray, "samples motors"] | None = None
-    motor_ends: tuple[float, float] = (0.0, 1.0)
-    throttle: Samples | None = None
-    stick: Samples | None = None
-    slewed: Samples | None = None
-    late: float = 0.0
-    resolution: tuple[float, float] = (0.0, 0.0)
-    names: tuple[str, str] = ("", "")
+    motor_ends: tuple[float, float] = (0.0, 1.0)  # lowest and highest command
+    throttle: Samples | None = None  # 0 to 1
+    stick: Samples | None = None  # likewise what filters and TPA follow, where that is another one
+    slewed: Samples | None = None  # by which P and D were lowered (ArduPilot's SMAX)
+    late: float = 0.0  # s after its stamp at which the set-point acts
+    resolution: tuple[float, float] = (0.0, 0.0)  # steps of logged rates (rad/s), and of terms
+    names: tuple[str, str] = ("", "")  # of the gyro's channels, filtered and unfiltered
+    # Medians of what notches follow, by INS_HNTCH_MODE: of motors (3), of RPM sensors (2, 5).
     tracked_hz: Mapping[int, tuple[float, ...]] = dataclasses.field(default_factory=dict)
 
     @property
@@ -93,22 +105,17 @@ class FlightChannels:
         return float(np.clip(np.median(self.followed), 0.01, 1.0))
 
     @property
-    def count(self) -> int:
-        """Of samples on `dt`."""
-        return len(self.setpoint)
-
-    @property
     def followed(self) -> Samples:
         """The throttle that filters and TPA follow at each sample; `HOVER` where none is logged."""
         if self.stick is not None:
             return self.stick
-        return np.full(self.count, HOVER) if self.throttle is None else self.throttle
+        return np.full(len(self.setpoint), HOVER) if self.throttle is None else self.throttle
 
     @property
     def limited(self) -> Samples:
         """At each sample, 1 where a motor is at an end of its range, else 0."""
         if self.motors is None:
-            return np.zeros(self.count)
+            return np.zeros(len(self.setpoint))
         low, high = self.motor_ends
         near = _AT_END * (high - low)
         return np.any((self.motors <= low + near) | (self.motors >= high - near), axis=1) * 1.0
@@ -116,52 +123,36 @@ class FlightChannels:
     @property
     def mixer_range(self) -> Samples | None:
         """Highest less lowest motor, over what a motor can be."""
-        if self.motors is None:
-            return None
-        low, high = self.motor_ends
-        return (self.motors.max(axis=1) - self.motors.min(axis=1)) / (high - low)
-
-
-_AT_END = 0.002  # of a motor's range
+        reach = np.ptp(self.motor_ends)
+        return None if self.motors is None else np.ptp(self.motors, axis=1) / reach
 
 
 def read_channels_if_any(
     path: Path, proposal: Proposal, settings: RecordSettings, values: Mapping[str, str]
 ) -> FlightChannels | None:
-    """None where they cannot be read: the record has what identification needs, and says so."""
+    """Of the longest analysed part; None without a rate and its set-point there.
+
+    The record has what identification needs, and says what is missing.
+    """
+    firmware, prefix = firmware_named(proposal.vehicle), _channel_prefix(proposal)
+    setup, axis, span = proposal.setup, AXES.index(proposal.setup.axis), _span(settings)
+    filtered = [f"{prefix}{name}" for name in firmware.log.rates]
+    setpoint, rate = f"{prefix}{firmware.log.setpoints[axis]}", filtered[axis]
+    names = firmware.channels(prefix, axis)
+    injected = {setup.reference: 1.0} if setup.injected_at == "mixer" else {}
     try:
-        return read_channels(path, proposal, settings, values)
+        logged = frozenset(channel.name for channel in channels(path))
+        median = lambda x: _median(_read(path, logged, [x], span).get(x), x, (None, None))
+        unfiltered = names.unfiltered or firmware.unfiltered_gyro(logged, values, median)
+        wanted = [*filtered, *unfiltered, *names.terms, *names.motors, setpoint, setup.reference]
+        wanted += [*names.output, *names.stick, *names.mixed, *names.slewed, *injected]
+        records = _read(path, logged, [*wanted, *setup.throttle], span)
+        tracked_hz = _tracked(path, logged, firmware.tracked_channels(), span)
     except (ReadError, RecordError):
         return None
-
-
-def channel_prefix(proposal: Proposal) -> str:
-    """What the channels of a flight begin with in a file with several."""
-    log, axis = firmware_named(proposal.vehicle).log, AXES.index(proposal.setup.axis)
-    rate = log.rates[axis] if axis < len(log.rates) else ""
-    full = proposal.setup.rate
-    return full.removesuffix(rate) if rate and full.endswith(f".{rate}") else ""
-
-
-def read_channels(
-    path: Path, proposal: Proposal, settings: RecordSettings, values: Mapping[str, str]
-) -> FlightChannels:
-    """Of the longest analysed part. Raises RecordError without a rate or its set-point."""
-    firmware, prefix = firmware_named(proposal.vehicle), channel_prefix(proposal)
-    setup, axis = proposal.setup, AXES.index(proposal.setup.axis)
-    filtered = [f"{prefix}{name}" for name in firmware.log.rates]
-    setpoint = f"{prefix}{firmware.log.setpoints[axis]}"
-    names, span = firmware.channels(prefix, axis), _span(settings)
-    log = _LoggedChannels(path, frozenset(channel.name for channel in channels(path)))
-    median = lambda name: _median(_read(log, [name], span).get(name), name, (None, None))
-    unfiltered = names.unfiltered or firmware.unfiltered_gyro(log.names, values, median)
-    injected = {setup.reference: 1.0} if setup.injected_at == "mixer" else {}
-    wanted = [*filtered, *unfiltered, *names.terms, *names.motors, setpoint, setup.reference]
-    wanted += [*names.output, *names.stick, *names.mixed, *names.slewed, *injected]
-    records = _read(log, [*wanted, *setup.throttle], span)
-    rates, rate = records.get(filtered[axis]), filtered[axis]
-    if rates is None or setpoint not in records:
-        raise RecordError(f"{path} holds no {rate} or no {setpoint} of the analysed part")
+    if rate not in records or setpoint not in records:
+        return None
+    rates = records[rate]
     at_rate = lambda name, read=Record.channel: np.interp(
         rates.time, records[name].time, read(records[name], name)
     )
@@ -196,26 +187,26 @@ def read_channels(
         stick=None if stick is None else firmware.stick_throttle(stick, values),
         slewed=sum_at(names.slewed), late=setup.late_s.get(setpoint, 0.0),
         resolution=firmware.resolution(values),
-        names=(rate, "" if raw is None else unfiltered[axis]),
-        tracked_hz=_tracked(log, firmware.tracked_channels(), span),
+        names=(rate, "" if raw is None else unfiltered[axis]), tracked_hz=tracked_hz,
     )  # fmt: skip
 
 
-class _LoggedChannels(NamedTuple):
-    """A log and the names of all its channels."""
-
-    path: Path
-    names: frozenset[str]
+def _channel_prefix(proposal: Proposal) -> str:
+    """What the channels of a flight begin with in a file with several."""
+    log, axis = firmware_named(proposal.vehicle).log, AXES.index(proposal.setup.axis)
+    rate = log.rates[axis] if axis < len(log.rates) else ""
+    full = proposal.setup.rate
+    return full.removesuffix(rate) if rate and full.endswith(f".{rate}") else ""
 
 
 def _tracked(
-    log: _LoggedChannels, patterns: Mapping[int, str], span: Span
+    path: Path, logged: frozenset[str], patterns: Mapping[int, str], span: Span
 ) -> dict[int, tuple[float, ...]]:
     """The median speeds in Hz that the log holds, of those that turn."""
     tracked: dict[int, tuple[float, ...]] = {}
     for mode, pattern in patterns.items():
-        names = sorted(name for name in log.names if re.fullmatch(pattern, name))
-        records = _read(log, names, (None, None)) if names else {}
+        names = sorted(name for name in logged if re.fullmatch(pattern, name))
+        records = _read(path, logged, names, (None, None)) if names else {}
         medians = [_median(record, name, span) / 60 for name, record in records.items()]
         if turning := tuple(speed for speed in medians if speed > 0):
             tracked[mode] = turning
@@ -239,14 +230,16 @@ def _span(settings: RecordSettings) -> Span:
     return (low if np.isfinite(low) else None), (high if np.isfinite(high) else None)
 
 
-def _read(log: _LoggedChannels, names: Sequence[str], span: Span) -> dict[str, Record]:
+def _read(
+    path: Path, logged: frozenset[str], names: Sequence[str], span: Span
+) -> dict[str, Record]:
     """For each channel that the log has the record of its table, on that table's clock.
 
     Where samples are missing it is the longest part without a gap.
     """
     tables: dict[str, list[str]] = {}
     for name in dict.fromkeys(names):
-        if name in log.names:
+        if name in logged:
             kind = name.rpartition(".")[0].partition("[")[0]  # instances have clocks alike
             tables.setdefault(kind, []).append(name)
     records: dict[str, Record] = {}
@@ -256,7 +249,7 @@ def _read(log: _LoggedChannels, names: Sequence[str], span: Span) -> dict[str, R
         try:
             with warnings.catch_warnings():  # of axes that rest
                 warnings.simplefilter("ignore", RecordWarning)
-                parts = read_segments(log.path, [span], inputs=first, outputs=outputs)
+                parts = read_segments(path, [span], inputs=first, outputs=outputs)
         except RecordError:  # too few samples in this span, or missing ones
             continue
         records |= dict.fromkeys(group, max(parts, key=lambda part: part.samples))
@@ -264,35 +257,35 @@ def _read(log: _LoggedChannels, names: Sequence[str], span: Span) -> dict[str, R
 
 
 def _in_radians(record: Record, name: str) -> Samples:
-    """A rate in rad/s."""
     degrees = record.unit(name) == "deg/s"
     return np.radians(record.channel(name)) if degrees else record.channel(name)
 
 
 @dataclasses.dataclass(frozen=True)
 class FlownAutopilot:
-    """The rate loop of a log: firmware, version, law and what of it is not modelled.
-
-    `loop` is the law with what moves in flight, `law` that at one throttle. `values` are the log's
-    own parameters, `throttle` is where Betaflight's dynamic filters and TPA and ArduPilot's notches
-    are taken, and `tracked_hz` what other notches of the latter followed. `angle` is the angle loop
-    around the rate loop, None where the firmware has none. `filters` are those of the gyro, by the
-    parameters, or as measured where the law lacks some of them; `filters_text` says which.
-    """
+    """The rate loop of a log: firmware, version, law and what of it is not modelled."""
 
     firmware: str
     version: tuple[int, ...]
     axis: int
-    loop: FlownLoop
-    law: RateLoop
-    parameters: Mapping[str, float]
-    unmodelled: tuple[Message, ...]
-    values: Mapping[str, str] = dataclasses.field(default_factory=dict)
-    throttle: float = 0.3
-    tracked_hz: Mapping[int, Sequence[float]] = dataclasses.field(default_factory=dict)
-    angle: OuterLoop | None = None
-    filters: tuple[KnownFilter, ...] = ()
-    filters_text: str = ""
+    loop: FlownLoop  # with what moves in flight
+    law: RateLoop  # at one throttle
+    values: Mapping[str, str]  # the log's own parameters
+    throttle: float  # at which Betaflight's dynamic filters and TPA, ArduPilot's notches are taken
+    flight: FlightChannels | None
+    angle: OuterLoop | None  # around the rate loop; None where the firmware has none
+    filters: tuple[KnownFilter, ...]  # of the gyro, or as measured where the law lacks some
+    filters_text: str  # which of both
+
+    @property
+    def parameters(self) -> dict[str, float]:
+        """Of all axes by the firmware's names."""
+        return self.loop.parameters()
+
+    @property
+    def unmodelled(self) -> tuple[Message, ...]:
+        """What of the firmware the law leaves out."""
+        return self.loop.unmodelled
 
     @property
     def measured(self) -> tuple[KnownFilter, ...] | None:
@@ -302,8 +295,9 @@ class FlownAutopilot:
     def with_filters(self, parameters: Mapping[str, Number]) -> RateLoop:
         """The law as it is read from a log with these cutoffs and notches."""
         values = change_filters(self.firmware, self.values, parameters)
+        tracked = None if self.flight is None else self.flight.tracked_hz
         return flown_loop(
-            self.firmware, values, self.version, throttle=self.throttle, tracked_hz=self.tracked_hz
+            self.firmware, values, self.version, throttle=self.throttle, tracked_hz=tracked
         ).law
 
     def at(self, throttle: float) -> "FlownAutopilot":
@@ -321,28 +315,66 @@ class FlownAutopilot:
 
 def settings_of(path: Path, proposal: Proposal) -> LogSettings:
     """The log's own parameters, of the part that is proposed."""
-    prefix = channel_prefix(proposal).rstrip(".")
+    prefix = _channel_prefix(proposal).rstrip(".")
     return read_settings(path, log=prefix, at=proposal.setup.start)
 
 
 def read_flown(
-    path: Path, proposal: Proposal, throttle: float | None,
-    tracked_hz: Mapping[int, Sequence[float]],
-) -> FlownAutopilot:  # fmt: skip
-    """The loop that flew. Raises ValueError where the log does not hold its gains."""
+    path: Path, proposal: Proposal, settings: RecordSettings, throttle: float | None = None
+) -> FlownAutopilot:
+    """The loop that flew, at a throttle or at the flight's median one, and the flight's channels.
+
+    Raises ValueError where the log does not hold its gains.
+    """
     setup, logged = proposal.setup, settings_of(path, proposal)
     axis, firmware = AXES.index(setup.axis), firmware_named(proposal.vehicle)
-    values = firmware.with_hold(logged.values, setup.hold)
+    flight = read_channels_if_any(path, proposal, settings, logged.values)
+    if throttle is None and flight is not None:
+        throttle = flight.middle
     throttle = HOVER if throttle is None else throttle
-    loop = firmware.flown_loop(values, logged.version, throttle=throttle, tracked_hz=tracked_hz)
+    values = firmware.with_hold(logged.values, setup.hold)
+    tracked = {} if flight is None else flight.tracked_hz
+    loop = firmware.flown_loop(values, logged.version, throttle=throttle, tracked_hz=tracked)
     loop = firmware.levelled(loop) if setup.levelled else loop
     if not np.any(gains_of(loop.law, axis) > 0):
         raise ValueError(
             f"{path}: P, I and D of {setup.axis} are all 0, so there is no rate loop to tune"
         )
-    dt = loop.law.interval()
+    angle = firmware.angle_loop(logged.values, axis, loop.law.dt, levelled=setup.levelled)
+    chains = tuple(chain for chain in loop.law.gyro_chains() if chain.filters)
+    filters, text = best_filters(chains, loop.unmodelled, flight, axis)
     return FlownAutopilot(
-        proposal.vehicle, tuple(logged.version), axis, loop, loop.law, loop.parameters(),
-        loop.unmodelled, values, throttle, tracked_hz,
-        firmware.angle_loop(logged.values, axis, dt, levelled=setup.levelled),
+        proposal.vehicle, tuple(logged.version), axis, loop, loop.law, values, throttle, flight,
+        angle, filters, text,
     )  # fmt: skip
+
+
+_SHOWN = 10.0  # Hz, of the delay in print
+
+
+def best_filters(
+    chains: tuple[FilterChain, ...], unmodelled: Sequence[Message], flight: FlightChannels | None,
+    axis: int,
+) -> tuple[tuple[KnownFilter, ...], str]:  # fmt: skip
+    """As measured where notches follow motors or spectrum, else those of the parameters."""
+    hidden = [text for text in unmodelled if text.kind == "notch"]
+    missing = "" if not hidden else f" (not {'; '.join(text.partition(':')[0] for text in hidden)})"
+    if hidden and flight is not None and len(flight.unfiltered) > axis and not flight.averaged:
+        unfiltered, filtered = flight.unfiltered[axis], flight.rates[axis]
+        try:
+            if len(unfiltered) != len(filtered):
+                raise ValueError("both rates have other instants")
+            measured = measured_chain(
+                unfiltered, filtered, flight.dt, filters=chains,
+                names=(flight.names[1], flight.names[0]),
+                reference=flight.setpoint if np.ptp(flight.setpoint) > 0 else None,
+            )  # fmt: skip
+            return (measured,), f"the gyro's filters are divided out, {measured.description}"
+        except ValueError as error:
+            missing = f"{missing[:-1]}, which could not be measured: {error})"
+    if not chains:
+        return (), f"the gyro has no filter that is known{missing}"
+    words = ", ".join(filter.in_words() for chain in chains for filter in chain.filters)
+    late = sum(float(chain.delay_ms([_SHOWN])[0]) for chain in chains)
+    text = f"the gyro's filters, {words}{missing}, are divided out: {late:.2g} ms at {_SHOWN:g} Hz"
+    return chains, text

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, ArrayLike, Float, PyTree
+from jaxtyping import Array, ArrayLike, Complex, Float, PyTree
 
 from jaxquad._core import (
     as_messages,
@@ -26,20 +26,24 @@ from jaxquad._core import (
     require_sample_interval,
     signal_shape,
 )
-from jaxquad.control import LinearController, Member, Reference, Setpoint, Transform
+from jaxquad.control import as_setpoint, LinearController, Member, Reference, Setpoint, Transform
 
-from ._filters import FilterChain, Memory, rest_of, run_between, Section
+from ._filters import FilterChain, Memory, rest_of, run_sections, Section
 
 
 DEGREES = 180 / np.pi  # per radian
 Signal = Float[Array, " axes *ensemble"]
+Series = Float[np.ndarray, " samples"]
+Samples = Float[np.ndarray, "samples axes"]
 Terms = Mapping[str, Signal]
+Memories = Mapping[str, PyTree]  # filters, integrals, last samples
+Advance = tuple[dict[str, PyTree], Signal, Terms]  # memory, command and its terms
 
 
 class LoopState(NamedTuple):
     """What the loop of a firmware remembers from the last sample."""
 
-    memory: Mapping[str, PyTree]  # filters, integrals, last samples
+    memory: Memories
     command: Signal  # in the firmware's unit
     excess: Signal  # of it beyond what the drive gave
     terms: Terms  # P, I, D and F of the last sample, in units of the command
@@ -51,9 +55,10 @@ class FirmwareLoop(eqx.Module):
     Subclasses are final: they say what the law remembers at rest, and how it advances.
     """
 
-    @abc.abstractmethod
-    def interval(self) -> float:
-        """The interval of its samples in s."""
+    if TYPE_CHECKING:  # fields of each law, in its own order
+
+        @property
+        def dt(self) -> float: ...  # s
 
     @abc.abstractmethod
     def rest(self, zero: Signal) -> dict[str, PyTree]:
@@ -61,12 +66,8 @@ class FirmwareLoop(eqx.Module):
 
     @abc.abstractmethod
     def advance(
-        self,
-        memory: Mapping[str, PyTree],
-        excess: Signal,
-        reference: Reference,
-        measurement: Signal,
-    ) -> tuple[dict[str, PyTree], Signal, Terms]:
+        self, memory: Memories, excess: Signal, reference: Reference, measurement: Signal
+    ) -> Advance:
         """Memory, command and its terms, one sample later."""
 
     @property
@@ -77,8 +78,7 @@ class FirmwareLoop(eqx.Module):
     def init(self, like: Signal) -> LoopState:
         """At rest; shaped as the measurement `like` and the ensemble of the gains."""
         zero = jnp.zeros(signal_shape(like, self.ensemble), like.dtype)
-        terms = {name: zero for name in "PIDF"}
-        return LoopState(self.rest(zero), zero, zero, terms)
+        return LoopState(self.rest(zero), zero, zero, dict.fromkeys("PIDF", zero))
 
     def step(
         self, state: LoopState, reference: Reference, measurement: Signal
@@ -102,7 +102,8 @@ class FirmwareLoop(eqx.Module):
 
     def tunable(self) -> dict[str, Transform | None]:
         """The gains of P, I and D that are not 0."""
-        return dict.fromkeys(name for name, gain in self.gains().items() if _all_set(gain))
+        gains = self.gains().items()
+        return dict.fromkeys(name for name, gain in gains if np.all(np.asarray(gain) != 0))
 
     @abc.abstractmethod
     def gains(self) -> dict[str, Array]:
@@ -113,22 +114,33 @@ class RateLoop(FirmwareLoop):
     """The rate loop of a firmware: rates in rad/s in, behind filters of the gyro.
 
     The methods say what a design has to know of a law; all have defaults for what it does not have.
+
+    **Raises:**
+
+    - `ValueError`: a gain is not finite, the gyro's rate is no multiple of 1/dt, or a filter lies
+        beyond half of its rate.
     """
 
     firmware: ClassVar[str]  # its name
+    tuned: ClassVar[tuple[str, ...]] = ("p", "i", "d")
+    factors: ClassVar[tuple[str, ...]] = ()  # of gains
     feed_forward: ClassVar[tuple[str, ...]] = ()  # gains of it
-    of_sticks: ClassVar[bool] = (
-        False  # whether feed-forward is of the sticks, between their samples
-    )
-    if TYPE_CHECKING:  # fields of each law, in its own order
+    limits: ClassVar[tuple[str, ...]] = ()  # fields that are not below 0
+    of_sticks: ClassVar[bool] = False  # whether feed-forward is theirs, between samples
+    if TYPE_CHECKING:
 
         @property
         def gyro(self) -> FilterChain: ...
-        @property
-        def dt(self) -> float: ...  # s
 
-    def interval(self) -> float:
-        return self.dt
+    def __check_init__(self):
+        gains = {name: vars(self)[name] for name in (*self.factors, *self.feed_forward)}
+        limits = {name: vars(self)[name] for name in self.limits}
+        require_gains(self.dt, {**self.gains(), **gains}, limits)
+        if self.gyro.filters:
+            samples_between(self.gyro, self.dt)  # refuses another rate than a multiple
+
+    def gains(self) -> dict[str, Array]:
+        return {name: vars(self)[name] for name in self.tuned}
 
     def gyro_chains(self) -> list[FilterChain]:
         """All filters of the gyro, at their own rates."""
@@ -139,10 +151,7 @@ class RateLoop(FirmwareLoop):
         return FilterChain((), 1 / self.dt)
 
     def without_gyro_filters(self) -> "RateLoop":
-        """The law as it acts on the logged rate, which is behind the gyro's filters.
-
-        A plant that was identified up to that rate contains the filters.
-        """
+        """The law as it acts on the logged rate: a plant up to that contains the filters."""
         return dataclasses.replace(self, gyro=FilterChain())
 
     def holds_integral(self, axis: int) -> bool:
@@ -160,10 +169,8 @@ RateLaw = TypeVar("RateLaw", bound=RateLoop)
 class FlownLoop(eqx.Module, Generic[RateLaw]):
     """The rate loop of a log, for roll, pitch and yaw, and what of it is not modelled.
 
-    **Arguments:**
-
-    - `law`: the rate loop at hover (for Betaflight, with throttle-dependent cutoffs at 30 %).
-    - `unmodelled`: sentences; their kind is "notch", "anti-gravity", "feedforward" or empty.
+    The `law` is that at hover (for Betaflight, with throttle-dependent cutoffs at 30 %). Sentences
+    of `unmodelled` have the kind "notch", "anti-gravity", "feedforward" or none.
     """
 
     law: RateLaw
@@ -189,19 +196,15 @@ class FlownLoop(eqx.Module, Generic[RateLaw]):
         """The law at one sample of a log."""
         return self.law
 
-    def surge(self, throttle: Float[np.ndarray, " samples"]) -> Float[np.ndarray, " samples"]:
+    def surge(self, throttle: Series) -> Series:
         """Anti-gravity's measure of a moving throttle times its gain, at the loop's samples."""
         return np.zeros_like(throttle)
 
-    def integral_share(
-        self, mixer_range: Float[np.ndarray, " samples"]
-    ) -> Float[np.ndarray, " samples"]:
+    def integral_share(self, mixer_range: Series) -> Series:
         """Of what the integral grows by, while the motors use this share of the mixer's range."""
         return np.ones_like(mixer_range)
 
-    def setpoint_speed(
-        self, slope: Float[np.ndarray, "samples axes"], fed: Float[np.ndarray, "samples axes"]
-    ) -> Float[np.ndarray, "samples axes"]:
+    def setpoint_speed(self, slope: Samples, fed: Samples) -> Samples:
         """In rad/s^2, by the slope of the set-point and the logged F."""
         return slope
 
@@ -213,48 +216,39 @@ class AngleLoop(FirmwareLoop):
     Subclasses are final: they say what rate they ask for.
     """
 
+    outer: ClassVar[tuple[str, ...]] = ("p",)  # gains of the angle alone
     rate: eqx.AbstractVar[FirmwareLoop]
 
     @property
     def dt(self) -> float:
-        return self.rate.interval()
-
-    def interval(self) -> float:
-        return self.dt
+        return self.rate.dt
 
     def gains(self) -> dict[str, Array]:
-        return self.outer_gains() | {f"rate.{name}": x for name, x in self.rate.gains().items()}
+        outer = {name: vars(self)[name] for name in self.outer}
+        return outer | {f"rate.{name}": x for name, x in self.rate.gains().items()}
 
     def rest(self, zero: Signal) -> dict[str, PyTree]:
         return {"rate": self.inner().rest(zero), "angle": zero, **self.outer_rest(zero)}
 
     def advance(
-        self,
-        memory: Mapping[str, PyTree],
-        excess: Signal,
-        reference: Reference,
-        measurement: Signal,
-    ) -> tuple[dict[str, PyTree], Signal, Terms]:
+        self, memory: Memories, excess: Signal, reference: Reference, measurement: Signal
+    ) -> Advance:
         rate = (measurement - memory["angle"]) / self.dt
-        outer, wanted = self.wanted_rate(memory, reference, measurement, rate)
+        outer, wanted = self.wanted_rate(memory, as_setpoint(reference), measurement, rate)
         inner, command, terms = self.inner().advance(memory["rate"], excess, wanted, rate)
         return {"rate": inner, "angle": measurement, **outer}, command, terms
 
-    @abc.abstractmethod
-    def outer_gains(self) -> dict[str, Array]:
-        """The gains of the angle alone."""
-
-    @abc.abstractmethod
     def inner(self) -> FirmwareLoop:
         """The rate loop as it is inside this one."""
+        return self.rate
 
-    @abc.abstractmethod
     def outer_rest(self, zero: Signal) -> dict[str, PyTree]:
         """What the angle loop remembers at rest besides the last angle."""
+        return {}
 
     @abc.abstractmethod
     def wanted_rate(
-        self, memory: Mapping[str, PyTree], reference: Reference, angle: Signal, rate: Signal
+        self, memory: Memories, aim: Setpoint, angle: Signal, rate: Signal
     ) -> tuple[dict[str, PyTree], Signal]:
         """What the angle loop remembers, and the set-point of the rate in rad/s."""
 
@@ -279,18 +273,11 @@ def _derivative(law: FirmwareLoop) -> LinearController:
 
     slopes = jax.jacfwd(advance)(jnp.zeros(states + 2, zero.dtype))
     return LinearController(
-        A=slopes[:states, :states],
-        reference_in=slopes[:states, states],
-        measurement_in=slopes[:states, states + 1],
-        C=slopes[states, :states],
-        reference_through=slopes[states, states],
-        measurement_through=slopes[states, states + 1],
-        dt=law.interval(),
-    )
-
-
-def _all_set(gain: Array) -> bool:
-    return bool(np.all(np.asarray(gain) != 0))
+        A=slopes[:states, :states], C=slopes[states, :states],
+        reference_in=slopes[:states, states], measurement_in=slopes[:states, states + 1],
+        reference_through=slopes[states, states], measurement_through=slopes[states, states + 1],
+        dt=law.dt,
+    )  # fmt: skip
 
 
 def require_gains(dt: float, gains: Mapping[str, Array], limits: Mapping[str, Array]) -> None:
@@ -302,12 +289,6 @@ def require_gains(dt: float, gains: Mapping[str, Array], limits: Mapping[str, Ar
         if is_concrete(limit):
             require_nonnegative(name, np.where(np.isinf(limit), 0.0, limit))
     require_common_shape({**gains, **limits})
-
-
-def require_gyro_rate(chain: FilterChain, dt: float) -> None:
-    """Raises ValueError for filters whose rate is no multiple of the loop's."""
-    if chain.filters:
-        samples_between(chain, dt)
 
 
 def samples_between(chain: FilterChain, dt: float) -> int:
@@ -322,25 +303,38 @@ def samples_between(chain: FilterChain, dt: float) -> int:
     return round(count)
 
 
+_UNROLLED = 2  # samples of the gyro, up to which a loop costs more than it saves
+
+
 def filter_gyro(
-    chain: FilterChain, dt: float, memory: Mapping[str, PyTree], rate: Signal, *more: Section
+    chain: FilterChain, dt: float, memory: Memories, rate: Signal, *more: Section
 ) -> tuple[dict[str, PyTree], tuple[Signal, Signal]]:
     """The filtered rate at this sample, and it through the sections `more` at the gyro's rate.
 
     Between two samples of the loop the rate is taken as straight.
     """
-    groups = chain.sections(), more
+    sections, before = chain.sections(), memory["rate"]
     count = samples_between(chain, dt) if chain.filters or more else 1
-    memories, (smooth, further) = run_between(
-        groups, (memory["gyro"], memory["derivative"]), memory["rate"], rate, count
-    )
-    return {"gyro": memories[0], "derivative": memories[1], "rate": rate}, (smooth, further)
+
+    def advance(memories: tuple[Memory, Memory], part: Array):
+        gyro, smooth = run_sections(sections, memories[0], before + part * (rate - before))
+        derivative, further = run_sections(more, memories[1], smooth)
+        return (gyro, derivative), (smooth, further)
+
+    memories, passed = (memory["gyro"], memory["derivative"]), (rate, rate)
+    parts = jnp.arange(1, count + 1, dtype=rate.dtype) / count
+    if count <= _UNROLLED:
+        for k in range(count):
+            memories, passed = advance(memories, parts[k])
+    else:
+        memories, (smooth, further) = jax.lax.scan(advance, memories, parts)
+        passed = smooth[-1], further[-1]
+    return {"gyro": memories[0], "derivative": memories[1], "rate": rate}, passed
 
 
 def gyro_rest(chain: FilterChain, zero: Signal, *more: Section) -> dict[str, PyTree]:
     """What `filter_gyro` remembers at rest."""
-    derivative: Memory = rest_of(more, zero)
-    return {"gyro": chain.init(zero), "derivative": derivative, "rate": zero}
+    return {"gyro": chain.init(zero), "derivative": rest_of(more, zero), "rate": zero}
 
 
 def split_reference(reference: Reference, before: Signal, dt: float) -> tuple[Signal, Signal]:
@@ -366,3 +360,16 @@ def low_pass_share(cutoff_hz: Array, dt: float, like: Signal) -> Array:
     on = cutoff_hz > 0
     w = 2 * np.pi * dt * jnp.where(on, cutoff_hz, 1.0)
     return broadcast_gain(jnp.where(on, w / (w + 1), 1.0), like)
+
+
+def law_responses(
+    law: RateLoop, axis: int, omega: Float[np.ndarray, " frequencies"]
+) -> Complex[np.ndarray, "2 frequencies"]:
+    """From the set-point and from the rate, both in rad/s, to the command."""
+    linear = law.linear(axis)
+    A, c = np.asarray(linear.A), np.asarray(linear.C)
+    into = np.stack([linear.reference_in, linear.measurement_in], axis=1)
+    through = np.array([linear.reference_through, linear.measurement_through])
+    z = np.exp(1j * omega * linear.dt)[:, None, None]
+    inner = np.linalg.solve(z * np.eye(len(A)) - A, np.broadcast_to(into, (len(z), *into.shape)))
+    return (c @ inner + through).T

@@ -13,16 +13,11 @@ import numpy as np
 from jaxtyping import Bool, Complex, Float
 
 from jaxquad._core import plain_content
-from jaxquad.identify import filter_response, Fit, MISFIT, usable
+from jaxquad.identify import filter_response, MISFIT, usable
 from jaxquad.records import Record
-from jaxquad.spectra import (
-    frequency_response,
-    JointInputOutput,
-    LocalPolynomial,
-)
+from jaxquad.spectra import frequency_response, JointInputOutput, LocalPolynomial
 
-from ._flight_channels import FlightChannels, FlownAutopilot
-from ._identified import IdentifiedPlant
+from ._flight_channels import FlightChannels, FlownAutopilot, IdentifiedPlant
 from ._law import FlownLoop, pick_axis
 from ._replay import fly_again, HeldPlant, replay_terms
 
@@ -41,24 +36,16 @@ _WINDOW = 0.2  # s, from one start of the integral to the next
 
 
 class TermReplay(NamedTuple):
-    """One term of the law beside the logged one; numbers in the firmware's unit.
+    """One term of the law beside the logged one; root mean squares in the firmware's unit."""
 
-    **Attributes:**
-
-    - `rms`: of the logged term; `left`: of what the replay leaves, without what rounding explains;
-        `rounding`: what that explains.
-    - `size`: the logged term over the replayed one, by least squares; `size_error`: its standard
-        error.
-    - `slower`: octaves by which the log is slower than a quarter of the loop's rate: what happens
-        between its samples is not in the replay.
-    """
-
-    rms: float
-    left: float
-    rounding: float
-    size: float
-    size_error: float
-    slower: float = 0.0
+    rms: float  # of the logged term
+    left: float  # of what the replay leaves, without what rounding explains
+    rounding: float  # what that explains
+    size: float  # the logged term over the replayed one, by least squares
+    size_error: float  # its standard error
+    # Octaves by which the log is slower than a quarter of the loop's rate: what happens between its
+    # samples is not in the replay.
+    slower: float
 
     @property
     def share(self) -> float:
@@ -76,20 +63,13 @@ class TermReplay(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class LawCheck:
-    """The terms of the law that flew, replayed.
+    """The terms of the law that flew, replayed."""
 
-    **Attributes:**
-
-    - `terms`: "P", "I", "D" where they are logged, and "output", their sum with feed-forward.
-    - `late`: s after its stamp at which the set-point acted; `shifted`: whether that was found in
-        this log, and not known of the firmware.
-    - `slewed`: by how much a slew limiter (SMAX) lowered P and D on the average, of 1.
-    """
-
+    # "P", "I", "D" where they are logged, and "output", their sum with feed-forward.
     terms: Mapping[str, TermReplay]
-    late: float = 0.0
-    shifted: bool = False
-    slewed: float = 0.0
+    late: float = 0.0  # s after its stamp at which the set-point acted
+    shifted: bool = False  # whether that was found in this log, and not known of the firmware
+    slewed: float = 0.0  # by which a slew limiter (SMAX) lowered P and D on the average, of 1
 
     @property
     def wrong(self) -> tuple[str, ...]:
@@ -134,16 +114,14 @@ class LawCheck:
 
     def content(self) -> dict[str, object]:
         """All numbers, for JSON."""
+        terms = {name: x._asdict() | {"share": x.share} for name, x in self.terms.items()}
         return {
             "flew": self.flew,
             "text": self.text,
             "setpoint_late_s": self.late,
             "shift_found": self.shifted,
             "lowered_by_slew_limit": self.slewed,
-            "terms": {
-                name: plain_content(term._asdict() | {"share": term.share})
-                for name, term in self.terms.items()
-            },
+            "terms": {name: plain_content(term) for name, term in terms.items()},
         }
 
 
@@ -157,7 +135,7 @@ def check_law(flown: FlownLoop, axis: int, flight: FlightChannels) -> LawCheck:
     output = stated.terms.get("output")
     if output is None or output.share <= _SHIFTED:
         return stated
-    step = flown.law.interval()
+    step = flown.law.dt
     others = [_checked(law, flight, flight.late + way * step) for way in (1, -1)]
     best = min(others, key=lambda check: check.terms["output"].left)
     if best.terms["output"].left > _BETTER * output.left:
@@ -189,14 +167,12 @@ def _checked(law: FlownLoop, flight: FlightChannels, late: float) -> LawCheck:
         terms["F"] = repeated(forward)
     if output is not None:
         if flight.injected is not None:  # without what was injected, when it acts
-            time = flight.dt * np.arange(flight.count)
+            time = flight.dt * np.arange(len(flight.setpoint))
             output = output - np.interp(time - late, time, flight.injected)
         logged["output"] = output
         terms["output"] = terms["P"] + terms["I"] + terms["D"] + terms["F"]
-    slower = max(0.0, float(np.log2(flight.dt / law.law.interval())) - 2)
-    compared = {}
-    for name, x in logged.items():
-        compared[name] = _compared(x, terms[name], name, flight)._replace(slower=slower)
+    slower = max(0.0, float(np.log2(flight.dt / law.law.dt)) - 2)
+    compared = {x: _compared(logged[x], terms[x], x, flight, slower) for x in logged}
     slewed = 0.0 if flight.slewed is None else float(1 - np.mean(flight.slewed))
     return LawCheck(compared, late, slewed=slewed)
 
@@ -211,7 +187,7 @@ def _rounding_error(signal: Samples, step: float, random: np.random.Generator) -
 
 def _compared(
     logged: Samples, replayed: Float[np.ndarray, "samples copies"], name: str,
-    flight: FlightChannels,
+    flight: FlightChannels, slower: float,
 ) -> TermReplay:  # fmt: skip
     """Of I what it grows by from start to start; of the rest what is below a tenth of the rate."""
     from scipy.signal import butter, sosfiltfilt
@@ -236,9 +212,8 @@ def _compared(
     power = max(float(first @ first), 1e-300)
     independent = max(2 * _BAND * x.size, 1.0)  # samples of a signal in this band
     error = rms(x - first) / np.sqrt(power / x.size) / np.sqrt(independent)
-    return TermReplay(
-        float(np.std(logged)), float(left), rounding, float(x @ first) / power, float(error)
-    )
+    size = float(x @ first) / power
+    return TermReplay(float(np.std(logged)), float(left), rounding, size, float(error), slower)
 
 
 _CLOSE = 0.1  # relative misfit of the closed loop up to which plants are believed
@@ -256,30 +231,20 @@ Frequencies = Float[np.ndarray, " frequencies"]
 
 @dataclasses.dataclass(frozen=True)
 class LoopCheck:
-    """The flight again, of law and plant.
+    """The flight again, of law and plant."""
 
-    **Attributes:**
-
-    - `law`: the law alone, replayed.
-    - `omega`: rad/s; `measured`, `predicted`: responses from the excitation to the rate, of log and
-        simulation; `error`: relative random error of the former; `used`: where it is coherent.
-    - `limited`: share of samples with a motor at an end of its range.
-    - `plant_misfit`: of the plant's fit, relative to its errors.
-    - `time`, `setpoint`, `rate`, `again`: a part of the flight, in s and rad/s.
-    """
-
-    law: LawCheck
-    omega: Frequencies
-    measured: Complex[np.ndarray, " frequencies"]
-    error: Frequencies
-    predicted: Complex[np.ndarray, " frequencies"]
-    used: Bool[np.ndarray, " frequencies"]
-    limited: float
-    plant_misfit: float
-    time: Samples
-    setpoint: Samples
-    rate: Samples
-    again: Samples
+    law: LawCheck  # alone, replayed
+    omega: Frequencies  # rad/s
+    measured: Complex[np.ndarray, " frequencies"]  # from the excitation to the logged rate
+    error: Frequencies  # its relative random error
+    predicted: Complex[np.ndarray, " frequencies"]  # likewise to the simulated one
+    used: Bool[np.ndarray, " frequencies"]  # where the former is coherent
+    limited: float  # share of samples with a motor at an end of its range
+    plant_misfit: float  # of the plant's fit, relative to its errors
+    time: Samples  # s, of a part of the flight
+    setpoint: Samples  # rad/s
+    rate: Samples  # rad/s
+    again: Samples  # rad/s
 
     @property
     def misfit(self) -> float:
@@ -317,9 +282,15 @@ class LoopCheck:
                 f"{self.law.text}; the excitation is too weak to fly the loop again: it is "
                 f"coherent at {int(self.used.sum())} frequencies"
             )
-        numbers = f"law and plant, flown on the logged set-point, miss the rate by {self._percent}"
+        numbers = (
+            "law and plant, flown on the logged set-point, miss the rate by "
+            f"{100 * self.misfit:.2g} %"
+        )
+        limited = f"{100 * self.limited:.1f} % of the flight"
         if self.kind == "flown":
-            return f"{self.law.text}; {numbers}{self._limits}"
+            often = self.limited > _SATURATED
+            limits = f" (a motor was at its limit in {limited})" if often else ""
+            return f"{self.law.text}; {numbers}{limits}"
         worst = int(np.argmax(np.where(self.used, np.abs(self.predicted - self.measured), 0.0)))
         at = f"most at {self.omega[worst] / (2 * np.pi):.1f} Hz"
         if self.law.slewed > _SLEWED:
@@ -328,10 +299,7 @@ class LoopCheck:
                 "gains did not fly: fly with less amplitude, or with SMAX 0"
             )
         elif self.limited > _SATURATED:
-            cause = (
-                f"motors were at their limits in {100 * self.limited:.1f} % of the flight: fly "
-                "with less amplitude"
-            )
+            cause = f"motors were at their limits in {limited}: fly with less amplitude"
         else:
             cause = (
                 f"the law is right, so it is the plant (misfit {self.plant_misfit:.2g} times its "
@@ -339,18 +307,9 @@ class LoopCheck:
             )
         return f"{numbers}, {at}. {cause[0].upper()}{cause[1:]}"
 
-    @property
-    def _percent(self) -> str:
-        return f"{100 * self.misfit:.2g} %"
-
-    @property
-    def _limits(self) -> str:
-        if self.limited <= _SATURATED:
-            return ""
-        return f" (a motor was at its limit in {100 * self.limited:.1f} % of the flight)"
-
     def content(self) -> dict[str, object]:
         """All numbers, for JSON."""
+        parts = lambda x: {"magnitude": np.abs(x), "phase_rad": np.angle(x)}
         return plain_content(
             {
                 "kind": self.kind,
@@ -361,26 +320,26 @@ class LoopCheck:
                 "plant_misfit_over_errors": self.plant_misfit,
                 "omega": self.omega,
                 "used": self.used.tolist(),
-                "measured": _parts(self.measured),
+                "measured": parts(self.measured),
                 "measured_error": self.error,
-                "predicted": _parts(self.predicted),
+                "predicted": parts(self.predicted),
             }
         )
 
 
-def _parts(response: Complex[np.ndarray, " frequencies"]) -> dict[str, object]:
-    return {"magnitude": np.abs(response), "phase_rad": np.angle(response)}
-
-
-def check_loop(
-    plant: IdentifiedPlant, flown: FlownAutopilot, flight: FlightChannels, law: LawCheck
-) -> LoopCheck:
-    """Fly the loop again on the excitation that the log holds."""
+def check_loop(plant: IdentifiedPlant, flown: FlownAutopilot) -> LoopCheck:
+    """Replay the law, and fly the loop again on the excitation that the log holds."""
+    flight = flown.flight
+    assert flight is not None
+    law = check_law(flown.loop, flown.axis, flight)
     forward, injected = flight.terms.get("F"), flight.injected
     added = flight.not_carried if injected is None else injected
+    values = {name: float(np.asarray(value)) for name, value in vars(plant.fit.model).items()}
+    per_radian = np.pi / 180 if plant.records[0].output_units[0] == "deg/s" else 1.0
+    gain, damping = per_radian * values["gain"], values.get("damping", 0.0)
     again = fly_again(
         pick_axis(flown.loop, flown.axis),
-        plant_of(plant.fit, plant.records[0].output_units[0]), flight.setpoint, flight.followed,
+        HeldPlant(gain, values["lag"], values["delay"], damping), flight.setpoint, flight.followed,
         dt=flight.dt, late=law.late, feed_forward=forward, injected=added,
     )  # fmt: skip
     drive, count = flight.setpoint if injected is None else injected, len(again)
@@ -413,12 +372,3 @@ def check_loop(
         float(np.sqrt(plant.fit.chi_squared)), time[part], flight.setpoint[part], rate[part],
         behind[part],
     )  # fmt: skip
-
-
-def plant_of(fit: Fit, unit: str) -> HeldPlant:
-    """The fit's plant, in rad/s^2 per unit of the command."""
-    values = {name: float(np.asarray(value)) for name, value in vars(fit.model).items()}
-    per_radian = np.pi / 180 if unit == "deg/s" else 1.0
-    return HeldPlant(
-        per_radian * values["gain"], values["lag"], values["delay"], values.get("damping", 0.0)
-    )

@@ -14,19 +14,15 @@ from jaxquad.identify import (
     FirmwareValue,
     gain_over_throttle,
     GainOverThrottle,
-    KnownFilter,
     throttle_levels,
     UndeterminedError,
 )
 from jaxquad.records import Proposal, Record, RecordWarning
 from jaxquad.records.firmware import firmware_names
 
-from ._files import ParameterChange, propose_changes
 from ._firmware import firmware_named
-from ._flight_channels import FlownAutopilot
-from ._identified import IdentifiedPlant
-from ._parameters import find_parameter
-from ._rate_loops import PlantSource
+from ._flight_channels import FlownAutopilot, IdentifiedPlant
+from ._parameters import find_parameter, ParameterChange, propose_changes
 
 
 ReadBeside = Callable[[Mapping[str, Mapping[str, float]]], Sequence[Record]]
@@ -36,22 +32,13 @@ _VAGUE = 0.4  # half of the relative 95 % interval of a gain from which plants a
 
 @dataclasses.dataclass(frozen=True)
 class CurveVerdict:
-    """The thrust curve's parameter: what flew, and what the log shows.
-
-    **Attributes:**
-
-    - `name`: of the firmware's parameter.
-    - `flown`: its value, or None where the log does not hold it.
-    - `estimate`: with its 95 % interval; None where the log holds too little of the curve.
-    - `change`: what its own files hold; None where what flew is as good, or is not known.
-    - `text`: all of it in words.
-    """
+    """The thrust curve's parameter: what flew, and what the log shows."""
 
     name: str
-    flown: float | None
-    estimate: FirmwareValue | None
-    change: ParameterChange | None
+    flown: float | None  # None where the log does not hold it
     text: str
+    estimate: FirmwareValue | None = None  # None where the log holds too little of the curve
+    change: ParameterChange | None = None  # None where what flew is as good, or is not known
 
     def content(self) -> dict[str, object]:
         """All of it, for JSON."""
@@ -69,38 +56,21 @@ class CurveVerdict:
 
 @dataclasses.dataclass(frozen=True)
 class ThrottleVerdict:
-    """At which throttles the gains of a proposal hold.
-
-    **Attributes:**
-
-    - `text`: in words.
-    - `gains`: over the throttle, where the log holds several levels of it: plants are drawn from
-      these.
-    - `span`: the lowest and the highest throttle of the levels.
-    - `logged`: the throttles at which gains are certified, as the log has them.
-    - `ratio`: the gain at the highest over that at the lowest, with its 95 % interval.
-    - `curve`: of thrust.
-    """
+    """At which throttles the gains of a proposal hold."""
 
     text: str
+    # Over the throttle, where the log holds several levels of it: plants are drawn from these.
     gains: GainOverThrottle | None = None
-    span: tuple[float, float] = (0.0, 1.0)
-    logged: tuple[float, ...] = ()
-    ratio: tuple[float, float, float] | None = None
-    curve: CurveVerdict | None = None
+    span: tuple[float, float] = (0.0, 1.0)  # the lowest and the highest throttle of the levels
+    logged: tuple[float, ...] = ()  # at which gains are certified, as the log has them
+    ratio: tuple[float, float, float] | None = None  # of the gains at its ends, with 95 % interval
+    curve: CurveVerdict | None = None  # of thrust
 
     @property
     def certified(self) -> tuple[float, ...]:
         """The throttles at which gains are certified; empty without a gain over the throttle."""
         low, high = self.span
         return () if self.gains is None else (low, (low + high) / 2, high)
-
-    def plants(
-        self, plant: IdentifiedPlant, measured: Sequence[KnownFilter] | None = None
-    ) -> PlantSource:
-        """What plants are drawn from, behind the gyro's filters as `measured`."""
-        unit = plant.records[0].output_units[0]
-        return PlantSource(plant.fit, unit, self.gains, self.span, measured)
 
     @property
     def table(self) -> str:
@@ -119,30 +89,24 @@ class ThrottleVerdict:
         }
 
 
-@dataclasses.dataclass(frozen=True)
 class _FlownCurve:
-    """The thrust curve that flew, and its parameter.
+    """The thrust curve that flew, and its parameter."""
 
-    `kept` is whether the firmware inverts it for the axes alone, so that the motors get the
-    throttle itself.
-    """
+    kind: CurveFirmware | None = None  # None: the firmware has none
+    value: float | None = None  # of the parameter; None where the log does not hold it
+    curve: float = 0.0
 
-    name: str  # empty: the firmware has none
-    kind: CurveFirmware | None
-    value: float | None  # None where the log does not hold it
-    curve: float
-    kept: bool
-
-    @classmethod
-    def of(cls, flown: FlownAutopilot) -> "_FlownCurve":
+    def __init__(self, flown: FlownAutopilot):
         firmware = firmware_named(flown.firmware)
-        if not (name := firmware.thrust_curve):
-            return cls("", None, None, 0.0, False)
-        kind = firmware.curve_kind(flown.version)
-        logged = float(flown.values[name]) if name in flown.values else None
-        assumed = find_parameter(flown.firmware, name).default if logged is None else logged
-        curve = curve_of_parameter(kind, assumed)
-        return cls(name, kind, logged, curve, firmware.keeps_throttle)
+        self.name = name = firmware.thrust_curve
+        # Whether it is inverted for the axes alone, so that the motors get the throttle itself.
+        self.kept = bool(name) and firmware.keeps_throttle
+        if name:
+            self.kind = firmware.curve_kind(flown.version)
+            self.value = float(flown.values[name]) if name in flown.values else None
+            default = find_parameter(flown.firmware, name).default
+            assumed = default if self.value is None else self.value
+            self.curve = curve_of_parameter(self.kind, assumed)
 
     def thrust(self, channel: str, factor: float) -> dict[str, float]:
         """What is asked for at a throttle, as a weighted sum of the channel and its square."""
@@ -166,14 +130,15 @@ def study_throttle(
             "it is not in the log, so the gains hold near what was flown: log it, and fly two or "
             "three levels between 0.2 and 0.8 for gains that hold at each of them"
         )
-    flown_curve, [(channel, factor)] = _FlownCurve.of(flown), proposal.setup.throttle.items()
+    flown_curve, [(channel, factor)] = _FlownCurve(flown), proposal.setup.throttle.items()
+    taken_together = "gains hold for the throttles of the log taken together"
     try:
         with warnings.catch_warnings():  # identification has said what there is
             warnings.simplefilter("ignore", RecordWarning)
             records = list(read({"throttle": flown_curve.thrust(channel, factor)}))
         levels = throttle_levels(records)
     except ValueError as error:  # of reading, too
-        return ThrottleVerdict(f"gains hold for the throttles of the log taken together: {error}")
+        return ThrottleVerdict(f"{taken_together}: {error}")
     shown = lambda x: flown_curve.as_logged(float(x))
     if levels.throttle.size == 1:
         return ThrottleVerdict(
@@ -193,19 +158,16 @@ def study_throttle(
         span = float(gains.low.min()), float(gains.high.max())
         ratio = value, least, most = _ratio(gains, span)
     except (UndeterminedError, ValueError) as error:
-        return ThrottleVerdict(
-            f"gains hold for the throttles of the log taken together, not for each: {error}"
-        )
-    ends = [shown(x) for x in span]
+        return ThrottleVerdict(f"{taken_together}, not for each: {error}")
+    logged = shown(span[0]), shown(sum(span) / 2), shown(span[1])
     text = (
-        f"gains hold from throttle {ends[0]:.2f} to {ends[1]:.2f}, of which the log has "
+        f"gains hold from throttle {logged[0]:.2f} to {logged[2]:.2f}, of which the log has "
         f"{gains.throttle.size} levels: plants are drawn over all of it, and certified at both "
         f"ends and between. The gain at the highest is {value:.2f} times that at the lowest "
         f"(95 %: {least:.2f} .. {most:.2f})"
     )
     if flown_curve.kept and flown_curve.curve:
         text += ". Below, throttle is the thrust that the firmware makes of it, 0 to 1"
-    logged = ends[0], shown(sum(span) / 2), ends[1]
     curve = _curve_verdict(gains, flown.firmware, flown_curve)
     return ThrottleVerdict(text, gains, span, logged, ratio, curve)
 
@@ -231,25 +193,26 @@ def _curve_verdict(
     name, value = flown.name, flown.value
     if flown.kind is None:
         return None
-    verdict = lambda text, estimate=None, change=None: CurveVerdict(
-        name, value, estimate, change, text
-    )
     try:
         estimate = gains.firmware_value(flown.kind)
     except UndeterminedError as error:
-        return verdict(str(error))
+        return CurveVerdict(name, value, str(error))
     low, high = estimate.interval
     shows = f"the log shows {estimate.value:.3g} (95 %: {low:.3g} .. {high:.3g})"
     if value is None:
-        return verdict(f"{name}: {shows}, not what flew, so that no file has it", estimate)
+        text = f"{name}: {shows}, not what flew, so that no file has it"
+        return CurveVerdict(name, value, text, estimate)
     if low <= value <= high:
-        return verdict(f"{name} {value:g} flew, and {shows}: it is kept", estimate)
+        return CurveVerdict(
+            name, value, f"{name} {value:g} flew, and {shows}: it is kept", estimate
+        )
     reason = f"proposal of its own: 95 % {low:.3g} .. {high:.3g}; all loops change with it"
     changes = propose_changes(
         firmware, {name: value}, {name: round(estimate.value, 3)}, reasons={name: reason}
     )
     if not changes:
-        return verdict(f"{name} {value:g} flew, and {shows}, stored as the same", estimate)
+        text = f"{name} {value:g} flew, and {shows}, stored as the same"
+        return CurveVerdict(name, value, text, estimate)
     # One gain at every throttle, and another throttle at hover.
     straight, curve = gains.straight_gain, gains.curve
     if straight is None or curve is None:
@@ -269,4 +232,4 @@ def _curve_verdict(
         f"the gains, which hold with the curve that flew: {moved}. Load it alone, fly, and tune "
         "the gains on that log"
     )
-    return verdict(text, estimate, changes[0])
+    return CurveVerdict(name, value, text, estimate, changes[0])

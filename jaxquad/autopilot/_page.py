@@ -3,12 +3,17 @@
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import NamedTuple, TYPE_CHECKING, TypeVar
+
+import numpy as np
+from jaxtyping import Float
 
 import jaxquad.plot as plot
 import jaxquad.report as report
 from jaxquad._core import write_file
 from jaxquad.identify import GainBand
 from jaxquad.plot import FlownAgain, Spectrum, StepBand, ThrottleCurve
+from jaxquad.records import AXES
 from jaxquad.report import (
     attempt,
     Cell,
@@ -16,74 +21,62 @@ from jaxquad.report import (
     Headline,
     Provenance,
     provenance_section,
+    reason_of,
     render_page,
     Table,
 )
 
+from ._filter_bank import gyro_noise, GyroNoise, hann_spectra, NoNoise, SLOWEST
 from ._filters import FilterChain
+from ._firmware import firmware_named
+from ._flight_channels import FlightChannels
+from ._law import RateLoop
+from ._parameters import gains_in, gains_of, ParameterChange, WordChange
+from ._rate_loops import gyro_chain_response, law_paths, StepGrid
+from ._stages import limits_text, Stage, WAYS
 
+
+if TYPE_CHECKING:
+    from ._proposal import AutopilotProposal
 
 Chains = Mapping[str, Sequence[FilterChain]]  # by the signal that they filter
 
 
-@dataclasses.dataclass(frozen=True)
-class B0Section:
-    """b0 over the throttle, for `jaxquad.plot.b0_figure`.
-
-    **Attributes:**
-
-    - `levels`, `curve`, `taken`: as the figure takes them.
-    - `text`: what they say, in words.
-    """
+class B0Section(NamedTuple):
+    """b0 over the throttle, for `jaxquad.plot.b0_figure`."""
 
     levels: GainBand
     taken: Mapping[str, ThrottleCurve]
     curve: GainBand | None = None
-    text: str = ""
+    text: str = ""  # what they say
 
 
 @dataclasses.dataclass(frozen=True)
 class PilotPage:
-    """What the page of a proposal shows; what is None or empty is left out.
-
-    **Attributes:**
-
-    - `title`: of the page; `headlines`: the verdict first.
-    - `remarks`: what of the firmware is not modelled, and other doubts.
-    - `filters`: the chains of "flown", and of "proposed" where they change, each by the signal that
-      they filter: "gyro", "D term".
-    - `gyro`, `derivative`: spectra by what they are, for `jaxquad.plot.spectra_figure`.
-    - `noise`: what the spectra are of, in words.
-    - `steps`: for `jaxquad.plot.steps_figure`, with `step_facts`.
-    - `b0`: over the throttle, of an ADRC.
-    - `terms`: root mean squares of P, I, D and F; `terms_are`: logged, or computed.
-    - `motors`: rows of name and shares of samples at the lowest and the highest command.
-    - `stages`, `changes`: tables.
-    - `unit`: of the command.
-    - `failures`: why a section could not be computed, by its name (a key of the page's sections:
-      "changes", "filters", "noise", "steps", "b0", "balance"); the reason stands in its place.
-    """
+    """What the page of a proposal shows; what is None or empty is left out."""
 
     title: str
-    headlines: Sequence[Headline]
-    filters: Mapping[str, Chains]
-    remarks: Sequence[str] = ()
+    headlines: Sequence[Headline]  # the verdict first
+    filters: Mapping[str, Chains]  # of "flown", and of "proposed" where they change
+    remarks: Sequence[str] = ()  # what of the firmware is not modelled, and other doubts
     gyro: Mapping[str, Spectrum] = dataclasses.field(default_factory=dict)
     derivative: Mapping[str, Spectrum] = dataclasses.field(default_factory=dict)
-    noise: str = ""
+    noise: str = ""  # what the spectra are of
     steps: Mapping[str, StepBand] = dataclasses.field(default_factory=dict)
-    b0: B0Section | None = None
-    terms: Mapping[str, float] = dataclasses.field(default_factory=dict)
-    terms_are: str = ""
+    b0: B0Section | None = None  # over the throttle, of an ADRC
+    terms: Mapping[str, float] = dataclasses.field(default_factory=dict)  # rms of P, I, D and F
+    terms_are: str = ""  # logged, or computed
+    # Rows of name and shares of samples at the lowest and the highest command.
     motors: Sequence[tuple[str, float, float]] = ()
     stages: Table | None = None
     changes: Table | None = None
     text: str = ""
-    unit: str = ""
+    unit: str = ""  # of the command
     again: FlownAgain | None = None
     again_text: str = ""
-    overview: str = ""
+    overview: str = ""  # title of a page of several axes
     provenance: Provenance | None = None
+    # Why a section could not be computed, by its name; the reason stands in its place.
     failures: Mapping[str, str] = dataclasses.field(default_factory=dict)
 
 
@@ -91,14 +84,8 @@ def write_pilot_page(path: str | Path, *pages: PilotPage) -> Path:
     """Write one self-contained HTML page on proposals for an autopilot, whole or not at all.
 
     It is made as `jaxquad.report.write_report` makes its page: figures inside it, nothing fetched,
-    texts from a log escaped, and a section or a figure that cannot be computed says why.
-
-    **Arguments:**
-
-    - `path`: of the page.
-    - `pages`: what it shows, one for each axis; the provenance is that of the first.
-
-    **Returns:** the path.
+    texts from a log escaped, and a section or a figure that cannot be computed says why. There is a
+    page for each axis; the provenance is that of the first. Returns the path.
     """
     first, origin = pages[0], pages[0].provenance
     axes = []
@@ -126,18 +113,29 @@ def write_pilot_page(path: str | Path, *pages: PilotPage) -> Path:
 # looked up when a page is written: with them comes matplotlib.
 
 PageSection = dict[str, object] | None
-_SHOWN = (10.0, 50.0)  # Hz, of a table of delays
+Rows = list[list[str | Cell]]
+_DELAYS = (10.0, 50.0)  # Hz, of a table of delays
 
 
 def filters_section(page: PilotPage) -> PageSection:
     """Magnitude and delay of what each signal has passed, and the shares of the delay."""
-    drawn = {}
+    drawn, tables = {}, []
+    heads = ("filter", "of", *(f"delay at {x:g} Hz, ms" for x in _DELAYS))
     for design, chains in page.filters.items():
         passed: list[FilterChain] = []  # what filters the gyro filters the D term, too
+        rows: Rows = []
         for signal, group in chains.items():
             passed = [*passed, *(chain for chain in group if chain.filters)]
             if passed:
                 drawn[f"{signal}, {design}"] = passed
+            total = [0.0] * len(_DELAYS)
+            for share in (share for chain in group for share in chain.shares(_DELAYS)[:-1]):
+                late = [float(x) for x in share.delay_ms]
+                total = [a + b for a, b in zip(total, late, strict=True)]
+                rows.append([Cell(share.name), signal, *(f"{x:.2f}" for x in late)])
+            rows.append([f"all of the {signal}'s", signal, *(f"{x:.2f}" for x in total)])
+        title = f"Filters {design}, with their shares of the delay"
+        tables.append(Table(title, heads, rows, texts=2))
     if not drawn:
         return {"image": None, "tables": []}
     image = report.embed_figure(
@@ -145,19 +143,6 @@ def filters_section(page: PilotPage) -> PageSection:
         alt=f"Magnitude and delay over the frequency of {', '.join(drawn)}.",
         caption="Magnitude and phase delay; what filters the gyro filters the D term, too.",
     )
-    heads = ("filter", "of", *(f"delay at {x:g} Hz, ms" for x in _SHOWN))
-    tables = []
-    for design, chains in page.filters.items():
-        rows: list[list[str | Cell]] = []
-        for signal, group in chains.items():
-            total = [0.0] * len(_SHOWN)
-            for share in (share for chain in group for share in chain.shares(_SHOWN)[:-1]):
-                late = [float(x) for x in share.delay_ms]
-                total = [a + b for a, b in zip(total, late, strict=True)]
-                rows.append([Cell(share.name), signal, *(f"{x:.2f}" for x in late)])
-            rows.append([f"all of the {signal}'s", signal, *(f"{x:.2f}" for x in total)])
-        title = f"Filters {design}, with their shares of the delay"
-        tables.append(Table(title, heads, rows, texts=2))
     return {"image": image, "tables": tables}
 
 
@@ -184,7 +169,7 @@ def steps_section(page: PilotPage) -> PageSection:
         caption="The logged rate after a step of 1 of the set-point, without feed-forward: median "
         "and 95 % of the plants that the log leaves possible.",
     )
-    rows: list[list[str | Cell]] = []
+    rows: Rows = []
     for name, band in page.steps.items():
         half = 1e3 * float(band.time[(band.middle >= 0.5).argmax()])
         over = [100 * max(float(x.max()) - 1, 0.0) for x in (band.middle, band.high)]
@@ -209,22 +194,21 @@ def again_section(page: PilotPage) -> PageSection:
 
 def b0_section(page: PilotPage) -> PageSection:
     """b0 over the throttle."""
-    section = page.b0
-    if section is None:
+    if page.b0 is None:
         return None
-    levels = section.levels
+    levels, taken, curve, text = page.b0
     image = report.embed_figure(
-        lambda: plot.b0_figure(levels, section.taken, curve=section.curve),
-        alt=f"b0 over the throttle: of the log, and {', '.join(section.taken)}.",
+        lambda: plot.b0_figure(levels, taken, curve=curve),
+        alt=f"b0 over the throttle: of the log, and {', '.join(taken)}.",
         caption="b0 over the throttle: gain / lag of the log with what it leaves uncertain, and "
         "what the ADRC takes.",
     )
-    rows: list[list[str | Cell]] = [
+    rows: Rows = [
         [f"{x:.2f}", f"{value:.0f}", f"{low:.0f} .. {high:.0f}"]
         for x, value, low, high in zip(*levels, strict=True)
     ]
     heads = ("throttle", "gain / lag, deg/s^3", "95 %")
-    return {"image": image, "table": Table("Levels flown", heads, rows), "text": section.text}
+    return {"image": image, "table": Table("Levels flown", heads, rows), "text": text}
 
 
 def balance_section(page: PilotPage) -> PageSection:
@@ -240,7 +224,7 @@ def balance_section(page: PilotPage) -> PageSection:
             caption=f"Root mean square of each term of the command in the log, {page.terms_are}; "
             "the mean of I is left out.",
         )
-    rows: list[list[str | Cell]] = [
+    rows: Rows = [
         [Cell(name), f"{100 * low:.2f}", f"{100 * high:.2f}"] for name, low, high in page.motors
     ]
     motors = Table("Motors at their limits", ("motor", "lowest, %", "highest, %"), rows)
@@ -255,3 +239,215 @@ SECTIONS: Mapping[str, Callable[[PilotPage], PageSection]] = {
     "b0": b0_section,
     "balance": balance_section,
 }
+
+_PLANTS, _SEED = 100, 77  # of the steps' bands
+_WINDOW = 4.0  # s, of computed terms
+_NEAR = 0.005  # of a motor's range, from its ends
+VERDICTS = {
+    "proposed": ("good", "PROPOSED"), "kept": ("good", "WHAT FLEW IS KEPT"),
+    "cannot tell": ("bad", "THIS LOG CANNOT TELL"), "not to be flown": ("bad", "NOT TO BE FLOWN"),
+}  # fmt: skip
+Designs = Mapping[str, tuple[RateLoop, Float[np.ndarray, " gains"]]]
+Part = TypeVar("Part")
+
+
+def pilot_page(proposal: "AutopilotProposal", origin: Provenance, overview: str) -> PilotPage:
+    """All that the page shows; what cannot be computed says why. `overview` is of all axes."""
+    flown, flight, new = proposal.flown, proposal.flight, proposal.new
+    law, axis, filters = flown.law, flown.axis, proposal.filters
+    failures: dict[str, str] = {}
+
+    def computed(section: str, compute: Callable[[], Part], missing: Part) -> Part:
+        try:
+            return compute()
+        except Exception as error:  # the page holds the rest
+            failures[section] = reason_of(error)
+            return missing
+
+    def shown_noise() -> GyroNoise | None:
+        if proposal.noise is not None or flight is None:
+            return proposal.noise
+        try:
+            return gyro_noise(flight, law, axis, SLOWEST)
+        except NoNoise:
+            return None
+
+    designs = {"flown": (law, gains_of(law, axis))}
+    if new:
+        changed = {} if filters is None else {name: new[name] for name in filters.flown}
+        after = flown.with_filters(changed) if changed else law
+        designs["proposed"] = (after, gains_in(law, axis, new))
+    noise = computed("noise", shown_noise, None)
+    spectra = lambda: ({}, {}) if noise is None else noise_spectra(noise, axis, designs)
+    gyro, derivative = computed("noise", spectra, ({}, {}))
+    steps = lambda: (
+        step_bands(proposal, designs) if proposal.identification.fit.identifiable else {}
+    )
+    logged = flight is not None and {"P", "I"} <= set(flight.terms)
+    compute_terms = lambda: (
+        {} if flight is None else logged_terms(flight) if logged
+        else computed_terms(flight, law, axis)
+    )  # fmt: skip
+    headlines = [Headline(*VERDICTS[proposal.kind], proposal.verdict)]
+    check, throttle = proposal.reproduction, proposal.throttle
+    if check is not None and check.kind == "flown":  # else the verdict says it
+        headlines.append(Headline("good", "THE FLOWN LOOP AGAIN", check.verdict))
+    if filters is not None:
+        headlines.append(Headline("good" if filters.flown else "warn", "FILTERS", filters.text))
+    if throttle is not None:
+        level = "warn" if throttle.gains is None else "good"
+        headlines.append(Headline(level, "THROTTLE", throttle.text))
+        if throttle.curve is not None:
+            level = "warn" if throttle.curve.change else "good"
+            headlines.append(Headline(level, "THRUST CURVE", throttle.curve.text))
+    version = ".".join(map(str, flown.version))
+    return PilotPage(
+        title=f"{flown.firmware} {version}, rate loop of {AXES[axis]}".replace(" ,", ","),
+        headlines=headlines,
+        remarks=[
+            *(f"not modelled: {text}" for text in flown.unmodelled),
+            *([flown.filters_text] if flown.filters_text else []),
+            *([limits_text(proposal.settings)] if new else []),
+        ],
+        filters={
+            name: chains_of(other, axis)
+            for name, (other, _) in designs.items() if name == "flown" or other is not law
+        },
+        gyro=gyro,
+        derivative=derivative,
+        noise="" if noise is None else (
+            f"Noise of {noise.source}, less what the set-point explains. Below "
+            f"{noise.least_hz:.0f} Hz motion is taken for noise, so the level above is used."
+        ),
+        steps=computed("steps", steps, {}),
+        terms=computed("balance", compute_terms, {}),
+        terms_are="as logged" if logged else "computed by the law from set-point and rate",
+        motors=[] if flight is None else motor_rows(flight),
+        stages=stage_rows(proposal) if proposal.stages else None,
+        changes=change_rows(proposal.changes) if new else None,
+        text=str(proposal),
+        unit=firmware_named(flown.firmware).unit,
+        again=None if check is None else FlownAgain(
+            check.time, check.setpoint, check.rate, check.again
+        ),
+        again_text="" if check is None else f"{check.verdict[0].upper()}{check.verdict[1:]}.",
+        overview=overview,
+        provenance=origin,
+        failures=failures,
+    )  # fmt: skip
+
+
+def chains_of(law: RateLoop, axis: int) -> dict[str, tuple[FilterChain, ...]]:
+    """The filters of the gyro and those of the D term alone."""
+    gyro, slope = law.gyro_chains(), law.derivative_chain(axis)
+    chains = {"gyro": tuple(chain for chain in gyro if chain.filters)}
+    if slope.filters and gains_of(law, axis)[2] > 0:
+        chains["D term"] = (slope,)
+    return chains
+
+
+def noise_spectra(
+    noise: GyroNoise, axis: int, designs: Designs
+) -> tuple[dict[str, Spectrum], dict[str, Spectrum]]:
+    """Of gyro and D term: before all filters, then behind those of each design."""
+    inside = (noise.before.hertz > 1.0) & (noise.before.hertz <= noise.known_hz)
+    hertz, before = noise.before.hertz[inside], noise.before.power[inside]
+    behind, (law, gains) = noise.behind.power[inside], designs["flown"]
+    omega = 2 * np.pi * np.minimum(hertz, 0.4999 / law.dt)
+    gyro, derivative = {"before the filters": Spectrum(hertz, before)}, {}
+    chain = gyro_chain_response(law, omega)
+    for name, (other, its_gains) in designs.items():
+        changed = np.abs(gyro_chain_response(other, omega) / chain) ** 2
+        if name == "flown" or other is not law:
+            gyro[name] = Spectrum(hertz, behind * changed)
+        through = np.abs(its_gains[2] * law_paths(other, axis, omega)[0][2]) ** 2
+        if name == "flown" and gains[2] > 0:
+            [slope] = chains_of(law, axis).get("D term", [FilterChain((), 1 / law.dt)])
+            open = before * through / np.abs(np.asarray(slope.response(hertz))) ** 2
+            derivative["before the filters"] = Spectrum(hertz, open)
+        if its_gains[2] > 0:
+            derivative[name] = Spectrum(hertz, behind * changed * through)
+    return gyro, derivative
+
+
+def step_bands(proposal: "AutopilotProposal", designs: Designs) -> dict[str, StepBand]:
+    """From set-point to rate, of plants drawn from the fit: by their responses."""
+    flown, seed = proposal.flown, proposal.settings.seed + _SEED
+    grid, steps = StepGrid.of(flown.law.dt), {}
+    loops = proposal.plants.loops(flown, _PLANTS, seed, omega=grid.omega)
+    for name, (law, gains) in designs.items():
+        mine = loops if law is flown.law else loops.of_law(law, flown.axis)
+        [back], [ahead] = mine.paths(gains[None])
+        steps[name] = grid.band(ahead * mine.plants / (1 + back * mine.plants))
+    return steps
+
+
+def logged_terms(flight: FlightChannels) -> dict[str, float]:
+    """Root mean squares of P, I, D and F as they were logged, I without its mean."""
+    moved = {name: x - x.mean() if name == "I" else x for name, x in flight.terms.items()}
+    return {name: float(np.sqrt(np.mean(x**2))) for name, x in moved.items()}
+
+
+def computed_terms(flight: FlightChannels, law: RateLoop, axis: int) -> dict[str, float]:
+    """Likewise, by the law from set-point and rate."""
+    size = min(int(_WINDOW / flight.dt), len(flight.setpoint))
+    hertz = np.fft.rfftfreq(size, flight.dt)
+    inside = (hertz > 0) & (hertz < 0.4999 / law.dt)
+    back, ahead = law_paths(law, axis, 2 * np.pi * hertz[inside])
+    rate = flight.rates[min(axis, len(flight.rates) - 1)]
+    r, y = (x[:, inside] for x in hann_spectra(size, flight.setpoint, rate))
+    terms = {}
+    for k, (name, gain) in enumerate(zip("PID", gains_of(law, axis), strict=True)):
+        power = np.mean(np.sum(np.abs(gain * (ahead[k] * r - back[k] * y)) ** 2, axis=1))
+        terms[name] = float(np.sqrt(2 * power / (size * np.sum(np.hanning(size) ** 2))))
+    return terms
+
+
+def motor_rows(flight: FlightChannels) -> list[tuple[str, float, float]]:
+    """Each motor's shares of samples at the lowest and at the highest command."""
+    low, high = flight.motor_ends
+    near = _NEAR * (high - low)
+    return [
+        (f"motor {k + 1}", float(np.mean(x <= low + near)), float(np.mean(x >= high - near)))
+        for k, x in enumerate(() if flight.motors is None else flight.motors.T)
+    ]
+
+
+def stage_rows(proposal: "AutopilotProposal") -> Table:
+    """What each set of gains gives on fresh plants."""
+    stages: dict[str, Stage] = dict(zip(WAYS, proposal.stages, strict=True))
+    levels = () if proposal.throttle is None else proposal.throttle.logged
+    if proposal.filters is not None and proposal.filters.flown and proposal.filters.gains_alone:
+        stages["gains alone, filters as flown"] = proposal.filters.gains_alone
+    further = lambda x: [  # with the integral held, and of the angle loop
+        *([] if x.relaxed is None else [f"{x.relaxed:.2f}"]),
+        *([] if x.angle is None else [f"{x.angle.peak:.2f}", f"{x.angle.resonance:.2f}"]),
+    ]
+    rows: Rows = [
+        [
+            name, f"{100 * x.stable:.1f}", f"{x.peak:.2f}", f"{x.resonance:.2f}",
+            f"{x.crossover / (2 * np.pi):.1f}", x.margin_text,
+            f"{x.rejection:.2f}", f"{x.noise:.2f}", *further(x),
+            *(f"{peak:.2f}" for peak in x.peaks[: len(levels)]),
+        ]
+        for name, x in stages.items()
+    ]  # fmt: skip
+    first = proposal.stages[0]
+    heads = (
+        "gains", "stable, %", "worst Ms", "worst peak", "crossover, Hz", "delay margin, ms",
+        "torque", "noise", *(("Ms, integral held",) if first.relaxed is not None else ()),
+        *(("Ms, angle loop", "peak, angle loop") if first.angle is not None else ()),
+        *(f"Ms at throttle {level:.2f}" for level in levels),
+    )  # fmt: skip
+    return Table(f"On {proposal.settings.fresh} fresh plants", heads, rows)
+
+
+def change_rows(changes: Sequence[ParameterChange], words: Sequence[WordChange] = ()) -> Table:
+    """Old, new, unit, range and reason, for the page."""
+    rows: Rows = [
+        [Cell(row.name), f"{old:.5g}", f"{new:.5g}", row.unit, row.range_text, reason]
+        for row, old, new, reason in changes
+    ]
+    rows += [[Cell(word.name), word.old, word.new, "", "", word.reason] for word in words]
+    heads = ("parameter", "old", "new", "unit", "range", "reason")
+    return Table("From what flew to the proposal", heads, rows)

@@ -1,27 +1,20 @@
-"""The firmwares' parameters: what is stored of them, and their places in a law."""
+"""Parameters of the firmwares: stored, in a law, changed, and in files that are loaded."""
 
 import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
-from typing import TypeVar
+from pathlib import Path
+from typing import NamedTuple, TypeVar
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
-from jaxquad._core import Number
+from jaxquad._core import Number, write_file
 from jaxquad.records import AXES
 from jaxquad.records.firmware import firmware_names
 
-from ._filters import Butterworth, Filter
-from ._firmware import (
-    cutoff_of,
-    FilterChoice,
-    FilterOption,
-    Firmware,
-    firmware_named,
-    LowPass,
-    Parameter,
-)
+from ._filters import Butterworth
+from ._firmware import firmware_named, joined_lines, number_text, Parameter
 from ._law import AngleLoop, FirmwareLoop, FlownLoop, RateLoop
 
 
@@ -29,16 +22,16 @@ Law = TypeVar("Law", bound=FirmwareLoop)
 
 
 class _Tables(Mapping[str, Mapping[str, Parameter]]):
-    def __getitem__(self, name: str) -> Mapping[str, Parameter]:
-        if name not in firmware_names():
-            raise KeyError(name)
-        return firmware_named(name).parameters
-
     def __iter__(self) -> Iterator[str]:
         return iter(firmware_names())
 
     def __len__(self) -> int:
         return len(firmware_names())
+
+    def __getitem__(self, name: str) -> Mapping[str, Parameter]:
+        if name not in firmware_names():
+            raise KeyError(name)
+        return firmware_named(name).parameters
 
 
 PARAMETERS: Mapping[str, Mapping[str, Parameter]] = _Tables()
@@ -58,11 +51,7 @@ def find_parameter(firmware: str, name: str) -> Parameter:
 
 
 def store_parameters(firmware: str, values: Mapping[str, Number]) -> dict[str, float]:
-    """What the firmware stores of these values: whole numbers, or single precision.
-
-    **Arguments:**
-
-    - `values`: by the parameters' names.
+    """What the firmware stores of values by their names: whole numbers, or single precision.
 
     **Raises:**
 
@@ -82,8 +71,8 @@ def check_ranges(firmware: str, values: Mapping[str, Number]) -> tuple[str, ...]
     beyond = []
     for name, value in values.items():
         row = find_parameter(firmware, name)
+        unit = f" {row.unit}" if row.unit else ""
         if not row.low * (1 - 1e-6) <= value <= row.high * (1 + 1e-6):
-            unit = f" {row.unit}" if row.unit else ""
             beyond.append(
                 f"{name} is {value:g}{unit}, beyond its documented range of {row.low:g} to "
                 f"{row.high:g}{unit}."
@@ -97,11 +86,10 @@ def firmware_of(law: FirmwareLoop) -> str:
 
 
 def list_parameters(law: FirmwareLoop, *, axes: Sequence[str] = AXES) -> dict[str, float]:
-    """The parameters that a law amounts to, not rounded.
+    """The parameters that a law amounts to, not rounded: gains, filters, those of an angle loop.
 
-    Gains and filters of a law, and the angle loop's where it has one; parameters of all axes, such
-    as a gyro filter, too. Not listed: Betaflight's filters, because their parameters are ranges
-    over the throttle.
+    Parameters of all axes, such as a gyro filter, are listed, too. Not listed: Betaflight's
+    filters, because their parameters are ranges over the throttle.
 
     **Arguments:**
 
@@ -195,24 +183,14 @@ def _replaced(law: Law, field: str, value: Array) -> Law:
     return dataclasses.replace(law, **{first: part})
 
 
-_STEPS = 8  # of a cutoff, to either side of the one that flew
-_HIGHEST = 0.45  # of the rate at which a filter runs
-_WIDTHS = (0.1, 0.2)  # half of a notch, of its centre
-
-
 def flown_loop(
-    firmware: str,
-    values: Mapping[str, str],
-    version: Sequence[int] = (),
-    *,
-    throttle: float = 0.3,
+    firmware: str, values: Mapping[str, str], version: Sequence[int] = (), *, throttle: float = 0.3,
     tracked_hz: Mapping[int, Sequence[float]] | None = None,
-) -> FlownLoop:
+) -> FlownLoop:  # fmt: skip
     """The rate loop of the parameters of a log.
 
     **Arguments:**
 
-    - `firmware`: "betaflight", "px4", "ardupilot", or one that is registered.
     - `values`, `version`: as `jq.records.read_settings` returns them.
     - `throttle`: 0 to 1, at which Betaflight's dynamic cutoffs and ArduPilot's notches are.
     - `tracked_hz`: as in `ardupilot_loop`.
@@ -226,94 +204,264 @@ def flown_loop(
     )
 
 
-def filter_choices(
-    firmware: str,
-    values: Mapping[str, str],
-    version: Sequence[int] = (),
-    *,
-    axis: int = 0,
-    throttle: float = 0.3,
-    change: float = 3.0,
-    line_hz: float | None = None,
-) -> tuple[FilterChoice, ...]:
-    """The low-passes of gyro and D term that are on, and a notch at a line of the gyro's noise.
-
-    Their kinds stay. A dynamic low-pass is moved as a whole, its lowest and its highest cutoff by
-    one factor. A notch is offered where one of the firmware's static notches is off.
-
-    **Arguments:**
-
-    - `firmware`, `values`, `version`, `throttle`: as in `flown_loop`.
-    - `axis`: 0, 1 or 2 for roll, pitch or yaw, whose own filters are offered.
-    - `change`: factor by which a cutoff may rise or fall, within its documented range.
-    - `line_hz`: of the line; None offers no notch.
-    """
-    kind = firmware_named(firmware)
-    loop = flown_loop(firmware, values, version, throttle=throttle)
-    choices = [
-        _low_pass_choice(firmware, low_pass, change)
-        for low_pass in kind.low_passes(loop, values, version, axis, throttle)
-    ]
-    if line_hz is not None:
-        choices += _notch_choices(kind, values, kind.notch_rate_hz(loop), line_hz)
-    return tuple(choice for choice in choices if len(choice.options) > 1)
-
-
-def _low_pass_choice(firmware: str, low_pass: LowPass, change: float) -> FilterChoice:
-    """Cutoffs that the firmware can store: whole numbers, or three digits in single precision."""
-    stage, flown, filter, rate_hz, shared = low_pass
-    cutoff, reach = cutoff_of(filter), np.linspace(0.0, np.log(change), _STEPS + 1)[1:]
-    options: dict[tuple[float, ...], FilterOption] = {}
-    for factor in [*np.exp(-reach[::-1]), 1.0, *np.exp(reach)]:
-        if factor == 1:
-            options[tuple(flown.values())] = FilterOption(dict(flown), filter)
-            continue
-        wanted = {name: float(f"{factor * value:.3g}") for name, value in flown.items()}
-        stored = store_parameters(firmware, wanted)
-        scaled = sum(stored.values()) / sum(flown.values()) * cutoff
-        rows = [find_parameter(firmware, name) for name in stored]
-        inside = all(
-            max(row.low, 1.0) <= value <= row.high
-            for row, value in zip(rows, stored.values(), strict=True)
-        )
-        if inside and scaled < _HIGHEST * rate_hz:
-            assert dataclasses.is_dataclass(filter) and not isinstance(filter, type)
-            moved = dataclasses.replace(filter, **{"cutoff_hz": scaled})
-            assert isinstance(moved, Filter)
-            options[tuple(stored.values())] = FilterOption(dict(stored), moved)
-    at = [*options].index(tuple(flown.values()))
-    return FilterChoice(stage, shared, rate_hz, tuple(options.values()), at)
-
-
-def _notch_choices(
-    firmware: Firmware, values: Mapping[str, str], rate_hz: float, line_hz: float
-) -> list[FilterChoice]:
-    """A static notch that is off, on the line: narrow or wide."""
-    line = float(np.rint(line_hz))
-    flown = zip(firmware.notches, firmware.flown_notches(values), strict=False)
-    free = [(names, second) for names, (centre, second) in flown if centre == 0]
-    if not free or line >= _HIGHEST * rate_hz:
-        return []
-    names, second = free[0]
-    options = [FilterOption(dict(zip(names, (0.0, second), strict=True)), None)]
-    for half_width in _WIDTHS:
-        pair = line, firmware.notch_width(line, half_width)
-        options.append(FilterOption(dict(zip(names, pair, strict=True)), firmware.notch(*pair)))
-    return [FilterChoice("gyro", True, rate_hz, tuple(options), 0)]
-
-
 def change_filters(
     firmware: str, values: Mapping[str, str], parameters: Mapping[str, Number]
 ) -> dict[str, str]:
-    """The values of a log as they would be with other filters.
-
-    **Arguments:**
-
-    - `firmware`, `values`: as in `flown_loop`.
-    - `parameters`: new cutoffs and notches by their names in `PARAMETERS`.
+    """The values of a log as they would be with other cutoffs and notches, by their names.
 
     **Raises:**
 
     - `ValueError`: Betaflight's header has no line for one of them.
     """
     return firmware_named(firmware).change_filters(values, parameters)
+
+
+FIELDS = ("p", "i", "d")
+Gains = Float[np.ndarray, " gains"]
+
+
+def names_by_field(firmware: str, axis: int) -> dict[str, str]:
+    """The parameters of one axis, by the field of the law that each sets."""
+    return {row.field: row.name for row in PARAMETERS[firmware].values() if row.axis == axis}
+
+
+def gains_of(law: RateLoop, axis: int) -> Gains:
+    """P, I and D of one axis."""
+    return np.array([float(np.broadcast_to(vars(law)[name], (3,))[axis]) for name in FIELDS])
+
+
+def gains_in(law: RateLoop, axis: int, parameters: Mapping[str, Number]) -> Gains:
+    """P, I and D of parameters; those that are not named stay."""
+    gains, names = gains_of(law, axis), names_by_field(law.firmware, axis)
+    for k, field in enumerate(FIELDS):
+        gains[k] = parameters.get(names.get(field, ""), gains[k])
+    return gains
+
+
+def parameters_of(law: RateLoop, axis: int, gains: Gains) -> dict[str, float]:
+    """The parameters that stand for these gains; a ceiling of D rises with D."""
+    names = names_by_field(law.firmware, axis)
+    flown = zip(FIELDS, gains, gains_of(law, axis), strict=True)
+    values = {names[field]: float(gain) for field, gain, old in flown if old > 0}
+    if (ceiling := law.d_ceiling(axis)) > 1:
+        values[names["d_max.ceiling"]] = ceiling * float(gains[2])
+    return store_parameters(law.firmware, values)
+
+
+def ceiling_in(law: RateLoop, axis: int, designs: Sequence[Mapping[str, Number]]) -> float:
+    """The most by which D can rise in flight under one of these stored sets of parameters."""
+    name, most = names_by_field(law.firmware, axis).get("d_max.ceiling", ""), law.d_ceiling(axis)
+    for design in designs:
+        base = gains_in(law, axis, design)[2]
+        if (top := design.get(name)) and base > 0:
+            most = max(most, float(top / base))
+    return most
+
+
+class ParameterChange(NamedTuple):
+    """One parameter, from what flew to what is proposed, as the firmware stores both."""
+
+    parameter: Parameter
+    old: float
+    new: float
+    reason: str = ""  # why it changes
+
+
+class WordChange(NamedTuple):
+    """A parameter of Betaflight that holds a word, such as pid_type."""
+
+    name: str
+    old: str
+    new: str
+    reason: str = ""  # why it changes
+
+
+def propose_changes(
+    firmware: str, old: Mapping[str, Number], new: Mapping[str, Number], *, share: Number = 1.0,
+    reasons: Mapping[str, str] | None = None, beyond: Sequence[str] = (),
+    at_once: Sequence[str] = (),
+) -> tuple[ParameterChange, ...]:  # fmt: skip
+    """What changes between two sets of parameters once both are stored by the firmware.
+
+    The changes are in the order of the firmware's table, without those that rounding undoes.
+
+    **Arguments:**
+
+    - `old`: what flew, by name; `new`: what is wanted. Names that are in `old` alone stay.
+    - `share`: how much of the way to go, above 0 and at most 1: 1/3 for a first flight.
+    - `reasons`: by name.
+    - `beyond`: names that may lie beyond their documented range.
+    - `at_once`: names that go all of the way at any share, such as a notch that is switched on.
+
+    **Raises:**
+
+    - `ValueError`: a name is unknown or not in `old`, or a value is beyond its documented range.
+    """
+    if not 0 < share <= 1:
+        raise ValueError(f"share is {share}: give the part of the way, above 0 and at most 1.")
+    unknown = [name for name in new if name not in old]
+    if unknown:
+        raise ValueError(
+            f"{', '.join(unknown)} would change, but what flew is not known: give it in `old`, so "
+            "that the change can be reverted."
+        )
+    part = lambda name: 1.0 if name in at_once else share
+    wanted = {name: old[name] + part(name) * (value - old[name]) for name, value in new.items()}
+    stored = store_parameters(firmware, wanted)
+    outside = {name: value for name, value in stored.items() if name not in beyond}
+    if said := check_ranges(firmware, outside):
+        raise ValueError(f"{' '.join(said)} Allow it with beyond=, or change it.")
+    before, why = store_parameters(firmware, {name: old[name] for name in new}), reasons or {}
+    return tuple(
+        ParameterChange(row, before[name], stored[name], why.get(name, ""))
+        for name, row in PARAMETERS[firmware].items()
+        if stored.get(name) != before.get(name)
+    )
+
+
+def parameter_file(
+    firmware: str, changes: Sequence[ParameterChange], *, revert: bool = False,
+    version: tuple[int, ...] = (2025, 12), profile: int | None = 0,
+    raised: Sequence[str] = ("roll", "pitch", "yaw"), title: str = "",
+    words: Sequence[WordChange] = (),
+) -> str:  # fmt: skip
+    """The text to load: Betaflight's CLI, PX4's .params, ArduPilot's .param, Crazyflie's YAML.
+
+    The other value of each parameter is in a comment where the format allows it.
+
+    **Arguments:**
+
+    - `revert`: whether to write the old values, to go back to what flew.
+    - `version`: of Betaflight, whose names differ: until 4.5 d is d_min, and the maximum d.
+    - `profile`: of Betaflight, the PID profile that is changed; None is the one in use.
+    - `raised`: of Betaflight until 4.5, the axes on which d_min is in use; on others d is d.
+    - `title`: comment; its lines begin the file.
+    - `words`: of Betaflight, what changes beside numbers; set last.
+
+    **Raises:**
+
+    - `ValueError`: a parameter does not exist in this version of Betaflight, or another firmware
+        is to change words.
+    """
+    kind = firmware_named(firmware)
+    if words and not kind.words:
+        raise ValueError(f"{words[0].name} is a word, and {firmware} stores numbers alone.")
+    values = [(x.parameter, *((x.old, x.new) if revert else (x.new, x.old))) for x in changes]
+    pairs = [(x.name, *((x.old, x.new) if revert else (x.new, x.old))) for x in words]
+    return kind.parameter_file(
+        values, title, version=version, profile=profile, raised=raised, words=pairs
+    )
+
+
+def change_table(changes: Sequence[ParameterChange], words: Sequence[WordChange] = ()) -> str:
+    """The changes as a table in Markdown: old, new, unit, documented range and reason."""
+    rows = ["| parameter | old | new | unit | range | reason |", "|---|---|---|---|---|---|"]
+    for row, old, new, reason in changes:
+        numbers = f"{number_text(old, row.integer)} | {number_text(new, row.integer)}"
+        rows.append(f"| {row.name} | {numbers} | {row.unit} | {row.range_text} | {reason} |")
+    rows += [f"| {name} | {old} | {new} |  |  | {reason} |" for name, old, new, reason in words]
+    return joined_lines(rows)
+
+
+class ParameterFiles(NamedTuple):
+    """Where a staged proposal was written."""
+
+    stages: tuple[Path, ...]  # a file for each share of the way, the smallest first
+    revert: Path  # back to what flew, from any of them
+    table: Path  # old, new, unit, range and reason, for each stage
+
+
+def write_parameter_files(
+    folder: str | Path, firmware: str, old: Mapping[str, Number], new: Mapping[str, Number], *,
+    stem: str = "proposal", shares: Sequence[Number] = (1 / 3, 1.0),
+    reasons: Mapping[str, str] | None = None, beyond: Sequence[str] = (),
+    at_once: Sequence[str] = (), version: tuple[int, ...] = (2025, 12), profile: int | None = 0,
+) -> ParameterFiles:  # fmt: skip
+    """Write a staged proposal, a file that reverts it, and a table of what changes.
+
+    **Arguments:**
+
+    - `stem`: begins the files' names; the share in percent follows.
+    - `shares`: of the way, each in a file of its own.
+    - the others: as in `propose_changes` and `parameter_file`.
+
+    **Raises:**
+
+    - `ValueError`: as in `propose_changes` and `parameter_file`, or nothing changes.
+    """
+    folder, suffix = Path(folder), firmware_named(firmware).suffix
+    raised = [x for x in AXES if old.get(f"d_max_{x}", 0.0) > old.get(f"d_{x}", 0.0)]
+    text = lambda changes, title, back=False: parameter_file(
+        firmware, changes, revert=back, version=version, profile=profile, raised=raised, title=title
+    )
+    stages, table, changes = [], [], ()
+    for share in sorted(shares):
+        changes = propose_changes(
+            firmware, old, new, share=share, beyond=beyond, at_once=at_once,
+            reasons=reasons if share >= 1 else {x: f"on the way to {new[x]:.5g}" for x in new},
+        )  # fmt: skip
+        percent = round(100 * share)
+        title = f"{percent} % of the way from what flew to the proposal"
+        stages.append((folder / f"{stem}_{percent:03d}.{suffix}", text(changes, title)))
+        table.append(f"## {title}\n\n{change_table(changes)}")
+    if not changes:
+        raise ValueError(
+            "Nothing changes: what is proposed is stored as the values that flew. Propose more, or "
+            "leave the files out."
+        )
+    back = write_file(folder / f"{stem}_revert.{suffix}", text(changes, "what flew", True))
+    written = tuple(write_file(path, content) for path, content in stages)
+    return ParameterFiles(written, back, write_file(folder / f"{stem}.md", "\n".join(table)))
+
+
+_STEM = "proposal"
+
+
+@dataclasses.dataclass(frozen=True)
+class ProposedParameters:
+    """Old and new values by the firmware's names, of one axis or of all."""
+
+    firmware: str
+    version: tuple[int, ...]
+    old: dict[str, float]
+    new: dict[str, float]  # empty where nothing is proposed
+    reasons: Mapping[str, str]  # for each new one
+    at_once: tuple[str, ...]  # those that have no third of the way
+
+    @classmethod
+    def joined(cls, parts: Sequence["ProposedParameters"]) -> "ProposedParameters":
+        """Of several axes; what they share is the first one's."""
+        first, old, new, reasons = parts[0], {}, {}, {}
+        for part in reversed(parts):
+            old, new, reasons = old | part.old, new | part.new, reasons | dict(part.reasons)
+        at_once = tuple(dict.fromkeys(name for part in parts for name in part.at_once))
+        order = {name: None for part in parts for name in part.old}
+        in_order = lambda values: {name: values[name] for name in order if name in values}
+        return cls(first.firmware, first.version, in_order(old), in_order(new), reasons, at_once)
+
+    def write(self, folder: Path) -> list[Path]:
+        """A third of the way, all of it, what reverts them and a table; or what flew alone."""
+        if not self.new:
+            same = [
+                ParameterChange(find_parameter(self.firmware, name), value, value)
+                for name, value in self.old.items()
+            ]
+            return [self.write_one(f"{_STEM}_revert", same, "what flew", folder, revert=True)]
+        files = write_parameter_files(
+            folder, self.firmware, self.old, self.new, stem=_STEM, shares=(1 / 3, 1.0),
+            reasons=self.reasons, beyond=list(self.new), version=self.version or (2025, 12),
+            at_once=self.at_once, profile=None,
+        )  # fmt: skip
+        return [*files.stages, files.revert, files.table]
+
+    def write_one(
+        self, stem: str, changes: Sequence[ParameterChange], title: str, folder: Path, *,
+        revert: bool,
+    ) -> Path:  # fmt: skip
+        """One file with these changes, or with what they were."""
+        raised = [axis for axis in AXES if f"d_max_{axis}" in self.old]
+        text = parameter_file(
+            self.firmware, changes, revert=revert, version=self.version or (2025, 12),
+            raised=raised, title=title, profile=None,
+        )  # fmt: skip
+        return write_file(folder / f"{stem}.{firmware_named(self.firmware).suffix}", text)

@@ -2,101 +2,24 @@
 
 import dataclasses
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
-from jaxquad._core import announce, Message, plain_content, write_file
+from jaxquad._core import announce, Message, plain_content
 from jaxquad.records import AXES
 from jaxquad.report import Provenance, provenance, write_json
 
-from ._files import (
-    change_table,
-    parameter_file,
-    ParameterChange,
-    propose_changes,
-    write_parameter_files,
-)
+from ._filter_bank import GyroNoise
 from ._firmware import firmware_named
-from ._flight_channels import FlightChannels, FlownAutopilot
-from ._gyro_noise import GyroNoise
-from ._identified import DesignSettings, IdentifiedPlant
+from ._flight_channels import FlightChannels, FlownAutopilot, IdentifiedPlant
 from ._law_check import LoopCheck
 from ._over_throttle import ThrottleVerdict
-from ._page import write_pilot_page
-from ._parameters import find_parameter
-from ._pilot_page import pilot_page
-from ._rate_design import FilterVerdict, Kind
+from ._page import pilot_page, PilotPage, write_pilot_page
+from ._parameters import change_table, ParameterChange, propose_changes, ProposedParameters
 from ._rate_loops import PlantSource
-from ._stages import limits_text, Stage
-
-
-_THIRD, _ALL = 1 / 3, 1.0
-_STEM = "proposal"
-
-
-@dataclasses.dataclass(frozen=True)
-class ProposedParameters:
-    """Old and new values by the firmware's names, of one axis or of all.
-
-    **Attributes:**
-
-    - `old`: what flew; `new`: what is proposed, empty where nothing is.
-    - `reasons`: for each new one; `at_once`: those that have no third of the way.
-    """
-
-    firmware: str
-    version: tuple[int, ...]
-    old: dict[str, float]
-    new: dict[str, float] = dataclasses.field(default_factory=dict)
-    reasons: Mapping[str, str] = dataclasses.field(default_factory=dict)
-    at_once: tuple[str, ...] = ()
-
-    @classmethod
-    def joined(cls, parts: Sequence["ProposedParameters"]) -> "ProposedParameters":
-        """Of several axes; what they share is the first one's."""
-        first, old, new, reasons = parts[0], {}, {}, {}
-        for part in reversed(parts):
-            old, new, reasons = old | part.old, new | part.new, reasons | dict(part.reasons)
-        at_once = tuple(dict.fromkeys(name for part in parts for name in part.at_once))
-        order = {name: None for part in parts for name in part.old}
-        in_order = lambda values: {name: values[name] for name in order if name in values}
-        return cls(first.firmware, first.version, in_order(old), in_order(new), reasons, at_once)
-
-    @property
-    def changes(self) -> tuple[ParameterChange, ...]:
-        """From what flew to the proposal."""
-        return propose_changes(
-            self.firmware, self.old, self.new, reasons=self.reasons, beyond=list(self.new)
-        )
-
-    def write(self, folder: Path) -> list[Path]:
-        """A third of the way, all of it, what reverts them and a table; or what flew alone."""
-        if not self.new:
-            same = [
-                ParameterChange(find_parameter(self.firmware, name), value, value)
-                for name, value in self.old.items()
-            ]
-            return [self.write_one(f"{_STEM}_revert", same, "what flew", folder, revert=True)]
-        files = write_parameter_files(
-            folder, self.firmware, self.old, self.new, stem=_STEM, shares=(_THIRD, _ALL),
-            reasons=self.reasons, beyond=list(self.new), version=self.version or (2025, 12),
-            at_once=self.at_once, profile=None,
-        )  # fmt: skip
-        return [*files.stages, files.revert, files.table]
-
-    def write_one(
-        self, stem: str, changes: Sequence[ParameterChange], title: str, folder: Path, *,
-        revert: bool,
-    ) -> Path:  # fmt: skip
-        """One file with these changes, or with what they were."""
-        raised = [axis for axis in AXES if f"d_max_{axis}" in self.old]
-        text = parameter_file(
-            self.firmware, changes, revert=revert, version=self.version or (2025, 12),
-            raised=raised, title=title, profile=None,
-        )  # fmt: skip
-        return write_file(folder / f"{stem}.{firmware_named(self.firmware).suffix}", text)
+from ._stages import DesignSettings, FilterVerdict, Kind, limits_text, Stage, WAYS
 
 
 _CURVE = "thrust_curve"
@@ -105,46 +28,35 @@ _FAR = 0.98  # of the factor by which a gain may change
 
 @dataclasses.dataclass(frozen=True)
 class AutopilotProposal:
-    """What `autopilot` found in a log, and what it proposes; `str()` is its report as text.
+    """What `autopilot` found in a log, and what it proposes; `str()` is its report as text."""
 
-    **Attributes:**
-
-    - `kind`: "proposed"; "kept" where what flew is as good; "cannot tell" where the log does not
-      show the plant or the loop; "not to be flown" where no gains keep the limits.
-    - `verdict`: the same in words, and what to do.
-    - `identification`: of the plant, in the firmware's units, with the gyro's filters divided out.
-    - `flown`: the loop that flew.
-    - `reproduction`: that loop and plant compared with the flight; None without a plant.
-    - `stages`: on fresh plants what flew, then a third of the way and all of it; empty where the
-      log cannot tell.
-    - `old`, `new`: the parameters by name; `new` is empty where nothing is proposed.
-    - `filters`: what freeing the filters brings, or why they stay as they flew; None without a
-      search.
-    - `noise`: of the gyros, where the log shows it; `flight`: the channels that were read.
-    - `throttle`: at which throttles the gains hold, and the thrust curve, which is proposed apart
-      from them; None where the log cannot tell.
-    """
-
+    # "kept": what flew is as good. "cannot tell": the log does not show the plant or the loop. "not
+    # to be flown": no gains keep the limits.
     kind: Kind
-    verdict: str
+    verdict: str  # in words, and what to do
     settings: DesignSettings
-    identification: IdentifiedPlant
+    identification: IdentifiedPlant  # in the firmware's units, the gyro's filters divided out
     flown: FlownAutopilot
-    reproduction: LoopCheck | None
+    reproduction: LoopCheck | None  # that loop and plant compared with the flight
+    # On fresh plants: what flew, a third of the way and all of it. Empty where the log cannot tell.
     stages: tuple[Stage, ...] = ()
-    new: Mapping[str, float] = dataclasses.field(default_factory=dict)
-    filters: FilterVerdict | None = None
-    noise: GyroNoise | None = None
-    flight: FlightChannels | None = None
-    throttle: ThrottleVerdict | None = None
+    new: Mapping[str, float] = dataclasses.field(default_factory=dict)  # what is proposed, if any
+    filters: FilterVerdict | None = None  # what freeing them brings; None without a search
+    noise: GyroNoise | None = None  # of the gyros, where the log shows it
+    throttle: ThrottleVerdict | None = None  # where gains hold, and the thrust curve, apart
+
+    @property
+    def flight(self) -> FlightChannels | None:
+        """The channels that were read."""
+        return self.flown.flight
 
     @property
     def plants(self) -> PlantSource:
         """What the log leaves possible."""
-        plant, measured = self.identification, self.flown.measured
-        if self.throttle is not None:
-            return self.throttle.plants(plant, measured)
-        return PlantSource(plant.fit, plant.records[0].output_units[0], filters=measured)
+        fit, unit = self.identification.fit, self.identification.records[0].output_units[0]
+        at = self.throttle
+        over, span = (None, (0.0, 1.0)) if at is None else (at.gains, at.span)
+        return PlantSource(fit, unit, over, span, self.flown.measured)
 
     @property
     def old(self) -> dict[str, float]:
@@ -176,7 +88,8 @@ class AutopilotProposal:
     @property
     def changes(self) -> tuple[ParameterChange, ...]:
         """From what flew to the proposal."""
-        return self.parameters.changes
+        x = self.parameters
+        return propose_changes(x.firmware, x.old, x.new, reasons=x.reasons, beyond=list(x.new))
 
     @property
     def _reasons(self) -> dict[str, str]:
@@ -205,6 +118,18 @@ class AutopilotProposal:
 
     def content(self) -> dict[str, object]:
         """All of it, for JSON."""
+        fit = self.identification.fit
+        plant: dict[str, object] = {"verdict": fit.verdict.summary}
+        if fit.verdict.fitted:
+            numbers = lambda values: dict(zip(fit.names, map(float, values), strict=True))
+            plant |= numbers(fit.values) | {
+                "standard_errors": numbers(fit.standard_errors),
+                "intervals_95": {name: list(map(float, fit.interval(name))) for name in fit.names},
+                "units": dict(zip(fit.names, fit.parameter_units, strict=True)),
+                "band_rad_s": list(self.identification.band),
+                "misfit_over_errors": float(np.sqrt(fit.chi_squared)),
+            }
+        part = lambda x: None if x is None else x.content()
         content = {
             "kind": self.kind,
             "verdict": self.verdict,
@@ -217,52 +142,22 @@ class AutopilotProposal:
             "old": self.old,
             "new": dict(self.new),
             "stages": [stage.content() for stage in self.stages],
-            "filters": None if self.filters is None else self.filters.content(),
-            "noise": None if self.noise is None else self.noise.content(),
-            "throttle": None if self.throttle is None else self.throttle.content(),
-            "reproduction": None if self.reproduction is None else self.reproduction.content(),
-            "plant": self._plant,
+            "filters": part(self.filters),
+            "noise": part(self.noise),
+            "throttle": part(self.throttle),
+            "reproduction": part(self.reproduction),
+            "plant": plant,
             "settings": self.settings.content(),
             "identified_with": self.identification.settings.content(),
         }
         return {key: plain_content(value) for key, value in content.items()}
-
-    @property
-    def _plant(self) -> dict[str, object]:
-        fit = self.identification.fit
-        if not fit.verdict.fitted:
-            return {"verdict": fit.verdict.summary}
-        errors = zip(fit.names, map(float, fit.standard_errors), strict=True)
-        return {
-            "verdict": fit.verdict.summary,
-            **dict(zip(fit.names, map(float, fit.values), strict=True)),
-            "standard_errors": dict(errors),
-            "intervals_95": {name: list(map(float, fit.interval(name))) for name in fit.names},
-            "units": dict(zip(fit.names, fit.parameter_units, strict=True)),
-            "band_rad_s": list(self.identification.band),
-            "misfit_over_errors": float(np.sqrt(fit.chi_squared)),
-        }
 
     def write(self, folder: str | Path) -> list[Path]:
         """Write the page, `autopilot.json`, and parameter files: without a proposal what flew.
 
         **Returns:** their paths.
         """
-        announce("parameter files")
-        folder, origin = Path(folder), self.provenance(self.settings)
-        stored = write_json(
-            folder / "autopilot.json", self.content() | {"provenance": origin.content()}
-        )
-        announce("the page")
-        page = write_pilot_page(folder / "autopilot.html", pilot_page(self, origin))
-        return [page, stored, *self.write_curve(folder), *self.parameters.write(folder)]
-
-    def provenance(self, settings: DesignSettings) -> Provenance:
-        """Of a result with these settings."""
-        stated = {k: v for k, v in settings.content().items() if v is not None}
-        log = self.identification.path
-        words = ["jaxquad", "autopilot", str(log), *settings.words()]
-        return provenance(log, command=shlex.join(words), settings=stated)
+        return _write_axes(Path(folder), self, [self])
 
     def write_curve(self, folder: Path) -> list[Path]:
         """The thrust curve's parameter and what flew of it, never in a file with gains."""
@@ -294,13 +189,19 @@ class AutopilotProposal:
             lines += ["", f"flown loop: {again.verdict}"]
         if self.stages:
             lines += ["", _stage_table(self.stages)]
-        if self.throttle is not None:
-            lines += ["", *_throttle_lines(self.throttle, self.stages)]
+        throttle, curve = self.throttle, None
+        if throttle is not None:
+            curve = throttle.curve
+            lines += ["", f"throttle: {throttle.text}"]
+            lines += [] if throttle.gains is None else [throttle.table]
+        if throttle is not None and throttle.gains is not None and self.stages:
+            row = lambda name, numbers: f"{name:<20} " + " ".join(f"{x:6.2f}" for x in numbers)
+            lines += ["", row("worst Ms at throttle", throttle.logged)]
+            lines += [row(x, stage.peaks) for x, stage in zip(WAYS, self.stages, strict=False)]
         if self.filters is not None:
             lines += ["", f"filters: {self.filters.text}"]
         if self.kind == "proposed":
             lines += ["", change_table(self.changes).rstrip(), "", limits_text(self.settings)]
-        curve = None if self.throttle is None else self.throttle.curve
         if curve is not None:
             lines += ["", f"thrust curve: {curve.text}"]
             if curve.change is not None:
@@ -309,26 +210,10 @@ class AutopilotProposal:
         return "\n".join([*lines, "", Message(self.verdict).in_words(lambda summary: below)])
 
 
-_WAYS = ("what flew", "a third of the way", "all of it")
-
-
 _OF_STAGES = """(fresh plants: drawn from what the log leaves possible, not tuned on; Ms and
 resonance: peaks of |S| and of the response to the set-point; torque: the rate after a step of
 torque, noise: that of the command, both over those of what flew)"""
 _OF_HELD = "(Ms held: without the integral, which iterm_relax holds while the set-point moves)"
-
-
-def _throttle_lines(throttle: ThrottleVerdict, stages: tuple[Stage, ...]) -> list[str]:
-    lines = [f"throttle: {throttle.text}"]
-    if throttle.gains is None:
-        return lines
-    lines.append(throttle.table)
-    if stages:
-        heads = " ".join(f"{level:6.2f}" for level in throttle.logged)
-        lines += ["", f"{'worst Ms at throttle':<20} {heads}"]
-        for name, stage in zip(_WAYS, stages, strict=False):
-            lines.append(f"{name:<20} " + " ".join(f"{peak:6.2f}" for peak in stage.peaks))
-    return lines
 
 
 def _stage_table(stages: tuple[Stage, ...]) -> str:
@@ -337,7 +222,7 @@ def _stage_table(stages: tuple[Stage, ...]) -> str:
     around = "   Ms angle" if first.angle is not None else ""
     heads = "stable   worst Ms   resonance   crossover   delay margin   torque   noise"
     rows = [f"{'on fresh plants':<20} {heads}{relaxed}{around}"]
-    for name, stage in zip(_WAYS, stages, strict=False):
+    for name, stage in zip(WAYS, stages, strict=False):
         row = (
             f"{name:<20} {100 * stage.stable:5.1f} % {stage.peak:9.2f} {stage.resonance:9.2f} "
             f"  {stage.crossover / (2 * np.pi):8.1f} Hz {stage.margin_text:>9} ms "
@@ -358,17 +243,11 @@ _ORDER: tuple[Kind, ...] = ("proposed", "kept", "not to be flown", "cannot tell"
 
 @dataclasses.dataclass(frozen=True)
 class AxesProposal:
-    """What `autopilot` found for each axis of a log; `str()` is its report as text.
-
-    **Attributes:**
-
-    - `axes`: an `AutopilotProposal` by the axis' name.
-    - `unread`: why an axis is not among them.
-    """
+    """What `autopilot` found for each axis of a log; `str()` is its report as text."""
 
     settings: DesignSettings
-    axes: Mapping[str, AutopilotProposal]
-    unread: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    axes: Mapping[str, AutopilotProposal]  # by the axis' name
+    unread: Mapping[str, str] = dataclasses.field(default_factory=dict)  # why one is not there
 
     @property
     def kind(self) -> Kind:
@@ -385,15 +264,16 @@ class AxesProposal:
     @property
     def new(self) -> dict[str, float]:
         """The proposed parameters of all axes by name."""
-        return self._parameters.new
+        return self.parameters.new
 
     @property
     def old(self) -> dict[str, float]:
         """What flew of them; without a proposal what flew of all axes."""
-        return self._parameters.old
+        return self.parameters.old
 
     @property
-    def _parameters(self) -> ProposedParameters:
+    def parameters(self) -> ProposedParameters:
+        """Of the axes that have a proposal; without one of all axes."""
         parts = [one.parameters for one in self.axes.values()]
         proposed = [part for part in parts if part.new]
         return ProposedParameters.joined(proposed or parts)
@@ -415,21 +295,7 @@ class AxesProposal:
 
         **Returns:** their paths.
         """
-        announce("parameter files")
-        folder, first = Path(folder), next(iter(self.axes.values()))
-        origin = first.provenance(self.settings)
-        stored = write_json(
-            folder / "autopilot.json", self.content() | {"provenance": origin.content()}
-        )
-        curves = (one.write_curve(folder) for one in self.axes.values())
-        curve = next((paths for paths in curves if paths), [])
-        files = self._parameters.write(folder)
-        announce("the page")
-        flown = first.flown
-        overview = f"{flown.firmware} {'.'.join(map(str, flown.version))}, rate loops".strip()
-        pages = [pilot_page(one, origin, overview) for one in self.axes.values()]
-        page = write_pilot_page(folder / "autopilot.html", *pages)
-        return [page, stored, *curve, *files]
+        return _write_axes(Path(folder), self, [*self.axes.values()])
 
     def __str__(self) -> str:
         parts = [str(one) for one in self.axes.values()]
@@ -437,3 +303,34 @@ class AxesProposal:
         if len(self.axes) > 1:
             parts.append(f"All axes:\n{self.verdict}")
         return "\n\n".join(parts)
+
+
+def _write_axes(
+    folder: Path, result: AutopilotProposal | AxesProposal, axes: Sequence[AutopilotProposal]
+) -> list[Path]:
+    """With the thrust curve, and one parameter file of all axes for each stage."""
+    flown = axes[0].flown
+    overview = f"{flown.firmware} {'.'.join(map(str, flown.version))}, rate loops".strip()
+
+    def files() -> list[Path]:
+        curves = (one.write_curve(folder) for one in axes)
+        return [*next((paths for paths in curves if paths), []), *result.parameters.write(folder)]
+
+    pages = lambda origin: [pilot_page(one, origin, overview) for one in axes]
+    log, settings = axes[0].identification.path, result.settings
+    return write_result(folder, log, settings, result.content(), files, pages)
+
+
+def write_result(
+    folder: Path, log: Path, settings: DesignSettings, content: Mapping[str, object],
+    files: Callable[[], Sequence[Path]], pages: Callable[[Provenance], Sequence[PilotPage]],
+) -> list[Path]:  # fmt: skip
+    """The page, the JSON with where it is from, and what `files` writes."""
+    announce("parameter files")
+    stated = {k: v for k, v in settings.content().items() if v is not None}
+    words = ["jaxquad", "autopilot", str(log), *settings.words()]
+    origin = provenance(log, command=shlex.join(words), settings=stated)
+    with_origin = {**content, "provenance": origin.content()}
+    stored, written = write_json(folder / "autopilot.json", with_origin), files()
+    announce("the page")
+    return [write_pilot_page(folder / "autopilot.html", *pages(origin)), stored, *written]

@@ -1,4 +1,4 @@
-"""Gains of a firmware's rate loop over the plants that a fit leaves uncertain, and what they give.
+"""Rate loops over the plants that a fit leaves uncertain, and what gains give there.
 
 P, I and D enter a rate loop's response one by one as factors, and the identified plant under a held
 command has a closed form: a design is a search over three numbers, and no flight is simulated.
@@ -6,7 +6,7 @@ Source: docs/autopilots.md.
 """
 
 import dataclasses
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import equinox as eqx
@@ -14,48 +14,43 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Complex, Float
 
-from jaxquad._core import Number
 from jaxquad.identify import draw_models, filter_response, Fit, GainOverThrottle, KnownFilter
+from jaxquad.plot import StepBand
 
-from ._firmware import OuterLoop, Parameter
-from ._law import RateLoop
-from ._parameters import PARAMETERS, store_parameters
+from ._flight_channels import FlownAutopilot
+from ._law import law_responses, RateLoop
+from ._parameters import FIELDS
 
 
-Gains = Float[np.ndarray, "designs gains"]
-Paths = Complex[np.ndarray, "designs frequencies"]
-Loops = Float[np.ndarray, "designs plants frequencies"]
 Frequencies = Float[np.ndarray, " frequencies"]
 Response = Complex[np.ndarray, " frequencies"]
-FIELDS = ("p", "i", "d")
-
-
-class OuterQualities(NamedTuple):
-    """What an angle loop gives, for each plant; the resonance is from set-point to angle."""
-
-    stable: Bool[np.ndarray, " plants"]
-    peak: Float[np.ndarray, " plants"]
-    resonance: Float[np.ndarray, " plants"]
+Responses = Complex[np.ndarray, "plants frequencies"]
+Paths = Complex[np.ndarray, "designs frequencies"]
+Parts = Complex[np.ndarray, "gains frequencies"]
+Loops = Float[np.ndarray, "designs plants frequencies"]
+Gains = Float[np.ndarray, "designs gains"]
+OneGains = Float[np.ndarray, " gains"]
+Column = Float[np.ndarray, "plants 1"]
 
 
 class LoopQualities(NamedTuple):
-    """What gains give, for each design and plant.
+    """What gains give, for each design and plant."""
 
-    **Attributes:**
-
-    - `stable`: by Nyquist's criterion on the sampled loop.
-    - `peak`: Ms; `resonance`: of the response from set-point to rate, without feed-forward.
-    - `crossover`: the highest frequency with |L| = 1, in rad/s.
-    - `rejection`: root of the integrated square of the rate after a step of torque, relative.
-    - `noise`: rms of the command of white noise before the gyro's filters, relative.
-    """
-
-    stable: Bool[np.ndarray, "designs plants"]
-    peak: Float[np.ndarray, "designs plants"]
-    resonance: Float[np.ndarray, "designs plants"]
-    crossover: Float[np.ndarray, "designs plants"]
+    stable: Bool[np.ndarray, "designs plants"]  # by Nyquist's criterion on the sampled loop
+    peak: Float[np.ndarray, "designs plants"]  # Ms
+    resonance: Float[np.ndarray, "designs plants"]  # from set-point to rate, no feed-forward
+    crossover: Float[np.ndarray, "designs plants"]  # the highest frequency with |L| = 1, rad/s
+    # Root of the integrated square of the rate after a step of torque, relative.
     rejection: Float[np.ndarray, "designs plants"]
-    noise: Float[np.ndarray, "designs plants"]
+    noise: Float[np.ndarray, "designs plants"]  # rms of the command of the gyro's noise, relative
+
+    def or_worse(self, other: "LoopQualities") -> "LoopQualities":
+        """The worse of each plant; effects of torque and of noise are those of the first."""
+        greater = {x: np.maximum(getattr(self, x), getattr(other, x)) for x in _GREATER}
+        return self._replace(stable=self.stable & other.stable, **greater)
+
+
+_GREATER = ("peak", "resonance", "crossover")
 
 
 class Filters(NamedTuple):
@@ -67,37 +62,20 @@ class Filters(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class RateLoops:
-    """The open rate loops of one axis for all plants, on a grid of frequencies.
+    """The open rate loops of one axis for all plants, on a grid of frequencies."""
 
-    **Attributes:**
-
-    - `omega`: rad/s.
-    - `feedback`: of the law, from the logged rate to minus the command, per unit of P, I and D.
-    - `ahead`: likewise from the set-point to the command.
-    - `plants`: from the command to the logged rate in rad/s, the hold included.
-    - `noise`: power of the logged rate's noise around each frequency, behind the flown filters.
-    - `passed`: response of the gyro's filters that flew, as measured where the log shows more than
-        the law has; `chain`: as the law has them.
-    - `ceiling`: by which factor D can rise in flight (D_MAX); 1 where it cannot.
-    - `relaxed`: whether the integral can be held in flight, as Betaflight's iterm_relax does.
-    - `forward`: response of the law's feed-forward, from the set-point to the command.
-    - `angle`: of the angle loop around this one, from rate to minus the set-point, per 1/s of its
-        gain; None where there is none.
-    - `others`: loops at other throttles, under the law there; their plants count, too.
-    """
-
-    omega: Frequencies
-    feedback: Complex[np.ndarray, "gains frequencies"]
-    ahead: Complex[np.ndarray, "gains frequencies"]
-    plants: Complex[np.ndarray, "plants frequencies"]
-    noise: Frequencies
-    passed: Response
-    ceiling: float = 1.0
-    chain: Response | None = None
-    relaxed: bool = False
-    forward: Response | None = None
-    angle: Response | None = None
-    others: tuple["RateLoops", ...] = ()
+    omega: Frequencies  # rad/s
+    feedback: Parts  # per unit of P, I and D: from the logged rate to minus the command
+    ahead: Parts  # likewise from the set-point to the command
+    plants: Responses  # from the command to the logged rate in rad/s, the hold included
+    noise: Frequencies  # power of the logged rate around each frequency, behind the flown filters
+    passed: Response  # of the flown gyro filters, as measured where the law lacks some of them
+    ceiling: float = 1.0  # by which factor D can rise in flight (D_MAX)
+    chain: Response | None = None  # of the flown gyro filters that the law has
+    relaxed: bool = False  # whether the integral can be held in flight (iterm_relax)
+    forward: Response | None = None  # of the law's feed-forward, from the set-point to the command
+    angle: Response | None = None  # of the angle loop around this one: `OuterLoop.path`
+    others: tuple["RateLoops", ...] = ()  # at other throttles, under the law there
 
     @property
     def groups(self) -> tuple["RateLoops", ...]:
@@ -105,26 +83,19 @@ class RateLoops:
         return dataclasses.replace(self, others=()), *self.others
 
     def of_law(self, law: RateLoop, axis: int) -> "RateLoops":
-        """The same plants under a law with other filters, as exactly as those of the flown one.
-
-        Without those beside.
-        """
+        """The plants of this throttle under a law with other filters."""
         back, ahead = law_paths(law, axis, self.omega)
         before = self.passed if self.chain is None else self.chain
-        changed = gyro_chain_response(law, self.omega) / before
-        return dataclasses.replace(
-            self, feedback=back * changed, ahead=ahead, forward=forward_path(law, axis, self.omega),
-        )  # fmt: skip
+        back = back * (gyro_chain_response(law, self.omega) / before)
+        forward = forward_path(law, axis, self.omega)
+        return dataclasses.replace(self, feedback=back, ahead=ahead, forward=forward)
 
     def worst(self, gains: Gains, count: int) -> "RateLoops":
         """With those plants alone that have the greatest peaks under these gains."""
         groups, peaks = self.groups, []
         for group in groups:
-            qualities = group.qualities(gains)
-            peak = np.where(
-                qualities.stable, np.maximum(qualities.peak, qualities.resonance), np.inf
-            )
-            peaks.append(peak.max(axis=0))
+            x = group.qualities(gains)
+            peaks.append(np.where(x.stable, np.maximum(x.peak, x.resonance), np.inf).max(axis=0))
         chosen = np.zeros(sum(map(len, peaks)), bool)
         chosen[np.argsort(np.concatenate(peaks), kind="stable")[-count:]] = True
         parts = np.split(chosen, np.cumsum([len(peak) for peak in peaks])[:-1])
@@ -136,23 +107,18 @@ class RateLoops:
     def joined(self, others: "RateLoops") -> "RateLoops":
         """With the plants of `others`, each at its throttle, under the laws of these."""
         plants = [group.plants for group in others.groups]
-        groups = self.groups if self.others else (self,)
-        if not self.others:
-            plants = [np.concatenate(plants)]
+        plants = plants if self.others else [np.concatenate(plants)]
         return grouped(
             dataclasses.replace(group, plants=np.concatenate([group.plants, more]))
-            for group, more in zip(groups, plants, strict=True)
+            for group, more in zip(self.groups, plants, strict=True)
         )
 
     def qualities(self, gains: Gains, filters: Filters | None = None) -> LoopQualities:
-        """What each row of P, I and D gives; stability and Ms with D at its ceiling, too.
-
-        `filters` are the responses of other filters over those that flew.
-        """
+        """What each row of P, I and D gives; stability and peaks with D at its ceiling, too."""
         qualities = self._qualities(*self.paths(gains, filters))
         if self.ceiling != 1:
             raised = gains * np.array([[1.0, 1.0, self.ceiling]])
-            qualities = _worst_of(qualities, self._qualities(*self.paths(raised, filters)))
+            qualities = qualities.or_worse(self._qualities(*self.paths(raised, filters)))
         parts = [qualities, *(loops.qualities(gains, filters) for loops in self.others)]
         return together(parts) if self.others else qualities
 
@@ -167,18 +133,14 @@ class RateLoops:
                 group._qualities(*group.paths(gains * np.array([[1.0, 0.0, factor]])))
                 for factor in (1.0, group.ceiling)
             )
-            parts.append(_worst_of(base, raised))
+            parts.append(base.or_worse(raised))
         return together(parts)
 
-    def open_loops(
-        self, gains: Float[np.ndarray, " gains"]
-    ) -> Complex[np.ndarray, "plants frequencies"]:
+    def open_loops(self, gains: OneGains) -> Responses:
         """Of the rate, of all groups."""
         return np.concatenate([gains @ group.feedback * group.plants for group in self.groups])
 
-    def outer_loops(
-        self, gains: Float[np.ndarray, " gains"], angle_gain: float
-    ) -> Complex[np.ndarray, "plants frequencies"]:
+    def outer_loops(self, gains: OneGains, angle_gain: float) -> Responses:
         """Of the angle with a gain in 1/s, of all groups; the true rate is before the filters."""
         loops = []
         for group in self.groups:
@@ -187,16 +149,6 @@ class RateLoops:
             rate = ahead * group.plants / group.passed / (1 + gains @ group.feedback * group.plants)
             loops.append(angle_gain * group.angle * rate)
         return np.concatenate(loops)
-
-    def outer_qualities(
-        self, gains: Float[np.ndarray, " gains"], angle_gain: float
-    ) -> OuterQualities:
-        """What an angle loop with a gain in 1/s gives around the rate loop."""
-        loops = self.outer_loops(gains, angle_gain)
-        distance = 1 + loops
-        stable = _is_stable(np.real(distance)[None], np.imag(distance)[None])[0]
-        peaks = 1 / np.abs(distance).min(axis=1), np.abs(loops / distance).max(axis=1)
-        return OuterQualities(stable, *peaks)
 
     def paths(self, gains: Gains, filters: Filters | None = None) -> tuple[Paths, Paths]:
         """The law from the logged rate to minus the command, and from the set-point to it."""
@@ -216,7 +168,7 @@ class RateLoops:
         real += 1
         imaginary = a * d
         imaginary += np.multiply(b, c, out=product)
-        stable = _is_stable(real, imaginary)
+        stable = is_stable(real, imaginary)
         distance, product = real**2, imaginary**2
         distance += product
         above = np.multiply(gain[:, None], plants, out=product) > 1  # |L|
@@ -232,16 +184,6 @@ class RateLoops:
             np.sqrt(np.einsum("dpf,pf->dp", inverse, plants / self.omega**2 * cells)),
             np.sqrt(np.einsum("dpf,df->dp", inverse, gain * self.noise)),
         )
-
-
-def _worst_of(one: LoopQualities, other: LoopQualities) -> LoopQualities:
-    """Of each plant; effects of torque and of noise are those of the first."""
-    return one._replace(
-        stable=one.stable & other.stable,
-        peak=np.maximum(one.peak, other.peak),
-        resonance=np.maximum(one.resonance, other.resonance),
-        crossover=np.maximum(one.crossover, other.crossover),
-    )
 
 
 def grouped(groups: Iterable[RateLoops]) -> RateLoops:
@@ -265,7 +207,7 @@ def cells_of(omega: Frequencies) -> Frequencies:
     return np.diff(edges)
 
 
-def _is_stable(real: Loops, imaginary: Loops) -> Bool[np.ndarray, "designs plants"]:
+def is_stable(real: Loops, imaginary: Loops) -> Bool[np.ndarray, "designs plants"]:
     """Whether 1 + L turns from -pi, of the double integrator, to 0; 2 pi for each unstable pair."""
     size = imaginary.shape[-1]
     upper = (imaginary >= 0).ravel()
@@ -281,9 +223,7 @@ def _is_stable(real: Loops, imaginary: Loops) -> Bool[np.ndarray, "designs plant
     return ends[0] - 2 * np.pi * rounds < 0
 
 
-def delay_margin(
-    loop: Complex[np.ndarray, "plants frequencies"], omega: Frequencies
-) -> Float[np.ndarray, " plants"]:
+def delay_margin(loop: Responses, omega: Frequencies) -> Float[np.ndarray, " plants"]:
     """The delay in s that brings each open loop to -1, at the worst of its crossings of 1."""
     size, angle = np.log(np.abs(loop)), np.angle(loop)
     falls = np.diff(np.sign(size), axis=1) != 0
@@ -295,9 +235,7 @@ def delay_margin(
     return np.where(falls, phase / at, np.inf).min(axis=1)
 
 
-def law_paths(
-    law: RateLoop, axis: int, omega: Frequencies
-) -> tuple[Complex[np.ndarray, "gains frequencies"], Complex[np.ndarray, "gains frequencies"]]:
+def law_paths(law: RateLoop, axis: int, omega: Frequencies) -> tuple[Parts, Parts]:
     """Per unit of P, I and D: from the filtered rate to minus the command, from the set-point."""
     bare = law.without_gyro_filters()  # the logged rate is behind them: they are in the plant
     fields, responses = (*FIELDS, *law.feed_forward), []
@@ -326,27 +264,10 @@ def forward_path(law: RateLoop, axis: int, omega: Frequencies) -> Response | Non
     return law_responses(without, axis, omega)[0]
 
 
-def law_responses(
-    law: RateLoop, axis: int, omega: Frequencies
-) -> Complex[np.ndarray, "inputs frequencies"]:
-    """From the set-point and from the rate, both in rad/s, to the command."""
-    linear = law.linear(axis)
-    A, c = np.asarray(linear.A), np.asarray(linear.C)
-    into = np.stack([linear.reference_in, linear.measurement_in], axis=1)
-    through = np.array([linear.reference_through, linear.measurement_through])
-    z = np.exp(1j * omega * linear.dt)[:, None, None]
-    inner = np.linalg.solve(z * np.eye(len(A)) - A, np.broadcast_to(into, (len(z), *into.shape)))
-    return (c @ inner + through).T
-
-
 def hold_plants(
-    gain: Float[np.ndarray, "plants 1"],
-    lag: Float[np.ndarray, "plants 1"],
-    delay: Float[np.ndarray, "plants 1"],
-    omega: Frequencies,
-    dt: float,
-    damping: Float[np.ndarray, "plants 1"] | None = None,
-) -> Complex[np.ndarray, "plants frequencies"]:
+    gain: Column, lag: Column, delay: Column, omega: Frequencies, dt: float,
+    damping: Column | None = None,
+) -> Responses:  # fmt: skip
     """K e^(-delay s) / ((s + damping) (lag s + 1)) behind a hold: its modified z-transform."""
     lag, delay = np.maximum(lag, 1e-6), np.maximum(delay, 0.0)
     samples = np.floor(delay / dt)
@@ -363,58 +284,6 @@ def hold_plants(
     return gain * (1 - q) * q ** (samples + 1) * steps
 
 
-def gains_of(law: RateLoop, axis: int) -> Float[np.ndarray, " gains"]:
-    """P, I and D of one axis."""
-    return np.array([float(np.broadcast_to(vars(law)[name], (3,))[axis]) for name in FIELDS])
-
-
-def gain_row(firmware: str, axis: int, field: str) -> Parameter:
-    """The parameter of a gain of one axis."""
-    rows = PARAMETERS[firmware].values()
-    return next(row for row in rows if row.field == field and row.axis == axis)
-
-
-def _ceiling_name(law: RateLoop, axis: int) -> str:
-    """The parameter up to which D can rise in flight; empty where the firmware has none."""
-    rows = PARAMETERS[law.firmware].values()
-    return next((x.name for x in rows if x.field == "d_max.ceiling" and x.axis == axis), "")
-
-
-def parameters_of(law: RateLoop, axis: int, gains: Float[np.ndarray, " gains"]) -> dict[str, float]:
-    """The parameters that stand for these gains; a ceiling of D rises with D."""
-    firmware = law.firmware
-    flown = gains_of(law, axis)
-    values = {
-        gain_row(firmware, axis, name).name: float(gain)
-        for name, gain, old in zip(FIELDS, gains, flown, strict=True)
-        if old > 0
-    }
-    if (ceiling := law.d_ceiling(axis)) > 1:
-        values[_ceiling_name(law, axis)] = ceiling * float(gains[2])
-    return store_parameters(firmware, values)
-
-
-def ceiling_in(law: RateLoop, axis: int, designs: Sequence[Mapping[str, Number]]) -> float:
-    """The most by which D can rise in flight under one of these stored sets of parameters."""
-    flown = law.d_ceiling(axis)
-    pairs = [
-        (design.get(_ceiling_name(law, axis)), gains_in(law, axis, design)[2]) for design in designs
-    ]
-    return max([flown, *(float(top / base) for top, base in pairs if top and base > 0)])
-
-
-def gains_in(
-    law: RateLoop, axis: int, parameters: Mapping[str, Number]
-) -> Float[np.ndarray, " gains"]:
-    """P, I and D of parameters; those that are not named stay."""
-    gains = gains_of(law, axis)
-    for row in PARAMETERS[law.firmware].values():
-        if row.field in FIELDS and row.axis == axis and row.name in parameters:
-            gains[FIELDS.index(row.field)] = parameters[row.name]
-    return gains
-
-
-Drawn = Float[np.ndarray, "plants 1"]
 _LOWEST = 0.05  # rad/s, below which only the integrals count
 _FREQUENCIES = 300
 _AT_ONCE = 256  # draws: each other number would be compiled anew
@@ -422,38 +291,25 @@ _AT_ONCE = 256  # draws: each other number would be compiled anew
 
 @dataclasses.dataclass(frozen=True)
 class PlantSource:
-    """What plants are drawn from.
+    """What plants are drawn from."""
 
-    **Attributes:**
-
-    - `fit`: up to what the gyro's filters are given, in `unit`.
-    - `over`: the gain over the throttle, whose plants take the place of those of `fit`.
-    - `span`: the lowest and the highest throttle of these.
-    - `filters`: of the gyro, as measured; None takes those of the law.
-    """
-
-    fit: Fit
-    unit: str
-    over: GainOverThrottle | None = None
-    span: tuple[float, float] = (0.0, 1.0)
-    filters: Sequence[KnownFilter] | None = None
-
-    @property
-    def damping(self) -> float:
-        """Of the rate in 1/s, as the fit has it."""
-        return float(np.asarray(vars(self.fit.model).get("damping", 0.0)))
+    fit: Fit  # up to what the gyro's filters are given
+    unit: str  # of its rate
+    over: GainOverThrottle | None = None  # its plants take the place of those of `fit`
+    span: tuple[float, float] = (0.0, 1.0)  # the lowest and the highest throttle of these
+    filters: Sequence[KnownFilter] | None = None  # of the gyro, as measured; None: the law's
 
     def loops(
-        self, law: RateLoop, axis: int, count: int, seed: int, *,
+        self, flown: FlownAutopilot, count: int, seed: int, *,
         omega: Frequencies | None = None, throttle: float | None = None,
-        angle: OuterLoop | None = None,
     ) -> RateLoops:  # fmt: skip
-        """The loops of a law with so many plants, and an angle loop around them.
+        """The loops of what flew with so many plants.
 
         All are at one `throttle`, or each is at its own, evenly over the span.
 
         Raises ValueError where a drawn gain is not above 0.
         """
+        law, axis, angle = flown.law, flown.axis, flown.angle
         if omega is None:
             omega = np.geomspace(_LOWEST, 0.999 * np.pi / law.dt, _FREQUENCIES)
         back, ahead = law_paths(law, axis, omega)
@@ -477,7 +333,7 @@ class PlantSource:
 
     def _drawn(
         self, count: int, seed: int, throttle: float | None
-    ) -> tuple[Drawn, Drawn, Drawn, Drawn]:
+    ) -> tuple[Column, Column, Column, Column]:
         """Gain, lag, delay and damping."""
         if self.over is None:
             names = len(self.fit.names)
@@ -486,11 +342,39 @@ class PlantSource:
             models = draw_models(self.fit, jnp.asarray(scores))
             wide = lambda x: np.broadcast_to(np.asarray(x, float), scores[0].shape)[:count, None]
             return wide(models.gain), wide(models.lag), wide(models.delay), wide(models.damping)
-        if throttle is None:
-            drawn = self.over.draw(np.linspace(*self.span, count), count, seed=seed)
-            gain = np.diagonal(drawn.gain)
-        else:
-            drawn = self.over.draw(np.array([throttle]), count, seed=seed)
-            gain = drawn.gain[0]
+        at = np.linspace(*self.span, count) if throttle is None else np.array([throttle])
+        drawn = self.over.draw(at, count, seed=seed)
+        gain = np.diagonal(drawn.gain) if throttle is None else drawn.gain[0]
         lag, delay = drawn.lag[:, None], drawn.delay[:, None]
-        return gain[:, None], lag, delay, np.full_like(lag, self.damping)
+        damping = float(np.asarray(vars(self.fit.model).get("damping", 0.0)))
+        return gain[:, None], lag, delay, np.full_like(lag, damping)
+
+
+_PERIOD, _SHOWN, _FINEST = 8.0, 1.2, 1 / 400  # s, of a computed step, of a shown one, of a sample
+
+
+class StepGrid(NamedTuple):
+    """Frequencies from whose closed responses steps are computed."""
+
+    dt: float  # of the computed step in s
+    omega: Float[np.ndarray, " frequencies"]  # rad/s
+    fade: Float[np.ndarray, " frequencies"]  # where the law runs faster than the step is computed
+
+    @classmethod
+    def of(cls, dt: float) -> "StepGrid":
+        """For a law of this interval."""
+        coarse = max(dt, _FINEST)
+        count = 2 * int(_PERIOD / coarse / 2)
+        omega = 2 * np.pi * np.arange(1, count // 2) / (count * coarse)
+        fade = np.cos(np.linspace(0, np.pi / 2, omega.size)) ** 2
+        return cls(coarse, omega, fade if coarse > dt else np.ones(omega.size))
+
+    def band(self, closed: Complex[np.ndarray, "plants frequencies"]) -> StepBand:
+        """Of the responses from set-point to rate: median and 95 % of the plants."""
+        response = np.pad(self.fade * closed, ((0, 0), (1, 1)))
+        response[:, 0] = 1.0
+        impulse = np.fft.irfft(response, 2 * (self.omega.size + 1), axis=1)
+        shown = int(_SHOWN / self.dt)
+        steps = np.cumsum(impulse, axis=1)[:, :shown]
+        low, middle, high = np.percentile(steps, [2.5, 50.0, 97.5], axis=0)
+        return StepBand(np.arange(shown) * self.dt, middle, low, high)

@@ -14,10 +14,8 @@ from jaxquad.records import RecordWarning
 from jaxquad.report import PageWarning
 from jaxquad.workflows import in_options
 
-from ._batch import batch
-from ._demo import demo
-from ._design import design
-from ._identify import channels, identify, NOT_IDENTIFIABLE, report, verify
+from ._first import demo, design
+from ._logs import batch, channels, identify, NOT_IDENTIFIABLE, report, verify
 from ._options import check_out, shown_stages
 from ._tune import autopilot, tune
 
@@ -108,10 +106,7 @@ def _fail(message: str, code: int) -> int:
 
 
 def printer_of_warnings() -> Callable[..., None]:
-    """Prints each text of the package once: a log is read for the estimate and for the page.
-
-    What NumPy or JAX warn of is no word to a user.
-    """
+    """Prints each text of the package, and of no other, once: a log is read several times."""
     printed: set[str] = set()
 
     def show(message: Warning | str, kind: type[Warning], *_: object) -> None:

@@ -46,55 +46,41 @@ class Command(NamedTuple):
 
     def add_to(self, commands: Any) -> None:  # argparse names the type of its subparsers nowhere
         declared = commands.add_parser(
-            self.name,
-            prog=f"jaxquad {self.name}",
-            description=self.help,
-            epilog=self.examples,
+            self.name, prog=f"jaxquad {self.name}", description=self.help, epilog=self.examples,
             formatter_class=argparse.RawDescriptionHelpFormatter,
-        )
+        )  # fmt: skip
         declared.set_defaults(run=self.declare(declared))
 
 
 def command(help: str, examples: str) -> Callable[[Declare], Command]:
-    """Makes the command of this help and these examples of the function that declares it."""
+    """Makes a command of the function that declares it."""
     return lambda declare: Command(declare.__name__, help, examples, declare)
 
 
-def add_log(declared: argparse.ArgumentParser) -> None:
-    declared.add_argument("file", type=Path, help="a log of an autopilot, CSV, NPZ, MAT, HDF5, ...")
+_SHARED = {
+    "file": (None, "a log of an autopilot, CSV, NPZ, MAT, HDF5, ..."),
+    "result": (None, "the folder, or result.json, of identify"),
+    "--log": ("FILE", "the log that was identified, if it was moved"),
+    "--config": ("TOML", "a file of settings; options take precedence"),
+}
 
 
-def add_result(declared: argparse.ArgumentParser) -> None:
-    declared.add_argument("result", type=Path, help="the folder, or result.json, of identify")
-
-
-def add_log_option(declared: argparse.ArgumentParser) -> None:
-    text = "the log that was identified, if it was moved"
-    declared.add_argument("--log", type=Path, metavar="FILE", help=text)
-
-
-def add_config(declared: argparse.ArgumentParser) -> None:
-    text = "a file of settings; options take precedence"
-    declared.add_argument("--config", type=Path, metavar="TOML", help=text)
+def add_paths(declared: argparse.ArgumentParser, *names: str) -> None:
+    """Arguments that several commands take."""
+    for name in names:
+        metavar, text = _SHARED[name]
+        declared.add_argument(name, type=Path, metavar=metavar, help=text)
 
 
 _FORCE = "overwrite the result of other settings; without it, that is kept, and FOLDER-2 written"
 
 
 def add_output(
-    declared: argparse.ArgumentParser,
-    content: str,
-    *,
-    folder: str = "",
-    file: tuple[str, str] | None = None,
-    force: str = _FORCE,
-    quiet: bool = True,
-) -> None:
-    """Options on output, last in the help of a command; `content` is what --json prints.
-
-    `folder` says where the command writes by default; a command that writes a `file` has the
-    placeholder and the help of it instead.
-    """
+    declared: argparse.ArgumentParser, content: str, *, folder: str = "",
+    file: tuple[str, str] | None = None, force: str = _FORCE, quiet: bool = True,
+) -> None:  # fmt: skip
+    """Options on output, last in the help of a command: `content` is what --json prints, `folder`
+    where the command writes by default, `file` instead placeholder and help of one."""
     add = declared.add_argument_group("output").add_argument
     if folder:
         text = f"where to write; by default {folder}"
@@ -129,12 +115,9 @@ def check_out(options: argparse.Namespace) -> None:
 
 
 def folder_to_write(
-    options: argparse.Namespace,
-    wanted: Path,
-    name: str,
-    same: Mapping[str, object],
+    options: argparse.Namespace, wanted: Path, name: str, same: Mapping[str, object],
     sources: Sequence[Path | str],
-) -> Path:
+) -> Path:  # fmt: skip
     """The folder that is wanted, or one beside it where that holds the result of other settings."""
     if options.force:
         return wanted
@@ -160,10 +143,7 @@ class _NamedOnce(argparse.Action):
 def add_settings(
     declared: argparse.ArgumentParser, settings: Settings, *, only: Mapping[str, str] | None = None
 ) -> None:
-    """Declare an option for each setting; an option that is not given stays out of the result.
-
-    `only` names the settings that are declared, each with its own help or "".
-    """
+    """Declare an option for each setting, or for those in `only`, each with its own help or ""."""
     chosen = {k: o for k, o in settings.options().items() if only is None or k in only}
     used = list(dict.fromkeys(option.group for option in chosen.values()))
     used.sort(key=lambda title: GROUPS.index(title) if title in GROUPS else len(GROUPS))
@@ -188,8 +168,7 @@ def add_settings(
 
 def typed_settings(options: argparse.Namespace, settings: Settings) -> dict[str, object]:
     """Those that were typed on the command line."""
-    keys = settings.options()
-    return {key: value for key, value in vars(options).items() if key in keys}
+    return {key: value for key, value in vars(options).items() if key in settings.options()}
 
 
 def settings_of(options: argparse.Namespace, settings: type[S]) -> S:
@@ -201,10 +180,7 @@ def settings_of(options: argparse.Namespace, settings: type[S]) -> S:
 
 
 def start_computing() -> None:
-    """JAX in 64 bits, and programs that are kept for the next call.
-
-    What a command can say without JAX it says before.
-    """
+    """JAX in 64 bits, and programs that are kept; what can be said without JAX is said before."""
     atexit.register(gc.freeze)  # Python's last look for garbage takes half a second
     from jaxquad._compile import enable_compile_cache
     from jaxquad._core import enable_x64

@@ -3,25 +3,13 @@
 import argparse
 from pathlib import Path
 
+import jaxquad.workflows as workflows
 from jaxquad.records import require_file
 from jaxquad.workflows import AutopilotSettings, default_folder, in_options, TuneSettings
 
-from ._identify import NOT_IDENTIFIABLE
-from ._options import (
-    add_config,
-    add_log,
-    add_log_option,
-    add_output,
-    add_result,
-    add_settings,
-    command,
-    folder_to_write,
-    print_json,
-    Run,
-    settings_of,
-    start_computing,
-    stdout_for_json,
-)
+from . import _options as shell
+from ._logs import NOT_IDENTIFIABLE
+from ._options import command, Run
 
 
 _NOT_TO_BE_FLOWN = 4
@@ -46,32 +34,28 @@ to be flown, since STABILITY, PERFORMANCE or CONVERGENCE fails (it is written al
 """,
 )
 def tune(declared: argparse.ArgumentParser) -> Run:
-    add_result(declared)
-    add_log_option(declared)
-    add_config(declared)
-    add_settings(declared, TuneSettings)
-    add_output(declared, "gains and certificate", folder="tuned/ in the folder of the result")
+    shell.add_paths(declared, "result", "--log", "--config")
+    shell.add_settings(declared, TuneSettings)
+    shell.add_output(declared, "gains and certificate", folder="tuned/ in the folder of the result")
 
     def run(options: argparse.Namespace) -> int:
-        from jaxquad.workflows import load_result
-
-        settings = settings_of(options, TuneSettings)
-        stored = load_result(options.result)
+        settings = shell.settings_of(options, TuneSettings)
+        stored = workflows.load_result(options.result)
         stored.require_radians()  # before anything is imported that takes long
-        start_computing()
-        from jaxquad.workflows import tune
-
-        tuning = tune(stored, settings, log=options.log, progress=False if options.quiet else None)
+        shell.start_computing()
+        tuning = workflows.tune(
+            stored, settings, log=options.log, progress=False if options.quiet else None
+        )
         content, logs = tuning.content(), tuning.identification.paths
-        with stdout_for_json(options):
+        with shell.stdout_for_json(options):
             print(tuning)
             print(_WORDS)
             same = {key: content[key] for key in ("settings", "identified_with")}
             wanted = options.out or stored.folder / "tuned"
-            folder = folder_to_write(options, wanted, "tuned.json", same, logs)
+            folder = shell.folder_to_write(options, wanted, "tuned.json", same, logs)
             print(f"\n{folder}: {', '.join(path.name for path in tuning.write(folder))}")
         if options.json:
-            print_json(content)
+            shell.print_json(content)
         return 0 if tuning.tuned.holds else _NOT_TO_BE_FLOWN
 
     return run
@@ -98,43 +82,35 @@ not to be flown (with 3 and 4 only the file with what flew is written)
 """,
 )
 def autopilot(declared: argparse.ArgumentParser) -> Run:
-    add_log(declared)
-    add_config(declared)
-    add_settings(declared, AutopilotSettings)
+    shell.add_paths(declared, "file", "--config")
+    shell.add_settings(declared, AutopilotSettings)
     folder = "autopilot/ in results/NAME of the file, autopilot_AXIS/ of one axis"
-    add_output(declared, "autopilot.json", folder=folder)
+    shell.add_output(declared, "autopilot.json", folder=folder)
 
     def run(options: argparse.Namespace) -> int:
-        settings = settings_of(options, AutopilotSettings)
+        settings = shell.settings_of(options, AutopilotSettings)
         require_file(options.file)
         name = "autopilot" if settings.axis == "all" else f"autopilot_{settings.axis}"
         folder = options.out or default_folder(options.file) / name
-        start_computing()
+        shell.start_computing()
         return run_autopilot(options, options.file, settings, folder)
 
     return run
 
 
 def run_autopilot(
-    options: argparse.Namespace,
-    log: Path,
-    settings: AutopilotSettings,
-    wanted: Path,
+    options: argparse.Namespace, log: Path, settings: AutopilotSettings, wanted: Path,
     note: str = "",
-) -> int:
-    """Tune the gains of the loop that flew the log, print and write what comes out.
-
-    `{page}` in `note` is the page's path.
-    """
-    from jaxquad.workflows import autopilot
-
-    proposal = autopilot(log, settings)
-    with stdout_for_json(options):
+) -> int:  # fmt: skip
+    """Tune the gains of the loop that flew the log, print and write what comes out; `{page}` in
+    `note` is the page's path."""
+    proposal = workflows.autopilot(log, settings)
+    with shell.stdout_for_json(options):
         print(in_options(str(proposal)))
         same = {"settings": settings.content()}
-        folder = folder_to_write(options, wanted, "autopilot.json", same, [log])
+        folder = shell.folder_to_write(options, wanted, "autopilot.json", same, [log])
         names = ", ".join(path.name for path in proposal.write(folder))
         print(f"\n{folder}: {names}{note.format(page=folder / 'autopilot.html')}")
     if options.json:
-        print_json(proposal.content())
+        shell.print_json(proposal.content())
     return _EXIT.get(proposal.kind, 0)

@@ -1,23 +1,37 @@
+"""The most informative multisine: powers and phases in turn, for powers depend on crest factors."""
+
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, PyTree
+from jaxtyping import Complex, Float, Int, PyTree
 
 from jaxquad._core import require_all_positive, require_x64, whole_samples
 from jaxquad.excitation import check_lines, Excitation, harmonics
 from jaxquad.identify import Free, select_parameters
 
+from ._powers import certify_powers, Criterion, DOptimal, optimal_powers, Powers
 from ._prediction import check_distinct, Noise, Prediction, unit_information
-from ._search import (
-    Criterion,
-    DOptimal,
-    gather_limits,
-    multisine_signals,
-    Plan,
-    search,
-    Trial,
-)
+
+
+_NORMS = (4, 16, 64, 256)  # one the start of the next; the last is almost the peak
+_PHASE_STEPS = 60  # of each
+_STARTS = 4
+_COARSE, _FINE = 8, 64  # least points to a cycle of the highest line: to search, and to judge
+_CREST = 1.5  # before phases are known
+_ROUNDS = 2  # of powers, phases, and the crest factors that they have
+_FAINT = 3e-3  # power, to that of the strongest line in its share of the limits, that is left out
+_LINES = (2, 4, 8)  # least lines to a parameter that are tried
+
+Orders = Int[np.ndarray, " frequencies"]
+Lines = Float[np.ndarray, " frequencies"]
+Amplitudes = Complex[np.ndarray, "signals frequencies"]
+Number = float | int
+
+
+_D_OPTIMAL = DOptimal()
 
 
 class Design(eqx.Module):
@@ -83,13 +97,6 @@ class Design(eqx.Module):
                 str(self.prediction),
             ]
         )
-
-
-_LINES = (2, 4, 8)  # least lines to a parameter that are tried
-_D_OPTIMAL = DOptimal()
-
-Number = float | int
-Lines = Float[np.ndarray, " frequencies"]
 
 
 def optimal_multisine(
@@ -170,9 +177,9 @@ def optimal_multisine(
     responses, units = zip(*parts, strict=True)
     for unit in units:
         check_distinct(unit.sum(axis=0), names)
-    limits = gather_limits(offered, responses, amplitude, rate, output_amplitude)
+    per_power = seconds * np.stack(units)
+    limits = _gather_limits(offered, responses, amplitude, rate, output_amplitude)
     orders = np.round(offered * period / (2 * np.pi)).astype(int)
-    plan = Plan(offered, orders, samples, names, seconds * np.stack(units), limits, criterion)
     if lines is None:
         least = [k * len(names) for k in _LINES if k * len(names) <= offered.size // 2]
         least = least or [max(1, offered.size // 2)]
@@ -182,36 +189,198 @@ def optimal_multisine(
         raise ValueError(
             f"lines is {lines}, but {offered.size} lines are offered: give 1 to {offered.size}"
         )
-    return _design(plan, search(plan, tuple(least), seed), periods, float(sample_rate))
 
+    def try_lines(lines: int, crest: Float[np.ndarray, " limits"]) -> _Trial:
+        """One design for these crest factors, scaled to the limits by the actual peaks."""
+        costs, informations = limits.costs(crest), jnp.asarray(per_power)
+        share = jnp.asarray(1 / lines, dtype=informations.dtype)
 
-def _design(plan: Plan, best: Trial, periods: int, sample_rate: float) -> Design:
+        def signals(power: Lines) -> Complex[np.ndarray, "limits frequencies"]:
+            """Complex amplitudes of the limited signals, in units of their limits."""
+            return limits.filters * np.sqrt(2 * power) / limits.peaks[:, None]
+
+        best = optimal_powers(informations, jnp.asarray(costs), criterion, names, share)
+        power = np.asarray(best.power)
+        used = costs.max(axis=0) * power
+        power = np.where(used > _FAINT * used.max(), power, 0.0)
+        phase = least_peak_phases(orders, signals(power), seed=seed)
+        reached = multisine_peaks(orders, phase, signals(power))
+        power, reached = power / reached.max() ** 2, reached / reached.max()
+        crest = reached / np.sqrt(0.5 * np.sum(np.abs(signals(power)) ** 2, axis=1))
+        powers, costs = Powers(jnp.asarray(power), best.price), jnp.asarray(limits.costs(crest))
+        proof = certify_powers(powers, informations, costs, criterion, names, share)
+        dispersion = len(names) * np.asarray(proof.dispersion)
+        efficiency = min(1.0, float(np.exp(-np.asarray(proof.gap))))
+        totals = np.einsum("f,mfpq->mpq", power, per_power)
+        values = [criterion.log_information(jnp.asarray(m), names) for m in totals]
+        value = float(np.mean([float(value) for value in values]))
+        return _Trial(power, phase, reached, dispersion, efficiency, value, lines, crest)
+
+    trials = []
+    for count in least:
+        crest = np.full(limits.peaks.size, _CREST)
+        for _ in range(_ROUNDS):
+            trials.append(try_lines(count, crest))
+            crest = trials[-1].crest
+    best = max(trials, key=lambda trial: trial.value)
     amplitudes = np.sqrt(2 * best.power).astype(complex)[None, :]
-    wave = multisine_signals(plan.orders, best.phase, amplitudes, plan.samples)[0]
+    wave = multisine_signals(orders, best.phase, amplitudes, samples)[0]
     wave = np.roll(wave, -int(np.abs(wave).argmin()))  # from its sample nearest to zero on
-    lines, duration = plan.omega[best.power > 0], plan.samples * periods / sample_rate
+    used, duration = offered[best.power > 0], samples * periods / float(sample_rate)
     excitation = Excitation(
-        np.arange(plan.samples * periods) / sample_rate,
+        np.arange(samples * periods) / float(sample_rate),
         np.tile(wave, periods),
-        lines,
+        used,
         kind="multisine",
-        omega_min=float(lines[0]),
-        omega_max=float(lines[-1]),
+        omega_min=float(used[0]),
+        omega_max=float(used[-1]),
         amplitude=float(np.abs(wave).max()),
-        sample_rate=sample_rate,
+        sample_rate=float(sample_rate),
         duration=float(duration),
     )
-    totals = np.einsum("f,mfpq->mpq", best.power, plan.per_power)
-    peaks = zip(plan.limits.names, best.peaks, plan.limits.peaks, strict=True)
+    totals = np.einsum("f,mfpq->mpq", best.power, per_power)
+    peaks = zip(limits.names, best.peaks, limits.peaks, strict=True)
     return Design(
         excitation=excitation,
         power=best.power[best.power > 0],
-        predictions=tuple(Prediction(plan.names, total, duration) for total in totals),
-        offered=plan.omega,
+        predictions=tuple(Prediction(names, total, duration) for total in totals),
+        offered=offered,
         dispersion=best.dispersion,
         efficiency=best.efficiency,
         limits={name: (float(share * limit), float(limit)) for name, share, limit in peaks},
-        crest_factor=float(best.peaks[0] * plan.limits.peaks[0] / np.sqrt(best.power.sum())),
-        criterion=plan.criterion,
+        crest_factor=float(best.peaks[0] * limits.peaks[0] / np.sqrt(best.power.sum())),
+        criterion=criterion,
         lines=best.lines,
     )
+
+
+class _Trial(NamedTuple):
+    """Lines scaled to the limits by their actual peaks."""
+
+    power: Lines
+    phase: Lines
+    peaks: Float[np.ndarray, " limits"]  # to their limits
+    dispersion: Lines
+    efficiency: float
+    value: float  # log information
+    lines: int
+    crest: Float[np.ndarray, " limits"]  # factors of the limited signals
+
+
+class _Limits(NamedTuple):
+    """Signals made from the input by a filter each, and the peaks that they may have."""
+
+    names: tuple[str, ...]
+    filters: Complex[np.ndarray, "limits frequencies"]
+    peaks: Float[np.ndarray, " limits"]
+
+    def costs(self, crest: Float[np.ndarray, " limits"]) -> Float[np.ndarray, "limits frequencies"]:
+        """Share of each limit that unit mean square at a line takes, at these crest factors."""
+        return np.abs(self.filters) ** 2 * (crest / self.peaks)[:, None] ** 2
+
+
+def _gather_limits(
+    omega: Float[np.ndarray, " frequencies"],
+    responses: Sequence[Complex[np.ndarray, "frequencies outputs"]],
+    amplitude: float | int,
+    rate: float | int | None,
+    output_amplitude: float | int | Sequence[float] | None,
+) -> _Limits:
+    """All limits of a design; an output's holds for every model of an ensemble."""
+    names, filters, peaks = ["amplitude"], [np.ones(omega.size, complex)], [amplitude]
+    if rate is not None:
+        names, filters, peaks = [*names, "rate"], [*filters, 1j * omega], [*peaks, rate]
+    outputs = responses[0].shape[1]
+    if output_amplitude is None or isinstance(output_amplitude, int | float):
+        output_peaks = [np.inf if output_amplitude is None else float(output_amplitude)] * outputs
+    else:
+        output_peaks = list(output_amplitude)
+    if len(output_peaks) != outputs:
+        raise ValueError(
+            f"output_amplitude has {len(output_peaks)} values for {outputs} outputs: give one for "
+            "each, inf where there is no limit"
+        )
+    for o, peak in enumerate(output_peaks):
+        for m, response in enumerate(responses):
+            if peak < np.inf:
+                which = f" {o}" if outputs > 1 else ""
+                names.append(f"output{which}" + (f", model {m}" if len(responses) > 1 else ""))
+                filters.append(response[:, o])
+                peaks.append(peak)
+    for name, peak in zip(names, peaks, strict=True):
+        if not 0 < peak < np.inf:
+            raise ValueError(f"the limit of {name} is {peak}: it has to be positive and finite")
+    return _Limits(tuple(names), np.array(filters), np.array(peaks, float))
+
+
+def least_peak_phases(orders: Orders, amplitudes: Amplitudes, *, seed: int) -> Lines:
+    """Phases of the lines under which several signals peak least, relative to their limits.
+
+    The signals are sums of `amplitudes` times cos(order 2 pi t + phase), `orders` per period, in
+    units of their limits. The p-norm over all of them is lowered for a rising p, from several
+    starts. Source: Guillaume, Schoukens, Pintelon and Kollar (1991), for one signal.
+    """
+    from scipy.optimize import minimize
+
+    used = np.flatnonzero(amplitudes[0])
+    few, heights = orders[used], amplitudes[:, used]
+    # Delays in proportion to the power of the lines below (Schroeder, 1970), and random starts.
+    power, rng = np.abs(heights[0]) ** 2, np.random.default_rng(seed)
+    below = np.concatenate([[0.0], np.cumsum(power)[:-1]]) / power.sum()
+    starts = [-2 * np.pi * np.concatenate([[0.0], np.cumsum(below[1:] * np.diff(few))])]
+    starts += [rng.uniform(-np.pi, np.pi, used.size) for _ in range(_STARTS - 1)]
+    points, ends = 1 << int(np.ceil(np.log2(_COARSE * few.max()))), []
+    for phase in starts:
+        for norm in _NORMS:
+            phase = minimize(
+                _log_norm, phase, (few, heights, points, norm),
+                jac=True, method="CG", options=dict(maxiter=_PHASE_STEPS),
+            ).x  # fmt: skip
+        ends.append(phase)
+    highest = [multisine_peaks(few, phase, heights).max() for phase in ends]
+    phase = np.zeros(orders.size)
+    phase[used] = ends[int(np.argmin(highest))]
+    return phase
+
+
+def multisine_peaks(
+    orders: Orders, phase: Lines, amplitudes: Amplitudes
+) -> Float[np.ndarray, " signals"]:
+    """A bound on each signal's peak at any time, from its values at many points.
+
+    Between N points, a signal of order n exceeds them by 1 / cos(pi n / N) at most (Ehlich and
+    Zeller, 1964): 0.1 %.
+    """
+    points = 1 << int(np.ceil(np.log2(_FINE * orders.max())))
+    levels = np.abs(multisine_signals(orders, phase, amplitudes, points))
+    return levels.max(axis=1) / np.cos(np.pi * orders.max() / points)
+
+
+def multisine_signals(
+    orders: Orders, phase: Lines, amplitudes: Amplitudes, points: int
+) -> Float[np.ndarray, "signals points"]:
+    """One period of each multisine, at evenly spaced points; `phase` in rad."""
+    return _synthesise(orders, amplitudes * np.exp(1j * phase), points)
+
+
+def _log_norm(
+    phase: Lines, orders: Orders, amplitudes: Amplitudes, points: int, norm: int
+) -> tuple[float, Lines]:
+    """Logarithm of the norm over all signals and points, and its gradient."""
+    turned = amplitudes * np.exp(1j * phase)
+    signals = _synthesise(orders, turned, points)
+    top = np.abs(signals).max()
+    unit = signals / top
+    powers = unit ** (norm - 2)
+    total = np.sum(powers * unit**2)
+    through = np.fft.rfft(powers * unit / (top * total), axis=1)[:, orders]
+    slope = np.real(1j * turned * np.conj(through)).sum(axis=0)
+    return float(np.log(total / unit.size) / norm + np.log(top)), slope
+
+
+def _synthesise(
+    orders: Orders, amplitudes: Amplitudes, points: int
+) -> Float[np.ndarray, "signals points"]:
+    spectrum = np.zeros((len(amplitudes), points // 2 + 1), complex)
+    spectrum[:, orders] = 0.5 * points * amplitudes
+    return np.fft.irfft(spectrum, points, axis=1)

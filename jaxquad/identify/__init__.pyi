@@ -1,11 +1,4 @@
-from ._curve_parameters import (
-    actuator as actuator,
-    B0Law as B0Law,
-    B0Schedule as B0Schedule,
-    curve_of_parameter as curve_of_parameter,
-    CurveFirmware as CurveFirmware,
-    FirmwareValue as FirmwareValue,
-)
+from ._fit_batch import BatchFit as BatchFit, fit_batch as fit_batch
 from ._gain_over_throttle import (
     gain_over_throttle as gain_over_throttle,
     throttle_levels as throttle_levels,
@@ -20,13 +13,18 @@ from ._known_filters import (
     without_filters as without_filters,
 )
 from ._thrust_curve import (
+    actuator as actuator,
+    B0Law as B0Law,
+    B0Schedule as B0Schedule,
+    curve_of_parameter as curve_of_parameter,
+    CurveFirmware as CurveFirmware,
+    FirmwareValue as FirmwareValue,
     GainBand as GainBand,
     GainOverThrottle as GainOverThrottle,
     PlantsOverThrottle as PlantsOverThrottle,
     ScaledB0 as ScaledB0,
     ThrottleLevels as ThrottleLevels,
 )
-from .batch._fit_batch import BatchFit as BatchFit, fit_batch as fit_batch
 from .frequency_domain._cost import (
     coherence_weight as coherence_weight,
     CoherenceWeighted as CoherenceWeighted,
@@ -100,25 +98,21 @@ from .output_error._verify import (
     Verification as Verification,
     verify as verify,
 )
-from .uncertainty._curves import (
+from .uncertainty._assess import MISFIT as MISFIT
+from .uncertainty._derived import (
+    check_drawable as check_drawable,
+    draw_models as draw_models,
+    Factor as Factor,
+    Factors as Factors,
+    factors as factors,
+    known_covariance as known_covariance,
     model_response as model_response,
     ResponseBand as ResponseBand,
     step_response as step_response,
     StepBand as StepBand,
-)
-from .uncertainty._derived import (
-    Factor as Factor,
-    Factors as Factors,
-    factors as factors,
     Tied as Tied,
 )
-from .uncertainty._draw_models import (
-    check_drawable as check_drawable,
-    draw_models as draw_models,
-    known_covariance as known_covariance,
-)
 from .uncertainty._error_budget import Discrepancy as Discrepancy
-from .uncertainty._fit_remarks import MISFIT as MISFIT
 from .uncertainty._verdict import (
     Bound as Bound,
     Combination as Combination,

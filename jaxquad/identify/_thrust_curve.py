@@ -1,7 +1,7 @@
 """The gain over the throttle by the thrust curve t = f x^2 + (1 - f) x, and b0."""
 
 from collections.abc import Mapping
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -10,20 +10,102 @@ from jaxtyping import ArrayLike, Float
 
 from jaxquad._core import plain_content
 
-from ._curve_parameters import (
-    actuator,
-    B0_POWERS,
-    B0Law,
-    B0Schedule,
-    curve_parameter,
-    CurveFirmware,
-    FirmwareValue,
-    parameter_of_curve,
-)
-from .frequency_domain._fit_content import counted
-from .frequency_domain._result import Fit
-from .uncertainty._draw_models import draw_models
-from .uncertainty._verdict import Combination, UndeterminedError
+from .frequency_domain._result import counted, Fit
+from .uncertainty._derived import draw_models
+from .uncertainty._verdict import Combination, reach_of_interval, UndeterminedError
+
+
+CurveFirmware = Literal["px4", "ardupilot", "betaflight", "betaflight 2025.12"]
+_PARAMETERS: Mapping[str, tuple[str, float, float, float]] = {  # name, factor on f, least, most
+    "px4": ("THR_MDL_FAC", 1.0, 0.0, 1.0),
+    "ardupilot": ("MOT_THST_EXPO", 1.0, -1.0, 1.0),
+    "betaflight": ("thrust_linear", 100.0, 0.0, 150.0),
+    "betaflight 2025.12": ("thrust_linear", 100.0, 0.0, 150.0),
+}
+
+
+def actuator(throttle: Float[ArrayLike, "..."], curve: float) -> Float[np.ndarray, "..."]:
+    """The motor's command x, 0 to 1, of a firmware that inverts t = curve x^2 + (1 - curve) x."""
+    t = np.asarray(throttle, float)
+    if curve == 0:
+        return t
+    half = (1 - curve) / (2 * curve)
+    return np.asarray(-half + np.sign(curve) * np.sqrt(half**2 + t / curve))
+
+
+def relative_slope(
+    throttle: Float[ArrayLike, "..."], curve: float, flown: float
+) -> Float[np.ndarray, "..."]:
+    """The gain over the throttle, relative to that of the `flown` curve being right."""
+    x = actuator(throttle, flown)
+    return np.asarray((1 - curve + 2 * curve * x) / (1 - flown + 2 * flown * x))
+
+
+class FirmwareValue(NamedTuple):
+    """A parameter of a firmware that straightens the thrust curve, with its 95 % interval."""
+
+    name: str
+    value: float  # within the documented range
+    standard_error: float
+    interval: tuple[float, float]  # not cut to the range
+
+    def __str__(self) -> str:
+        low, high = self.interval
+        return f"{self.name} {self.value:.3g} (95 %: {low:.3g} .. {high:.3g})"
+
+    def content(self) -> dict[str, object]:
+        """All of it, for JSON."""
+        content: dict[str, object] = dict(self._asdict())
+        content["interval_95"] = content.pop("interval")
+        return content
+
+
+def _parameter(firmware: CurveFirmware) -> tuple[str, float, float, float]:
+    if firmware not in _PARAMETERS:
+        raise ValueError(f"firmware is {firmware!r}: use one of {', '.join(_PARAMETERS)}")
+    return _PARAMETERS[firmware]
+
+
+def _cubic(curve: float) -> float:
+    """e of t (1 + e (1 - t)^2) nearest to the inverse of the thrust curve."""
+    t = (np.arange(1000) + 0.5) / 1000
+    shape = t * (1 - t) ** 2
+    return float(shape @ (actuator(t, curve) - t) / (shape @ shape))
+
+
+def curve_of_parameter(firmware: CurveFirmware, value: float | int) -> float:
+    """f of the thrust curve that a firmware inverts with this value of its parameter.
+
+    It is the inverse of `GainOverThrottle.firmware_value`: `value` is that of THR_MDL_FAC,
+    MOT_THST_EXPO or thrust_linear.
+
+    **Returns:** -1 to 1; for thrust_linear beyond what a curve of this family can be, the nearest.
+
+    **Raises:** ValueError for another firmware.
+    """
+    share = float(value) / _parameter(firmware)[1]
+    if firmware == "betaflight 2025.12":
+        curves = np.linspace(0.0, 1.0, 201)
+        return float(np.interp(share, [_cubic(float(curve)) for curve in curves], curves))
+    return float(np.clip(share, -1.0, 1.0))
+
+
+B0Law = Literal["FIXED", "SQRT", "LINEAR", "QUADRATIC"]
+B0_POWERS: Mapping[B0Law, float] = {"FIXED": 0.0, "SQRT": 0.5, "LINEAR": 1.0, "QUADRATIC": 2.0}
+
+
+class B0Schedule(NamedTuple):
+    """How Betaflight's proposed ADRC scales b0 over the throttle."""
+
+    law: B0Law  # adrc_b0_law
+    hover: float  # adrc_hover_throttle, 0 to 1, where the scale is 1
+    low: float = 1.0  # adrc_b0_scale_min, as a factor
+    high: float = 3.0  # adrc_b0_scale_max
+
+    def scale(self, throttle: Float[ArrayLike, "..."]) -> Float[np.ndarray, "..."]:
+        """The factor on b0 at a throttle of 0 to 1."""
+        scale = (np.asarray(throttle) / self.hover) ** B0_POWERS[self.law]
+        return np.asarray(np.clip(scale, self.low, self.high))
 
 
 Levels = Float[np.ndarray, " levels"]
@@ -64,24 +146,18 @@ class GainBand(NamedTuple):
 
 
 class ThrottleLevels(NamedTuple):
-    """Levels of throttle at which records hold an excitation, the lowest first.
+    """Levels of throttle at which records hold an excitation, the lowest first."""
 
-    **Attributes:**
-
-    - `throttle`: mean of each level, 0 to 1; `low`, `high`: of the throttle within it.
-    - `seconds`: flown at each.
-    """
-
-    throttle: Levels
-    low: Levels
+    throttle: Levels  # mean of each level, 0 to 1
+    low: Levels  # of the throttle within it
     high: Levels
-    seconds: Levels
+    seconds: Levels  # flown at each
 
     def what_to_fly(self) -> str:
         """In words, for gains at other throttles; empty where there are several levels."""
         if self.throttle.size > 1:
             return ""
-        return _two_more_levels(float(self.throttle[0]), float(self.seconds[0]))
+        return _advise_flight(float(self.throttle[0]), 0.2, float(self.seconds[0]), _AS_WELL)
 
 
 class PlantsOverThrottle(NamedTuple):
@@ -99,6 +175,12 @@ class _Line(NamedTuple):
     weights: Float[np.ndarray, "2 levels"]  # (a, b) is this times the gains
     misfit: float  # chi^2
     probability: float  # that the family has a larger one
+
+    @property
+    def widening(self) -> float:
+        """Of errors by the curve, where the curve itself does not fit."""
+        levels = self.weights.shape[1]
+        return 1.0 if self.probability >= 0.05 else float(np.sqrt(self.misfit / (levels - 2)))
 
 
 class GainOverThrottle(eqx.Module):
@@ -135,9 +217,7 @@ class GainOverThrottle(eqx.Module):
     def b0(self, level: int) -> Combination:
         """gain / lag at one level, in the output's unit per s^2 and unit of input.
 
-        **Raises:**
-
-        - `UndeterminedError`: the record does not tell the lag from the delay.
+        **Raises:** UndeterminedError if the record does not tell the lag from the delay.
         """
         self._require_lag()
         name = f"b0 at {self.throttle[level]:.2f}"
@@ -165,68 +245,55 @@ class GainOverThrottle(eqx.Module):
     def over(self, throttle: Float[ArrayLike, " points"]) -> GainBand:
         """The gain by the thrust curve, at any throttle.
 
-        **Raises:**
-
-        - `UndeterminedError`: fewer than two levels were flown.
+        **Raises:** UndeterminedError for fewer than two levels.
         """
         return self._band(throttle, over_lag=False)
 
     def b0_over(self, throttle: Float[ArrayLike, " points"]) -> GainBand:
-        """gain / lag by the thrust curve, at any throttle; as `b0`.
-
-        **Raises:**
-
-        - `UndeterminedError`: as `over`, and as `b0`.
-        """
+        """gain / lag by the thrust curve, at any throttle; raises as `over` and `b0`."""
         self._require_lag()
         return self._band(throttle, over_lag=True)
 
     def draw(
         self, throttle: Float[ArrayLike, " throttles"], plants: int, *, seed: int = 0
     ) -> PlantsOverThrottle:
-        """Draw plants from what the record leaves uncertain; each follows a thrust curve.
+        """Draw so many plants from what the record leaves uncertain, at a throttle of 0 to 1.
 
-        **Arguments:**
-
-        - `throttle`: 0 to 1.
-        - `plants`: how many.
-
-        **Returns:**
-
-        A `PlantsOverThrottle`.
-
-        **Raises:**
-
-        - `UndeterminedError`: as `over`, and as `b0`.
+        Each follows a thrust curve. Raises as `over` and `b0`.
         """
-        line = self._require_line()
+        line = self._line()
+        if line is None:
+            raise UndeterminedError(self.what_to_fly())
         self._require_lag()
         scores = np.random.default_rng(seed).standard_normal((len(self.fit.names), plants))
         models = draw_models(self.fit, jnp.asarray(scores))
         wide = lambda x: np.broadcast_to(np.asarray(x, float), (plants,))
         change = line.weights @ (np.asarray(models.gain) - self.gain[:, None])
         rows = self._rows(np.atleast_1d(throttle))
-        gain = rows @ (line.ends[:, None] + self._widening(line) * change)
+        gain = rows @ (line.ends[:, None] + line.widening * change)
         return PlantsOverThrottle(gain, wide(models.lag), wide(models.delay))
 
     def firmware_value(self, firmware: CurveFirmware) -> FirmwareValue:
         """The parameter with which a firmware makes the gain the same at every throttle.
 
-        **Arguments:**
-
-        - `firmware`: `"px4"` (THR_MDL_FAC), `"ardupilot"` (MOT_THST_EXPO), `"betaflight"`
-            (thrust_linear from 2026.6 on) or `"betaflight 2025.12"`, whose thrust_linear
-            t (1 + e (1 - t)^2) is fitted to the inverse curve by least squares over 0 to 1.
+        **Arguments:** `firmware`: `"px4"` (THR_MDL_FAC), `"ardupilot"` (MOT_THST_EXPO),
+        `"betaflight"` (thrust_linear from 2026.6 on) or `"betaflight 2025.12"`, whose thrust_linear
+        t (1 + e (1 - t)^2) is fitted to the inverse curve by least squares over 0 to 1.
 
         **Raises:**
 
         - `UndeterminedError`: the record holds too little of the curve; says what to fly.
         - `ValueError`: for another firmware.
         """
-        name, curve = curve_parameter(firmware), self.curve
+        (name, factor, least, most), curve = _parameter(firmware), self.curve
         if curve is None or _reach(curve) > _SHARP:
             raise UndeterminedError(f"{name}: {self.what_to_fly()}")
-        return parameter_of_curve(firmware, curve)
+        convert = _cubic if firmware == "betaflight 2025.12" else float
+        slope = (convert(curve.value + 1e-4) - convert(curve.value - 1e-4)) / 2e-4
+        value, error = factor * convert(curve.value), factor * abs(slope) * curve.standard_error
+        reach = reach_of_interval(curve.degrees_of_freedom) * error
+        interval = (value - reach, value + reach)
+        return FirmwareValue(name, float(np.clip(value, least, most)), error, interval)
 
     def adrc_b0(self, hover: float, *, largest: float = 3.0) -> ScaledB0:
         """adrc_b0 and the law over the throttle of Betaflight's proposed ADRC.
@@ -269,15 +336,15 @@ class GainOverThrottle(eqx.Module):
         if curve is None:
             return (
                 f"the log holds one level of throttle ({first:.2f}), which shows no curve: "
-                f"{_two_more_levels(first, seconds)}"
+                f"{_advise_flight(first, 0.2, seconds, _AS_WELL)}"
             )
         reach = _reach(curve)
         if reach <= _SHARP:
             return f"the log holds enough of the thrust curve ({first:.2f} .. {last:.2f} throttle)"
         wanted = (last - first) * reach / _SHARP
         if wanted <= 0.6:
-            lower, upper = _levels_around((first + last) / 2, wanted)
-            advice = f"fly from {lower:.2f} to {upper:.2f}, {_same_excitation(seconds)}"
+            words = "from {:.2f} to {:.2f}"
+            advice = _advise_flight((first + last) / 2, wanted, seconds, words)
         else:
             advice = (
                 f"fly from 0.20 to 0.80, with {wanted / 0.6:.1f} times the amplitude or "
@@ -378,12 +445,6 @@ class GainOverThrottle(eqx.Module):
         probability = float(chdtrc(n - 2, misfit)) if n > 2 else 1.0
         return _Line(ends, gather * scale, misfit, probability)
 
-    def _require_line(self) -> _Line:
-        line = self._line()
-        if line is None:
-            raise UndeterminedError(self.what_to_fly())
-        return line
-
     def _rows(self, throttle: Float[ArrayLike, "..."]) -> Float[np.ndarray, "... 2"]:
         """The gain at a throttle is this times the line's ends."""
         x = actuator(throttle, self.flown)
@@ -395,18 +456,14 @@ class GainOverThrottle(eqx.Module):
         line = self._line()
         slope = np.concatenate([by_gain, [by_lag, 0.0]]) * self.fit.units
         error = float(np.sqrt(slope @ self.fit.relative_covariance @ slope))
-        error *= 1.0 if line is None else self._widening(line)
+        error *= 1.0 if line is None else line.widening
         return Combination(name, value, error, self.fit.freedom_of(slope))
-
-    def _widening(self, line: _Line) -> float:
-        """Of errors by the curve, where the curve itself does not fit."""
-        if line.probability >= 0.05:
-            return 1.0
-        return float(np.sqrt(line.misfit / (self.throttle.size - 2)))
 
     def _by_curve(self, throttle: float, *, over_lag: bool) -> Combination:
         """The gain at a throttle, or gain / lag."""
-        line, lag = self._require_line(), self.fit["lag"] if over_lag else 1.0
+        line, lag = self._line(), self.fit["lag"] if over_lag else 1.0
+        if line is None:
+            raise UndeterminedError(self.what_to_fly())
         row = self._rows(throttle)
         value, by_gain = float(row @ line.ends) / lag, row @ line.weights / lag
         by_lag = -float(row @ line.ends) / lag**2 if over_lag else 0.0
@@ -430,20 +487,14 @@ class GainOverThrottle(eqx.Module):
             )
 
 
-def _levels_around(middle: float, span: float) -> tuple[float, float]:
-    """A range of throttle of this span that can be flown."""
+_AS_WELL = "{:.2f} and {:.2f} as well"
+
+
+def _advise_flight(middle: float, span: float, seconds: float, words: str) -> str:
     lower = float(np.clip(middle - span / 2, 0.15, 0.85 - min(span, 0.7)))
-    return lower, min(lower + span, 0.85)
-
-
-def _two_more_levels(throttle: float, seconds: float) -> str:
-    lower, upper = _levels_around(throttle, 0.2)
-    return f"fly {lower:.2f} and {upper:.2f} as well, {_same_excitation(seconds)}"
-
-
-def _same_excitation(seconds: float) -> str:
     turns = ", in turns of about 8 s, as the vehicle sinks or climbs" if seconds > 10 else ""
-    return f"with the same excitation for {seconds:.0f} s at each{turns}"
+    levels = words.format(lower, min(lower + span, 0.85))
+    return f"fly {levels}, with the same excitation for {seconds:.0f} s at each{turns}"
 
 
 def _reach(number: Combination) -> float:

@@ -97,19 +97,11 @@ def stacked(count: int, ax: AxesLike = None, *, columns: int = 1, shared: bool =
 
 
 def arrange(
-    panels: Panels,
-    heights: Sequence[float],
-    *,
-    columns: int = 1,
-    width: float = WIDTH,
-    left: float = _LEFT,
-    right: float = _RIGHT,
-    above: float = 0.0,
-    gap: float | Sequence[float] = _GAP,
-    title: str = "",
-    legend: Mapping[str, Artist] | None = None,
-    handle_length: float = 2.0,
-) -> Panels:
+    panels: Panels, heights: Sequence[float], *, columns: int = 1, width: float = WIDTH,
+    left: float = _LEFT, right: float = _RIGHT, above: float = 0.0,
+    gap: float | Sequence[float] = _GAP, title: str = "",
+    legend: Mapping[str, Artist] | None = None, handle_length: float = 2.0,
+) -> Panels:  # fmt: skip
     """Give new panels their places, all in inches, a title above and a legend below.
 
     `heights` are those of the rows, `gap` the room below each of them, `above` that between the

@@ -8,52 +8,26 @@ from jaxtyping import Bool, Float, PyTree
 from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
-from jaxquad.identify import (
-    as_sampled,
-    compare as compare_models,
-    Comparison,
-    Fit,
-    linear_model,
-    model_response,
-    step_response,
-    Verification,
-    verify,
-)
+import jaxquad.identify as identify
+from jaxquad.identify import Comparison, Fit, linear_model, Verification
 from jaxquad.models import Model
 from jaxquad.records import clock_start, Record
 from jaxquad.spectra import estimate_step, FrequencyResponse, StepResponse
 
-from ._histories import extremes
-from ._panels import (
-    add_hertz,
-    arrange,
-    AxesLike,
-    COHERENT,
-    few_ticks,
-    legend_of,
-    look_of,
-    Panels,
-    plain_ticks,
-    stacked,
-    Style,
-    unit_label,
-    WIDTH,
-)
-from ._shown import analysed, Channels, channels_shown, Measured, named, named_models, Thing
+from . import _panels as lay
+from ._flights import extremes
+from ._panels import AxesLike, COHERENT, Panels, Style
+from ._shown import analysed, Channels, Measured, named, named_models, Shown, Thing
 
 
 Samples = Float[np.ndarray, " samples"]
 
 
 def compare(
-    models: PyTree | Mapping[str, PyTree] | Sequence[PyTree],
-    record: Record | None = None,
-    *,
-    band: tuple[float, float] | None = None,
-    hold: str | None = None,
-    ax: AxesLike = None,
+    models: PyTree | Mapping[str, PyTree] | Sequence[PyTree], record: Record | None = None, *,
+    band: tuple[float, float] | None = None, hold: str | None = None, ax: AxesLike = None,
     title: str = "",
-) -> Panels:
+) -> Panels:  # fmt: skip
     """Draw measured outputs and what models predict over time, with their differences below.
 
     The legend has the fit in per cent of each model. Angles are in degrees. A long curve is drawn
@@ -70,9 +44,6 @@ def compare(
     - `models`, `record`, `band`, `hold`: as in `jq.compare`; or instead of the models what it or
         `jq.verify` returned.
     - `ax`: axes to draw into, two for each output.
-    - `title`: above the figure.
-
-    **Returns:** `jq.plot.Panels`.
 
     **Raises:** what `jq.compare` raises; ValueError for models without a record.
     """
@@ -86,27 +57,27 @@ def compare(
             "jq.compare or jq.verify returned"
         )
     else:
-        checks = compare_models(models, record, band=band, hold=hold).checks
+        checks = identify.compare(models, record, band=band, hold=hold).checks
     first, single = next(iter(checks.values())), len(checks) == 1
     count = len(first.outputs)
-    panels = stacked(2 * count, ax)
+    panels = lay.stacked(2 * count, ax)
     for k, one in enumerate(first.outputs):
         top, bottom = panels[2 * k], panels[2 * k + 1]
-        scale, unit = unit_label(one.unit)
+        scale, unit = lay.unit_label(one.unit)
         measured = scale * first.measured.reshape(-1, count)[:, k]
         ink = {"color": "0.15", "lw": 1.0} if single else {"color": "0.7", "lw": 3.0}
         _plot(top, first.time, measured, ink | {"label": "measured"})
         for m, (name, check) in enumerate(checks.items()):
             simulated = scale * check.simulated.reshape(-1, count)[:, k]
             text = name if single else f"{name}: {check.outputs[k].fit_percent:.1f} %"
-            look = look_of(m, text) | ({"ls": "--"} if single else {})
+            look = lay.look_of(m, text) | ({"ls": "--"} if single else {})
             thin: Style = {"lw": 0.9} | ({"color": "tab:red", "ls": "-"} if single else {})
             _plot(top, check.time, simulated, look)
             _plot(bottom, check.time, measured - simulated, look | thin)
         top.legend(loc="upper right", fontsize=9 if single else 8, ncols=2)
         top.set_ylabel(f"{one.name}{unit}")
         bottom.set_ylabel(f"difference{unit}")
-        few_ticks(bottom.yaxis, 4)
+        lay.few_ticks(bottom.yaxis, 4)
         for axis in (top, bottom):
             axis.grid(True, color="0.9", lw=0.5)
             axis.margins(x=0)
@@ -121,7 +92,7 @@ def compare(
             f" TIC {first.tic:.3f}{where}"
         ]
     heights = [2.4, 1.0] if count == 1 else [1.8, 0.9] * count
-    return arrange(panels, heights, title="\n".join(filter(None, lines)))
+    return lay.arrange(panels, heights, title="\n".join(filter(None, lines)))
 
 
 def _plot(panel: Axes, time: Samples, values: Samples, style: Style) -> None:
@@ -144,12 +115,9 @@ _LONGEST = 60.0  # s, where nothing says how long it lasts
 
 
 def step(
-    *shown: Thing,
-    duration: float | None = None,
-    pair: tuple[str, str] | None = None,
-    ax: AxesLike = None,
-    title: str = "",
-) -> Panels:
+    *shown: Thing, duration: float | None = None, pair: tuple[str, str] | None = None,
+    ax: AxesLike = None, title: str = "",
+) -> Panels:  # fmt: skip
     """Draw the answers of models, fits, closed loops and flown loops to a unit step.
 
     A fit has its 95 % band, model error included. Of a loop its first axis is simulated: the angle,
@@ -172,9 +140,6 @@ def step(
     - `pair`: names of output and input of a fit (`y1`, `u1` of a model); by default all, an input
         for each column.
     - `ax`: axes to draw into, one for each pair.
-    - `title`: above the figure.
-
-    **Returns:** `jq.plot.Panels`.
 
     **Raises:** ValueError for what has no step response, such as a frequency response or a record
     without a reference, and for an unknown `pair`.
@@ -189,19 +154,33 @@ def step(
     end = max(map(_duration, things.values())) if duration is None else float(duration)
     time = np.linspace(0.0, end, _SAMPLES)
     answers = {name: _answer(thing, time) for name, thing in things.items()}
-    channels = _channels(things, answers, records)
+    shapes = {name: answer.value.shape[1:] for name, answer in answers.items()}
+    if len(set(shapes.values())) > 1:
+        raise ValueError(
+            f"models of different channels (outputs, inputs): {shapes}; draw them one by one"
+        )
+    origins = [x.origin for x in things.values() if isinstance(x, Fit) and x.origin is not None]
+    flown = [thing.names for thing in things.values() if isinstance(thing, StepResponse)]
+    if origins:  # names and units of the first fit or record that has them; else numbers
+        channels = Shown([Measured("", origins[0].frfs[0])], []).channels
+    elif flown:
+        reference, output = flown[0]
+        units = [records[0].unit(name) for name in (output, reference)] if records else ["", ""]
+        channels = Channels((output,), (reference,), (units[0],), (units[1],), True)
+    else:
+        channels = Channels.numbered(*next(iter(shapes.values())))
     places = channels.places(pair)
     columns = len({i for _, i in places})
-    panels = stacked(len(places), ax, columns=columns)
+    panels = lay.stacked(len(places), ax, columns=columns)
     for panel, (o, i) in zip(panels, places, strict=True):
-        above, unit = unit_label(channels.output_units[o])
-        below, other = unit_label(channels.input_units[i])
+        above, unit = lay.unit_label(channels.output_units[o])
+        below, other = lay.unit_label(channels.input_units[i])
         if unit == other:
             unit = ""
         elif unit and other:
             unit += f" per {other.removeprefix(', ')}"
         for k, (name, answer) in enumerate(answers.items()):
-            look, value = look_of(k, name), above / below * answer.value[:, o, i]
+            look, value = lay.look_of(k, name), above / below * answer.value[:, o, i]
             if answer.reach is not None:
                 reach = above / below * answer.reach[:, o, i]
                 panel.fill_between(answer.time, value - reach, value + reach, alpha=0.3, lw=0,
@@ -212,10 +191,10 @@ def step(
         panel.margins(x=0)
     for panel in panels[-columns:]:
         panel.set_xlabel("time, s")
-    width = WIDTH if columns == 1 else 4.2 * columns
+    width = lay.WIDTH if columns == 1 else 4.2 * columns
     bands = any(answer.reach is not None for answer in answers.values())
-    legend = legend_of(panels[:1]) if len(answers) > 1 or bands else None
-    return arrange(panels, [2.6] * (len(places) // columns), columns=columns, width=width,
+    legend = lay.legend_of(panels[:1]) if len(answers) > 1 or bands else None
+    return lay.arrange(panels, [2.6] * (len(places) // columns), columns=columns, width=width,
                    title=title, legend=legend, handle_length=3.0)  # fmt: skip
 
 
@@ -240,7 +219,7 @@ def _answer(thing: Thing, time: Samples) -> _Answer:
         band = thing.step_response(time)
         return _Answer(band.time, band.value, band.reach)
     if isinstance(thing, Model):
-        return _Answer(time, step_response(thing, time))
+        return _Answer(time, identify.step_response(thing, time))
     from jaxquad.loops import Loop
     from jaxquad.simulation import scenario, simulate, Step  # here: most figures show no loop
 
@@ -254,27 +233,6 @@ def _answer(thing: Thing, time: Samples) -> _Answer:
     )
     angle = np.asarray(flown.angle)[:, 0] / size
     return _Answer(np.asarray(flown.time), angle[:, None, None])
-
-
-def _channels(
-    things: Mapping[str, Thing], answers: Mapping[str, _Answer], records: Sequence[Record]
-) -> Channels:
-    """Names and units of the first fit or record that has them; else numbers."""
-    shapes = {name: answer.value.shape[1:] for name, answer in answers.items()}
-    if len(set(shapes.values())) > 1:
-        raise ValueError(
-            f"models of different channels (outputs, inputs): {shapes}; draw them one by one"
-        )
-    origins = [x.origin for x in things.values() if isinstance(x, Fit) and x.origin is not None]
-    if origins:
-        return channels_shown([Measured("", origins[0].frfs[0])], [])
-    flown = [thing.names for thing in things.values() if isinstance(thing, StepResponse)]
-    if flown:
-        reference, output = flown[0]
-        units = [records[0].unit(name) for name in (output, reference)] if records else ["", ""]
-        return Channels((output,), (reference,), (units[0],), (units[1],), True)
-    outputs, inputs = next(iter(shapes.values()))
-    return Channels.numbered(outputs, inputs)
 
 
 _SIGMAS = 1.96  # of a normal error, that hold 95 %
@@ -315,7 +273,7 @@ def residuals_of(frf: FrequencyResponse, model: Model, output: int, source: int)
     - `output`, `source`: places of output and input.
     """
     omega = np.asarray(frf.omega)
-    modelled = model_response(as_sampled(model, frf), omega)[:, output, source]
+    modelled = identify.model_response(identify.as_sampled(model, frf), omega)[:, output, source]
     pair = (slice(None), output, source)
     with np.errstate(all="ignore"):
         difference = np.log(np.asarray(frf.response)[pair] / modelled)
@@ -328,13 +286,9 @@ def residuals_of(frf: FrequencyResponse, model: Model, output: int, source: int)
 
 
 def resid(
-    model: PyTree,
-    data: FrequencyResponse | Record | None = None,
-    *,
-    pair: tuple[str, str] | None = None,
-    ax: AxesLike = None,
-    title: str = "",
-) -> Panels:
+    model: PyTree, data: FrequencyResponse | Record | None = None, *,
+    pair: tuple[str, str] | None = None, ax: AxesLike = None, title: str = "",
+) -> Panels:  # fmt: skip
     """Draw what a model leaves unexplained: of a response over frequency, of a record over time.
 
     Over frequency, measured minus model is in units of its random error, with the band that holds
@@ -356,9 +310,6 @@ def resid(
     - `data`: a measured response or a record; by default the response of the fit.
     - `pair`: names of output and input of a measured response; by default the first of each.
     - `ax`: axes to draw into: two, of a record two for each output.
-    - `title`: above the figure.
-
-    **Returns:** `jq.plot.Panels`.
 
     **Raises:** ValueError for a model without data, and for an unknown `pair`.
     """
@@ -370,17 +321,17 @@ def resid(
     if data is None and isinstance(model, Fit) and model.origin is not None:
         data = model.origin.frfs[0]
     if isinstance(data, Record):
-        return _over_time(verify(fitted, data), ax, title)
+        return _over_time(identify.verify(fitted, data), ax, title)
     if data is None:
         raise ValueError(
             "resid needs what was measured: give a response or a record as the second argument"
         )
-    [(o, i), *_] = channels_shown([Measured("", data)], []).places(pair)
+    [(o, i), *_] = Shown([Measured("", data)], []).channels.places(pair)
     return _over_frequency(residuals_of(data, fitted, o, i), ax, title)
 
 
 def _over_frequency(residuals: Residuals, ax: AxesLike, title: str) -> Panels:
-    panels = stacked(2, ax)
+    panels = lay.stacked(2, ax)
     for panel, values, text in (
         (panels[0], residuals.magnitude, "magnitude"),
         (panels[1], residuals.phase, "phase"),
@@ -396,11 +347,11 @@ def _over_frequency(residuals: Residuals, ax: AxesLike, title: str) -> Panels:
         panel.set_ylabel(f"{text} / error")
         panel.grid(True, color="0.93", lw=0.5)
         panel.set_xscale("log")
-        plain_ticks(panel.xaxis)
+        lay.plain_ticks(panel.xaxis)
     panels[1].set_xlabel("frequency, rad/s")
     panels[1].set_xlim(residuals.omega[0] / 1.05, residuals.omega[-1] * 1.05)
-    add_hertz(panels[0])
-    return arrange(panels, (1.6, 1.6), above=0.45, title=title)
+    lay.add_hertz(panels[0])
+    return lay.arrange(panels, (1.6, 1.6), above=0.45, title=title)
 
 
 def autocorrelation(values: Float[np.ndarray, " samples"]) -> Float[np.ndarray, " lags"]:
@@ -416,11 +367,11 @@ _LAGS = 400  # that are drawn
 
 def _over_time(check: Verification, ax: AxesLike, title: str) -> Panels:
     count, samples = len(check.outputs), check.time.size
-    panels = stacked(2 * count, ax, shared=False)
+    panels = lay.stacked(2 * count, ax, shared=False)
     left = (check.measured - check.simulated).reshape(samples, count)
     dt = float(check.time[-1] - check.time[0]) / (samples - 1)
     for k, one in enumerate(check.outputs):
-        scale, unit = unit_label(one.unit)
+        scale, unit = lay.unit_label(one.unit)
         top, bottom = panels[2 * k], panels[2 * k + 1]
         top.plot(check.time - clock_start(check.time), scale * left[:, k], color="tab:red", lw=0.8)
         top.set(ylabel=f"{one.name}, measured\nminus model{unit}", xlabel="time, s")
@@ -434,6 +385,6 @@ def _over_time(check: Verification, ax: AxesLike, title: str) -> Panels:
         bottom.set(xlabel="lag, s", ylabel="autocorrelation")
         for panel in (top, bottom):
             panel.grid(True, color="0.92", lw=0.5)
-            few_ticks(panel.yaxis, 5)
+            lay.few_ticks(panel.yaxis, 5)
             panel.margins(x=0)
-    return arrange(panels, [1.7, 1.5] * count, gap=0.55, title=title)
+    return lay.arrange(panels, [1.7, 1.5] * count, gap=0.55, title=title)

@@ -5,7 +5,6 @@ from textwrap import wrap
 
 import numpy as np
 from jaxtyping import PyTree
-from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
 from jaxquad.ensembles import Ensemble, Members
@@ -22,19 +21,9 @@ from jaxquad.tuning import (
     worst_flights,
 )
 
-from ._histories import histories
-from ._panels import (
-    arrange,
-    AxesLike,
-    draw_limit,
-    legend_of,
-    marks,
-    Panels,
-    plain_ticks,
-    raise_powers,
-    stacked,
-    Style,
-)
+from . import _panels as lay
+from ._flights import histories
+from ._panels import AxesLike, Panels, Style
 
 
 _LINES = ("-", "--", "-.", ":")
@@ -53,9 +42,6 @@ def convergence_figure(
 
     - `history`: `Tuned.history`; several starts have a line each.
     - `ax`: two axes to draw into.
-    - `title`: above the figure.
-
-    **Returns:** `jq.plot.Panels`.
 
     **Raises:** ValueError for an empty history.
     """
@@ -65,8 +51,7 @@ def convergence_figure(
     flying = np.array([one.phase == "optimise" for one in history])
     cost = np.where(flying[:, None], [np.atleast_1d(one.cost) for one in history], np.nan)
     stable = np.array([np.atleast_1d(one.stable) for one in history])
-    panels = stacked(2, ax)
-    top, bottom = panels
+    top, bottom = panels = lay.stacked(2, ax)
     best = np.nanmin(cost) if np.isfinite(cost).any() else 0.0
     above, starts = np.maximum(cost - best, _LEAST), cost.shape[1]
     for k in range(starts):
@@ -79,8 +64,8 @@ def convergence_figure(
         shares = 100 * stable[running, k]
         bottom.plot(count[running], shares, drawstyle="steps-mid", lw=1.4, **style)
     top.set(yscale="log", ylabel="cost above the best")
-    plain_ticks(top.yaxis)
-    draw_limit(top, _CLOSE, "1 %")
+    lay.plain_ticks(top.yaxis)
+    lay.draw_limit(top, _CLOSE, "1 %")
     bottom.set(ylabel="stable members, %", ylim=(-4, 104))
     for panel in panels:
         panel.grid(True, color="0.9", lw=0.5)
@@ -95,8 +80,8 @@ def convergence_figure(
     bottom.set_xlabel("gradient evaluation")
     bottom.xaxis.set_major_locator(MaxNLocator(integer=True))
     bottom.set_xlim(0.5, len(history) + 0.5)
-    legend = legend_of([top]) if starts > 1 else None
-    return arrange(panels, (2.6, 1.4), title=title, legend=legend)
+    legend = lay.legend_of([top]) if starts > 1 else None
+    return lay.arrange(panels, (2.6, 1.4), title=title, legend=legend)
 
 
 _TITLES = {"activity_rate": "mean activity", "sensitivity_peak": "worst Ms"}
@@ -110,13 +95,9 @@ def front_figure(pareto: Pareto, *, ax: AxesLike = None, title: str = "") -> Pan
     **Arguments:**
 
     - `pareto`: see `jaxquad.tuning`.
-    - `ax`: axes to draw into.
     - `title`: by default what is shown.
-
-    **Returns:** `jq.plot.Panels`.
     """
-    panels = stacked(1, ax)
-    [panel] = panels
+    [panel] = panels = lay.stacked(1, ax)
     degrees, on = QUANTITIES["itae"].factor, pareto.front
     order = np.argsort(pareto.effort)
     front = order[on[order]]
@@ -132,7 +113,7 @@ def front_figure(pareto: Pareto, *, ax: AxesLike = None, title: str = "") -> Pan
     efforts = [effort for effort, _ in points]
     # Where designs without a finite effort stand.
     edge = 1.6 * max((x for x in [*pareto.effort, *efforts] if np.isfinite(x)), default=1.0)
-    styles = list(marks(["front", *pareto.peers]).items())[1:]
+    styles = list(lay.marks(["front", *pareto.peers]).items())[1:]
     designs = pareto.peers.values()
     for (name, style), design, (effort, itae) in zip(styles, designs, points, strict=True):
         bold: Style = style | {"ms": 8.0, "mew": 1.4}
@@ -153,17 +134,17 @@ def front_figure(pareto: Pareto, *, ax: AxesLike = None, title: str = "") -> Pan
             xytext=(0, -4), textcoords="offset points", fontsize=8,
         )  # fmt: skip
     members, shown = pareto.certificates[0].members, QUANTITIES[pareto.over]
-    unit = f", {raise_powers(shown.unit)}" if shown.unit else ""
+    unit = f", {lay.raise_powers(shown.unit)}" if shown.unit else ""
     panel.margins(x=0.12, y=0.1)
-    panel.set(xscale="log", yscale="log", ylabel=f"ITAE, {raise_powers('deg s^2')}")
+    panel.set(xscale="log", yscale="log", ylabel=f"ITAE, {lay.raise_powers('deg s^2')}")
     panel.set_xlabel(f"{_TITLES[pareto.over]} of the members{unit}")
     for axis in (panel.xaxis, panel.yaxis):
-        plain_ticks(axis)
+        lay.plain_ticks(axis)
     panel.grid(True, color="0.9", lw=0.5)
     stable = "none is unstable on the front" if on.any() else "no front"
     text = f"tracking against {shown.title}: {members} fresh members fly each design, {stable}"
     title = "\n".join(wrap(title or text, 95))
-    return arrange(panels, [3.4], width=7.0, title=title, legend=legend_of(panels))
+    return lay.arrange(panels, [3.4], width=7.0, title=title, legend=lay.legend_of(panels))
 
 
 _TOPS = {"sensitivity_peak": 30.0}  # where the picture ends: more is as good as unstable
@@ -171,13 +152,9 @@ _LETTER = 0.067  # inches, of a design's name
 
 
 def certificate_figure(
-    certificate: Certificate,
-    *,
-    quantities: Sequence[str] = ("itae", "sensitivity_peak"),
-    designs: Sequence[str] | None = None,
-    ax: AxesLike = None,
-    title: str = "",
-) -> Panels:
+    certificate: Certificate, *, quantities: Sequence[str] = ("itae", "sensitivity_peak"),
+    designs: Sequence[str] | None = None, ax: AxesLike = None, title: str = "",
+) -> Panels:  # fmt: skip
     """Draw every member of a certificate over its inertia: stability, then further quantities.
 
     Linearly unstable members have a cross, and no Ms or margin. Limits are dashed lines.
@@ -190,8 +167,6 @@ def certificate_figure(
     - `ax`: axes to draw into: one for the stability, one for each quantity.
     - `title`: by default the verdict, and what fails.
 
-    **Returns:** `jq.plot.Panels`.
-
     **Raises:** ValueError for unknown designs, and for more than there are marks.
     """
     names = tuple(certificate.designs) if designs is None else tuple(designs)
@@ -199,7 +174,7 @@ def certificate_figure(
     if unknown:
         raise ValueError(f"no designs {unknown}: choose from {list(certificate.designs)}")
     heights = [0.28 * len(names) + 0.1, *(2.7 for _ in quantities)]
-    panels = stacked(len(heights), ax)
+    panels = lay.stacked(len(heights), ax)
     inertia, label = certificate.facts["inertia"], "inertia J of the member, kg m^2"
     if certificate.nominal is not None:
         inertia, label = inertia / certificate.nominal[:, None], "inertia of the member, J / J0"
@@ -218,62 +193,50 @@ def certificate_figure(
     panels[0].set_ylim(len(names) - 0.5, -0.5)
     panels[0].tick_params(axis="y", length=0)
     for panel, quantity in zip(panels[1:], quantities, strict=True):
-        _draw_members(panel, certificate, quantity, names, place)
-    panels[-1].set(xscale="log", xlabel=raise_powers(label))
+        shown, top = QUANTITIES[quantity], _TOPS.get(quantity, np.inf)
+        lowest = []
+        for name, style in reversed(lay.marks(names).items()):
+            design = certificate.designs[name]
+            values = np.array([shown.number(x) for x in design.of(quantity)])
+            finite = np.isfinite(values)
+            height = np.minimum(values, top)
+            above = 3 if name == names[0] else 2
+            panel.plot(place[finite], height[finite], ls="none", label=name, zorder=above, **style)
+            if design.unstable is not None and (cross := finite & design.unstable).any():
+                panel.plot(place[cross], height[cross], "x", ms=5, mew=0.8, color="black", zorder=4,
+                           label="linearly unstable")  # fmt: skip
+            lowest.append(np.min(height[finite], initial=np.inf))
+        for distance in certificate.distances:
+            if distance.quantity == quantity:
+                text = f"{distance.over} {distance.sense} {shown.text(distance.bound)}"
+                lay.draw_limit(panel, shown.number(distance.bound), lay.raise_powers(text))
+        panel.set_yscale("log" if min(lowest) > 0 and not shown.decibels else "linear")
+        unit = f", {lay.raise_powers(shown.unit)}" if shown.unit else ""
+        cut = f" (above {top:g} drawn at {top:g})" if np.isfinite(top) else ""
+        panel.set_ylabel(f"{shown.title}{unit}{cut}")
+    panels[-1].set(xscale="log", xlabel=lay.raise_powers(label))
     for panel in panels[1:]:
         panel.grid(True, color="0.9", lw=0.5)
         if panel.get_yscale() == "log":
-            plain_ticks(panel.yaxis)
-    plain_ticks(panels[-1].xaxis)
-    handles = legend_of(panels[1:])
+            lay.plain_ticks(panel.yaxis)
+    lay.plain_ticks(panels[-1].xaxis)
+    handles = lay.legend_of(panels[1:])
     crossed = [name for name in handles if name == "linearly unstable"]
     order = [name for name in handles if name not in crossed][::-1] + crossed
     failed = [str(verdict) for verdict in certificate.verdicts if verdict.holds is False]
     lines = [title] if title else [str(certificate).splitlines()[0], *failed]
     title = "\n".join(part for line in lines for part in wrap(line, 95))
     left = max(0.9, 0.2 + _LETTER * max(map(len, labels)))
-    return arrange(panels, heights, width=6.4 + left, left=left, title=title,
+    return lay.arrange(panels, heights, width=6.4 + left, left=left, title=title,
                    legend={name: handles[name] for name in order})  # fmt: skip
 
 
-def _draw_members(
-    panel: Axes, certificate: Certificate, quantity: str, names: Sequence[str], place: np.ndarray
-) -> None:
-    shown, top = QUANTITIES[quantity], _TOPS.get(quantity, np.inf)
-    lowest = []
-    for name, style in reversed(marks(names).items()):
-        design = certificate.designs[name]
-        values = np.array([shown.number(x) for x in design.of(quantity)])
-        finite = np.isfinite(values)
-        height = np.minimum(values, top)
-        order = 3 if name == names[0] else 2
-        panel.plot(place[finite], height[finite], ls="none", label=name, zorder=order, **style)
-        if design.unstable is not None and (cross := finite & design.unstable).any():
-            panel.plot(place[cross], height[cross], "x", ms=5, mew=0.8, color="black", zorder=4,
-                       label="linearly unstable")  # fmt: skip
-        lowest.append(np.min(height[finite], initial=np.inf))
-    for distance in certificate.distances:
-        if distance.quantity == quantity:
-            text = f"{distance.over} {distance.sense} {shown.text(distance.bound)}"
-            draw_limit(panel, shown.number(distance.bound), raise_powers(text))
-    panel.set_yscale("log" if min(lowest) > 0 and not shown.decibels else "linear")
-    unit = f", {raise_powers(shown.unit)}" if shown.unit else ""
-    cut = f" (above {top:g} drawn at {top:g})" if np.isfinite(top) else ""
-    panel.set_ylabel(f"{shown.title}{unit}{cut}")
-
-
 def flight(
-    flown: PyTree,
-    loop: Loop | None = None,
-    ensemble: Ensemble | Members | None = None,
-    scenario: Scenario | None = None,
-    *,
-    axis: str | int = 0,
-    quantities: Sequence[str] = ("itae", "sensitivity_peak"),
-    command_unit: str = "",
-    ax: AxesLike = None,
-    title: str = "",
-) -> Panels:
+    flown: PyTree, loop: Loop | None = None, ensemble: Ensemble | Members | None = None,
+    scenario: Scenario | None = None, *, axis: str | int = 0,
+    quantities: Sequence[str] = ("itae", "sensitivity_peak"), command_unit: str = "",
+    ax: AxesLike = None, title: str = "",
+) -> Panels:  # fmt: skip
     """Draw how a tuned design flies: angle, command and disturbing torque over time.
 
     The nominal loop, and the members of the certificate that are worst in some quantity, are flown
@@ -297,9 +260,6 @@ def flight(
     - `quantities`: names of `jaxquad.tuning` whose worst member is drawn.
     - `command_unit`: such as "V".
     - `ax`: three axes to draw into.
-    - `title`: above the figure.
-
-    **Returns:** `jq.plot.Panels`, of three.
 
     **Raises:** ValueError for a design without certificate, for parts that are missing or that the
     certificate was not made with, for an unknown axis, and for ensembles of simulations.

@@ -1,31 +1,32 @@
-from ._channel import Channel as Channel, resample as resample
-from ._clock import clock_start as clock_start, show_times as show_times
-from ._edit import detrend as detrend, mix as mix, select as select, trim as trim
+from ._channel import Channel as Channel, clock_start as clock_start, show_times as show_times
+from ._edit import (
+    detrend as detrend,
+    mix as mix,
+    resample as resample,
+    select as select,
+    trim as trim,
+)
 from ._errors import (
     ReadError as ReadError,
     RecordError as RecordError,
     RecordWarning as RecordWarning,
 )
-from ._read import (
-    channels as channels,
-    ChannelSummary as ChannelSummary,
-    read as read,
-    read_settings as read_settings,
-    Settings as Settings,
-)
-from ._record import Record as Record
-from ._segments import (
-    Mix as Mix,
-    MixError as MixError,
-    parse_mix as parse_mix,
-    read_segments as read_segments,
-    Segment as Segment,
-)
-from .formats import require_file as require_file
-from .proposals import (
+from ._proposal import (
     AXES as AXES,
     Flight as Flight,
     flights as flights,
     Proposal as Proposal,
     propose as propose,
 )
+from ._read import (
+    Mix as Mix,
+    MixError as MixError,
+    parse_mix as parse_mix,
+    read as read,
+    read_segments as read_segments,
+    Segment as Segment,
+)
+from ._record import Record as Record
+from ._timebase import channels as channels, ChannelSummary as ChannelSummary
+from .firmware import read_settings as read_settings, Settings as Settings
+from .formats import require_file as require_file

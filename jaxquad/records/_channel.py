@@ -1,53 +1,210 @@
-"""Logged channels: their repair, and their resampling to one grid."""
+"""Logged channels: their time stamps and values, and the repair of both."""
 
 import dataclasses
-import warnings
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from typing import NamedTuple
+from collections.abc import Iterable, Mapping
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from ._clock import (
-    check_increasing,
-    clock_start,
-    dates_in_seconds,
-    FEWEST,
-    in_file_time,
-    longest_step,
-    native_rate,
-    nonuniformity,
-    Number,
-    scatters,
-    show_times,
-    Times,
-)
-from ._errors import (
-    choose_range,
-    GapError,
-    mend_holes,
-    RecordError,
-    RecordWarning,
-    unknown_name,
-)
+from ._errors import RecordError, unknown_name
 
 
+Times = Float[np.ndarray, " samples"]  # s
 Values = Float[np.ndarray, " samples"]
+FEWEST = 16  # samples in a record
+JITTER = 0.02  # of a sample: largest departure from the uniform grid that still counts as uniform
+GAP = 1.5  # nominal samples: a longer step is a gap
+TimeUnit = Literal["s", "ms", "us", "ns"]
+Number = float | int
 Range = tuple[Number, Number]  # lowest and highest value that can be true
 Valid = Mapping[str, Range]  # by channel
+PER_SECOND = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}
+_SLOW = 0.25  # s: as large a step may be one of milliseconds
+_DATES = 1e8  # s: stamps from here on are dates, in s since 1970
+_DATE_UNITS = {
+    "W": 604800.0, "D": 86400.0, "h": 3600.0, "m": 60.0, "s": 1.0,
+    "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "ps": 1e-12, "fs": 1e-15, "as": 1e-18,
+}  # fmt: skip
+
+
+def clock_start(time: Times) -> float:
+    """Where the time begins that is shown: 0, or for dates the first stamp (s)."""
+    return float(time[0]) if time.size and time[0] >= _DATES else 0.0
+
+
+def show_times(*times: float, start: float = 0.0) -> str:
+    """Times in s as text: `3.2 .. 30 s`, counted from a `start` that `clock_start` gives."""
+    text = " .. ".join(f"{time - start:.6g}" for time in times)
+    return f"{text} s after {start:.3f} s" if start else f"{text} s"
+
+
+def check_unit(unit: TimeUnit | None) -> None:
+    if unit is not None and unit not in PER_SECOND:
+        raise RecordError(f"time_unit is {unit!r}: use one of {', '.join(PER_SECOND)}.")
+
+
+def doubt_of_seconds(stamps: Times) -> str:
+    """What speaks against steps in s of which nobody said the unit; empty if nothing does."""
+    step = float(np.median(np.abs(np.diff(stamps)))) if stamps.size > 1 else 0.0
+    if not step >= _SLOW:
+        return ""
+    doubt = f"{1 / step:.3g} Hz if that is in s, {1e3 / step:.4g} Hz in ms"
+    doubt = "which is probably not in seconds" if step >= 1 else doubt
+    return (
+        f"steps by {step:.6g}, {doubt}. Give its unit («time_unit=»): ms, us or ns, or s if the "
+        f"log really is that slow; for a count of rows give the sampling interval («dt=»)"
+    )
+
+
+def dates_in_seconds(stamps: np.ndarray) -> np.ndarray | None:
+    """Dates (s since 1970) or durations (s) of NumPy; None where they have no fixed unit."""
+    if stamps.dtype.kind == "M" and np.datetime_data(stamps.dtype)[0] in ("Y", "M"):
+        stamps = stamps.astype("M8[D]")
+    unit, count = np.datetime_data(stamps.dtype)
+    if unit not in _DATE_UNITS:
+        return None
+    seconds = stamps.astype(np.int64) * (count * _DATE_UNITS[unit])
+    return np.where(np.isnat(stamps), np.nan, seconds)
+
+
+def check_increasing(label: str, time: Times) -> None:
+    """Raise RecordError where the stamps of `label` are not finite, repeat or go back."""
+    bad = np.flatnonzero(~np.isfinite(time))
+    if bad.size:
+        raise RecordError(
+            f"{label}: time stamp {bad[0]} is {time[bad[0]]}: delete such rows from the file."
+        )
+    back = np.flatnonzero(np.diff(time) <= 0)
+    if back.size:
+        i = back[0] + 1
+        verb = "repeats" if time[i] == time[i - 1] else "goes back"
+        raise RecordError(
+            f"{label}: time {verb} at sample {i}, from {time[i - 1]:.9g} s to {time[i]:.9g} s "
+            f"(in {back.size} places). Time must increase strictly: delete or sort these rows."
+        )
+
+
+_SCATTERED = 0.01  # of the steps; fewer are those of single late stamps
+_SPAN = 16  # samples, over which scattered stamps are counted: their ends hardly matter
+
+
+def scatters(time: Times) -> bool:
+    """Whether time stamps scatter about a clock: steps are too short as often as too long."""
+    step = np.diff(time)
+    usual = np.median(step)
+    too_long, too_short = np.sum(step > GAP * usual), np.sum(step < (2 - GAP) * usual)
+    return bool(too_short > max(0.5 * too_long, _SCATTERED * step.size))
+
+
+def longest_step(time: Times) -> float:
+    """The step in s beyond which samples are missing: between scattered stamps up to 2 samples."""
+    return (2.0 if scatters(time) else GAP) * float(np.median(np.diff(time)))
+
+
+def native_rate(time: Times) -> float:
+    """Samples per second of jittered time stamps, without the gaps."""
+    count = min(_SPAN, time.size // 2) if scatters(time) else 1
+    span = time[count:] - time[:-count]
+    usual = float(np.median(np.diff(time)))
+    unbroken = span[span <= np.median(span) + (longest_step(time) - usual)]
+    return float(count * unbroken.size / unbroken.sum())
+
+
+def nonuniformity(time: Times) -> float:
+    """Largest distance of the time stamps from a uniform grid between their ends, in samples."""
+    grid = np.linspace(time[0], time[-1], time.size)
+    return float(np.abs(time - grid).max() * (time.size - 1) / (time[-1] - time[0]))
+
+
+def chosen_span(
+    first: float, last: float, start: Number | None, stop: Number | None, origin: float,
+    slack: float, extent: str,
+) -> tuple[float, float]:  # fmt: skip
+    """From `start` to `stop` within `first` .. `last` (s), where None is the end.
+
+    Both may count from the `origin` that is shown; the `extent` is what errors say there is.
+    """
+    start, stop = (
+        origin + time if time is not None and origin and time < _DATES else time
+        for time in (start, stop)
+    )
+    begin = first if start is None else float(start)
+    end = last if stop is None else float(stop)
+    shown = lambda *times: show_times(*times, start=origin)
+    if not begin < end:
+        raise RecordError(f"start {shown(begin)} is not before stop {shown(end)}; {extent}.")
+    if begin < first - slack or end > last + slack:
+        raise RecordError(f"{shown(begin, end)} is out of range; {extent}.")
+    return begin, end
+
+
+def window(time: Times, start: Number | None, stop: Number | None) -> slice:
+    """The samples from `start` to `stop` (s, both included), which may count from a first date."""
+    slack, origin = 1e-6 * (time[-1] - time[0]) / (time.size - 1), clock_start(time)
+    extent = f"the record covers {show_times(time[0], time[-1], start=origin)}"
+    begin, end = chosen_span(float(time[0]), float(time[-1]), start, stop, origin, slack, extent)
+    first = int(np.searchsorted(time, begin - slack))
+    last = int(np.searchsorted(time, end + slack, side="right"))
+    if last - first < FEWEST:
+        raise RecordError(
+            f"{show_times(begin, end, start=origin)} holds {last - first} samples: at least "
+            f"{FEWEST} are needed; {extent}."
+        )
+    return slice(first, last)
+
+
+_MOST_DROPPED = 0.01  # of the time stamps; more is not a glitch, and the record is refused
+
+
+def unwrap(counter: np.ndarray) -> tuple[np.ndarray, int]:
+    """A counter with its overflows undone, and how many; seen by its dtype or a step of 32 bits."""
+    if counter.dtype.kind in "iu" and counter.dtype.itemsize <= 4:
+        span = float(2 ** (8 * counter.dtype.itemsize))
+        wraps = np.diff(counter.astype(np.int64)) < -span / 2
+    else:
+        span = 2.0**32
+        wraps = (counter[:-1] > 0.99 * span) & (counter[:-1] < span) & (counter[1:] < 0.01 * span)
+        wraps &= counter[1:] >= 0
+    if not wraps.any():
+        return counter, 0
+    turns = np.concatenate([[0], np.cumsum(wraps)])
+    return counter.astype(np.float64) + span * turns, int(wraps.sum())
+
+
+RepairedTime = tuple[Times, np.ndarray | None, str]  # stamps, which rows (None: all), a remark
+
+
+def repair_time(time: Times) -> RepairedTime:
+    """Drop stamps that repeat, go back, jump ahead or are not finite; none if over 1 % would."""
+    good = np.isfinite(time)
+    if time.size < FEWEST or (good.all() and (np.diff(time) > 0).all()):
+        return time, None, ""
+    kept = np.flatnonzero(good)
+    if kept.size > 2:  # what jumps ahead although its neighbours are in order goes alone
+        a, b, c = time[kept][:-2], time[kept][1:-1], time[kept][2:]
+        kept = kept[~np.concatenate([[a[0] > b[0] and b[0] < c[0]], (b > c) & (a < c), [False]])]
+    highest = np.maximum.accumulate(time[kept])
+    kept = kept[np.concatenate([[True], time[kept][1:] > highest[:-1]])] if kept.size else kept
+    dropped = time.size - kept.size
+    if dropped > _MOST_DROPPED * time.size:
+        return time, None, ""
+    mask = np.zeros(time.size, dtype=bool)
+    mask[kept] = True
+    first = int(np.flatnonzero(~mask)[0])
+    remark = (
+        f"{dropped} of {time.size} time stamps repeat or go back; these rows were dropped, the "
+        f"first of them row {first} ({time[first]:.9g} s)"
+    )
+    return time[mask], mask, remark
+
+
 _GENERIC = 10  # nominal samples of a gap that is bridged where nobody says how long it may be
 _SHORTEST = 0.05  # s
 
 
-class RepairedValues(NamedTuple):
-    """Values of a channel, NaN where they are still missing, and when others were filled in."""
-
-    values: Values
-    times: Float[np.ndarray, " repaired"]  # s
-
-
-def _longest_gap(time: Times, max_gap: Number | None) -> float:
+def longest_gap(time: Times, max_gap: Number | None) -> float:
     """The longest gap that is interpolated, in s: as told, else 10 nominal samples or 0.05 s."""
     if max_gap is not None:
         return float(max_gap)
@@ -56,11 +213,11 @@ def _longest_gap(time: Times, max_gap: Number | None) -> float:
 
 def repair_values(
     name: str, time: Times, values: Values, valid: Range | None, max_gap: Number | None
-) -> RepairedValues:
-    """Interpolate what is missing or out of range, between neighbours at most `max_gap` (s) apart.
+) -> tuple[Values, Float[np.ndarray, " repaired"]]:
+    """Values without what is missing or out of range, and the times (s) at which they are new.
 
-    Nothing is repaired unless `valid` or `max_gap` asks for it. The interpolation is monotone
-    between neighbours (Fritsch and Butland 1984). What lies at an end, or in a longer gap, is NaN.
+    Monotone between neighbours at most `max_gap` (s) apart (Fritsch and Butland 1984), else NaN; as
+    they are where neither `valid` nor `max_gap` asks for it.
     """
     good = np.isfinite(values)
     if valid is not None:
@@ -71,20 +228,20 @@ def repair_values(
             )
         good &= (values >= valid[0]) & (values <= valid[1])
     if good.all() or (valid is None and max_gap is None):
-        return RepairedValues(values, np.empty(0))
+        return values, np.empty(0)
     places, bad = np.flatnonzero(good), np.flatnonzero(~good)
     after = np.searchsorted(places, bad)
     between = (after > 0) & (after < places.size)
     bad, after = bad[between], after[between]
     gap = time[places[after]] - time[places[after - 1]]
-    filled = bad[gap <= _longest_gap(time, max_gap) * (1 + 1e-9)]
+    filled = bad[gap <= longest_gap(time, max_gap) * (1 + 1e-9)]
     repaired = np.where(good, values, np.nan)
     if filled.size:
         # Imported here: it takes a quarter of a second, and most records need no repair.
         from scipy.interpolate import PchipInterpolator
 
         repaired[filled] = PchipInterpolator(time[good], values[good])(time[filled])
-    return RepairedValues(repaired, time[filled])
+    return repaired, time[filled]
 
 
 def within(
@@ -119,6 +276,46 @@ def as_float64(label: str, values: ArrayLike, *, copy: bool = True) -> np.ndarra
         return np.asarray(np.ma.filled(array.astype(np.float64, copy=copy), np.nan))
     except (TypeError, ValueError) as error:
         raise RecordError(f"{label} is not an array of numbers: {error}.") from error
+
+
+def uniform_stamps(time: ArrayLike, unit: TimeUnit | None) -> Times:
+    """The time stamps of a record in s; raises RecordError where they are not uniform."""
+    check_unit(unit)
+    dates = np.asarray(time)
+    if dates.dtype.kind in "mM":
+        first = dates.flat[0] if dates.size and dates.dtype.kind == "M" else None
+        # Before they become s, of which a float holds a day of ns but not 50 years of them.
+        stamps = dates_in_seconds(dates if first is None else dates - first)
+        if stamps is None or unit is not None:
+            raise RecordError(
+                f"time has the type {dates.dtype}: give «time_unit=» to plain numbers only, and "
+                f"dates or durations in a unit between weeks and attoseconds."
+            )
+    else:
+        stamps = as_float64("time", time) / PER_SECOND[unit or "s"]
+        doubt = doubt_of_seconds(stamps) if unit is None and stamps.ndim == 1 else ""
+        if doubt:
+            raise RecordError(f"time {doubt}.")
+    if stamps.ndim != 1:
+        raise RecordError(f"time has shape {stamps.shape}: give one value for each sample.")
+    if stamps.size < FEWEST:
+        raise RecordError(f"{stamps.size} samples: a record needs at least {FEWEST}.")
+    check_increasing("time", stamps)
+    worst, step = nonuniformity(stamps), np.diff(stamps)
+    if worst > JITTER:
+        i = int(np.abs(step - np.median(step)).argmax())
+        missing = step[i] > longest_step(stamps)
+        gap = "; as rows are missing, state there how long a gap may be («max_gap=», in s)"
+        raise RecordError(
+            f"time is not uniformly sampled: the time stamps lie up to {worst:.3g} samples off a "
+            f"uniform grid (limit {JITTER}); the most unusual step is {step[i]:.6g} s at "
+            f"t = {show_times(stamps[i], start=clock_start(stamps))}, the median step "
+            f"{np.median(step):.6g} s. "
+            "Resample it with «sample_rate=|jq.read(..., sample_rate=), "
+            "jq.Record.from_dataframe(..., sample_rate=) or "
+            f"jq.records.resample»{gap if missing else ''}."
+        )
+    return stamps
 
 
 _PERIODS = {"deg": (360.0,), "rad": (2 * np.pi,), "": (360.0, 2 * np.pi)}  # by unit
@@ -173,8 +370,8 @@ class Channel:
     """
 
     name: str
-    time: Float[np.ndarray, " samples"]  # s
-    values: Float[np.ndarray, " samples"]
+    time: Times
+    values: Values
     unit: str
 
     def __init__(self, name: str, time: ArrayLike, values: ArrayLike, unit: str = ""):
@@ -199,225 +396,3 @@ class Channel:
     def rate(self) -> float:
         """Native sample rate in Hz, without the gaps."""
         return native_rate(self.time)
-
-
-def _contiguous_part(
-    channel: Channel, begin: float, end: float, *, margin: float, max_gap: Number | None
-) -> Channel:
-    """The samples from `begin` to `end` (s), and up to `margin` (s) beyond, without a break.
-
-    A break is a gap longer than `max_gap` (s) or a value that is not finite. Outside of
-    `begin` .. `end` it ends the part; inside it raises RecordError, a GapError where all are gaps.
-    """
-    time, longest = channel.time, _longest_gap(channel.time, max_gap)
-    bad = ~np.isfinite(channel.values)
-    broken = (np.diff(time) > longest) | bad[:-1] | bad[1:]
-    inside = broken & (time[1:] > begin) & (time[:-1] < end)
-    if inside.any():
-        breaks = np.flatnonzero(inside)
-        holes = bad[breaks] | bad[breaks + 1]
-        index = int(breaks[holes.argmax() if holes.any() else 0])
-        left, right = time[index : index + 2]
-        origin = clock_start(time)
-        if holes.any():
-            i = index if bad[index] else index + 1
-            raise RecordError(
-                f"channel {channel.name!r} is {channel.values[i]} at sample {i}, "
-                f"t = {show_times(time[i], start=origin)}. {mend_holes('it')}"
-            )
-        raise GapError(
-            f"channel {channel.name!r} has a gap of {1e3 * (right - left):.4g} ms from "
-            f"t = {left - origin:.6g} s to {show_times(right, start=origin)} (limit "
-            f"{1e3 * longest:.4g} ms). "
-            f"{choose_range('it')}, or allow it, by its length in s («max_gap=»).",
-            [(float(time[i]), float(time[i + 1])) for i in breaks],
-        )
-    before = np.flatnonzero(broken & (time[1:] <= begin))
-    after = np.flatnonzero(broken & (time[:-1] >= end))
-    reach = margin + longest
-    first = max(np.searchsorted(time, begin - reach), *(before[-1:] + 1), 0)
-    last = min(np.searchsorted(time, end + reach, "right"), *(after[:1] + 1), time.size)
-    return Channel(channel.name, time[first:last], channel.values[first:last], channel.unit)
-
-
-def _gaps(channel: Channel, begin: float, end: float) -> np.ndarray:
-    """Indices of the steps within `begin` .. `end` in which samples are missing."""
-    step = np.diff(channel.time)
-    inside = (channel.time[1:] > begin) & (channel.time[:-1] < end)
-    return np.flatnonzero((step > longest_step(channel.time)) & inside)
-
-
-# Kaiser's formulas for 72 dB over a transition from 0.3 to 0.5 of the sample rate.
-_BETA = 0.1102 * (72 - 8.7)
-_HALF = 0.5 * (72 - 7.95) / (2.285 * 2 * np.pi * 0.2)  # samples of the target grid
-_CUTOFF = 0.4  # of the target rate, where the filter is down by 6 dB
-
-
-def _lowpass(
-    curve: Callable[[Times], Times],
-    span: tuple[float, float],
-    time: Times,
-    sample_rate: Number,
-    fastest: float,
-) -> Times:
-    """`curve` at the times `time` (s, at `sample_rate` in Hz), low-passed against aliasing.
-
-    The curve is known over `span` (s) and is continued by reflection about its end points, which
-    keeps a straight line straight. `fastest` (Hz) is the highest native rate: the filter runs on a
-    grid twice as fine, the same for all channels.
-    """
-    fold = int(np.ceil(2 * fastest / sample_rate))
-    half = int(np.ceil(_HALF * fold))
-    taps = np.sinc(2 * _CUTOFF * (np.arange(-half, half + 1) / fold))
-    taps *= np.kaiser(2 * half + 1, _BETA)
-    taps /= taps.sum()
-    fine = fold * sample_rate
-    lowest, highest = -half, (time.size - 1) * fold + half
-    first = max(lowest, int(np.ceil((span[0] - time[0]) * fine - 1e-6)))
-    last = min(highest, int(np.floor((span[1] - time[0]) * fine + 1e-6)))
-    inside = curve(np.clip(time[0] + np.arange(first, last + 1) / fine, *span))
-    padding = (first - lowest, highest - last)
-    padded = np.pad(inside, padding, mode="reflect", reflect_type="odd")
-    return np.lib.stride_tricks.sliding_window_view(padded, taps.size)[::fold] @ taps
-
-
-_SAME = 1.05  # rates closer than this need neither a filter nor a warning
-_MOST = 50_000_000  # samples
-
-
-def resample(
-    channels: Sequence[Channel],
-    sample_rate: Number,
-    *,
-    start: Number | None = None,
-    stop: Number | None = None,
-    max_gap: Number | None = None,
-) -> tuple[Times, Float[np.ndarray, "samples channels"]]:
-    """Resample channels with different time stamps to one uniform grid.
-
-    Where a channel is faster than the grid, every channel passes the same linear-phase filter,
-    whose delay is compensated: frequencies above half the `sample_rate` are attenuated by 70 dB,
-    those below 0.3 of it are unchanged, and so is the phase between channels. It is designed with a
-    Kaiser window (Oppenheim and Schafer, "Discrete-Time Signal Processing", 3rd ed., section 7.5).
-    Between samples a spline of degree 7 interpolates: at a quarter of a channel's own rate a cubic
-    would be off by 2 %.
-
-    **Arguments:**
-
-    - `channels`: the `Channel`s.
-    - `sample_rate`: of the grid, in Hz.
-    - `start`: where the grid begins, in s; by default where all channels overlap.
-    - `stop`: in s; the grid ends at or before it. By default where the channels cease to overlap.
-    - `max_gap`: the longest gap that is interpolated, in s; by default 10 nominal samples or
-        0.05 s, whichever is longer.
-
-    **Returns:** the time of the grid in s, and the values, shape `(samples, channels)`. Gaps that
-    were interpolated, and channels slower than the grid, give a `RecordWarning`.
-
-    **Raises:**
-
-    - `RecordError`: for a longer gap or a value that is not finite within the range, and where the
-        channels do not overlap.
-    """
-    from scipy.interpolate import CubicSpline, make_interp_spline
-
-    begin, end = _common_extent(channels, start, stop)
-    if not (np.isfinite(sample_rate) and sample_rate > 0):
-        raise RecordError(f"the sample rate is {sample_rate} Hz: it must be positive.")
-    steps = (end - begin) * sample_rate
-    if not FEWEST - 1 <= steps + 1e-6 < _MOST:
-        raise RecordError(
-            f"a sample rate of {sample_rate:.6g} Hz over {end - begin:.6g} s makes "
-            f"{steps + 1:.6g} samples; {FEWEST} .. {_MOST} are allowed. Choose another rate or "
-            f"range."
-        )
-    time = begin + np.arange(int(steps + 1e-6) + 1) / sample_rate
-    # The filter looks as far to either side, and a spline at its end needs some samples more.
-    margin = (_HALF + 1) / sample_rate + 20 / min(channel.rate for channel in channels)
-    pieces = [_contiguous_part(c, begin, end, margin=margin, max_gap=max_gap) for c in channels]
-    for remark in _remarks(pieces, channels, begin, end, sample_rate):
-        warnings.warn(remark, RecordWarning, stacklevel=2)
-    fastest = max(channel.rate for channel in channels)
-    columns = []
-    for piece in pieces:
-        holes, knots, values = _gaps(piece, -np.inf, np.inf), piece.time, piece.values
-        if holes.size:  # filled by a cubic: far apart knots make a spline of degree 7 oscillate
-            fill = []
-            for left, right in zip(piece.time[holes], piece.time[holes + 1], strict=True):
-                steps = round((right - left) * piece.rate)
-                fill.append(np.linspace(left, right, steps + 1)[1:-1])
-            knots = np.sort(np.concatenate([piece.time, *fill]))
-            values = CubicSpline(piece.time, piece.values)(knots)
-        curve = make_interp_spline(knots, values, k=7)
-        if fastest <= _SAME * sample_rate:
-            columns.append(curve(time))
-        else:
-            span = piece.time[0], piece.time[-1]
-            columns.append(_lowpass(curve, span, time, sample_rate, fastest))
-    return time, np.stack(columns, axis=1)
-
-
-def _common_extent(
-    channels: Sequence[Channel], start: Number | None, stop: Number | None
-) -> tuple[float, float]:
-    """First and last time (s) of the grid, within the time that all channels share."""
-    if not channels:
-        raise RecordError("there are no channels to resample: give at least one.")
-    latest = max(channels, key=lambda channel: channel.time[0])
-    earliest = min(channels, key=lambda channel: channel.time[-1])
-    first, last = float(latest.time[0]), float(earliest.time[-1])
-    origin = min(clock_start(channel.time) for channel in channels)
-    start, stop = in_file_time(start, origin), in_file_time(stop, origin)
-    begin = first if start is None else float(start)
-    end = last if stop is None else float(stop)
-    shown = lambda *times: show_times(*times, start=origin)
-    overlap = (
-        f"the channels overlap from {first - origin:.6g} s ({latest.name!r} begins) "
-        f"to {shown(last)} ({earliest.name!r} ends)"
-    )
-    if not first < last:
-        raise RecordError(f"the channels have no common time: {overlap}.")
-    if not begin < end:
-        raise RecordError(f"start {shown(begin)} is not before stop {shown(end)}; {overlap}.")
-    slack = 1e-9 * (1 + abs(last))
-    if begin < first - slack or end > last + slack:
-        raise RecordError(f"{shown(begin, end)} is out of range; {overlap}.")
-    return max(begin, first), min(end, last)
-
-
-def _remarks(
-    pieces: Sequence[Channel],
-    channels: Sequence[Channel],
-    begin: float,
-    end: float,
-    sample_rate: Number,
-) -> Iterator[str]:
-    """What is to be said of gaps, of time stamps that scatter, and of channels that are slow."""
-    gaps = []
-    for piece in pieces:
-        holes = _gaps(piece, begin, end)
-        if holes.size:
-            step = np.diff(piece.time)[holes]
-            where = piece.time[holes[step.argmax()]]
-            place = show_times(float(where), start=clock_start(piece.time))
-            longest = f"longest {1e3 * step.max():.4g} ms at t = {place}"
-            gaps.append(f"{piece.name!r} {holes.size}, {longest}")
-    if gaps:
-        yield f"gaps filled by interpolation: {'; '.join(gaps)}."
-    scattered = [piece for piece in pieces if scatters(piece.time)]
-    if scattered:
-        off = max(nonuniformity(piece.time) for piece in scattered)
-        rate = min(piece.rate for piece in scattered)
-        yield (
-            f"the time stamps of {', '.join(repr(piece.name) for piece in scattered)} lie up to "
-            f"{off:.2g} samples off a clock of "
-            f"{rate:.5g} Hz, and steps shorter than half a sample are as frequent as long ones: "
-            f"values were interpolated at these times. If the samples were equally spaced, give "
-            f"their interval instead: {1 / rate:.4g} s («dt=»)."
-        )
-    slow = [f"{c.name!r} {c.rate:.6g} Hz" for c in channels if sample_rate > _SAME * c.rate]
-    if slow:
-        yield (
-            f"resampled to {sample_rate:.6g} Hz, faster than {', '.join(slow)}: such a channel "
-            f"holds no information above half its own rate. Keep the frequency band below that."
-        )

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 
 TYPE_CHECKING = False  # for checkers, without the time to import typing
 if TYPE_CHECKING:
-    from .proposals import FirmwareLog
+    from .firmware import FirmwareLog
 
 _OFFERED: dict[str, "str | FirmwareLog"] = {}  # by the `vehicle` of logs
 

@@ -6,10 +6,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ._channel import Channel, repair_values, resample
-from ._clock import dates_in_seconds, doubt_of_seconds, Number, PER_SECOND, Times, TimeUnit
+from ._channel import dates_in_seconds, doubt_of_seconds, PER_SECOND, Times, TimeUnit
 from ._errors import ReadError, RecordError, unknown_name
-from ._record import as_tuple, assemble, check_distinct, Hold, Names, Record
+from ._record import as_tuple, assemble, Names, Record
 from .formats import load_log
 
 
@@ -17,67 +16,10 @@ if TYPE_CHECKING:
     import pandas
 
 
-_ATTRIBUTES = "jaxquad"  # entry of `DataFrame.attrs` with what columns cannot say
 _TIMES = ("t", "time", "time_s", "timestamp")
-_ROLES = ("inputs", "outputs", "references")
 
 
-def from_dataframe(
-    frame: "pandas.DataFrame",
-    roles: tuple[Names, Names, Names],
-    time: str | None,
-    time_unit: TimeUnit | None,
-    sample_rate: Number | None,
-    max_gap: Number | None,
-    units: Mapping[str, str],
-    hold: Hold,
-    source: str,
-) -> Record:
-    """`Record.from_dataframe`, where the arguments are described."""
-    stored = frame.attrs.get(_ATTRIBUTES, {})
-    if all(role is None for role in roles):
-        if not all(role in stored for role in _ROLES):
-            raise RecordError(
-                "the table does not say which columns are inputs and outputs: name them "
-                f"(«inputs=», «outputs=»). Its columns are {', '.join(map(str, frame.columns))}."
-            )
-        roles = tuple(stored[role] for role in _ROLES)
-    names = [as_tuple(role or ()) for role in roles]
-    flat = [name for role in names for name in role]
-    check_distinct(flat)
-    values = {}
-    for name in flat:
-        if name not in frame.columns:
-            raise ReadError(unknown_name(name, map(str, frame.columns)))
-        values[name] = _numbers(name, _column(frame, name))
-    stamps = _stamps(frame, time, time_unit)
-    if sample_rate is not None:
-        channels = [
-            Channel(name, stamps, repair_values(name, stamps, column, None, max_gap).values)
-            for name, column in values.items()
-        ]
-        stamps, table = resample(channels, sample_rate, max_gap=max_gap)
-        values = dict(zip(values, table.T, strict=True))
-    if not names[0] or not names[1]:
-        raise RecordError(
-            "a record needs at least one input and one output («inputs=», «outputs=»)."
-        )
-    for name in units:
-        if name not in flat:
-            raise RecordError(f"a unit is given for {name!r}: {unknown_name(name, flat)}")
-    units = {**stored.get("units", {}), **units}
-    return assemble(
-        stamps,
-        names,
-        values.__getitem__,
-        lambda name: units.get(name, ""),
-        hold=stored.get("hold") if hold is None else hold,
-        source=source or stored.get("source", ""),
-        max_gap=max_gap,
-    )
-
-
-def _stamps(frame: "pandas.DataFrame", time: str | None, unit: TimeUnit | None) -> Times:
+def frame_stamps(frame: "pandas.DataFrame", time: str | None, unit: TimeUnit | None) -> Times:
     """Time stamps (s): of the column `time`, of one that is called like that, or of the index."""
     from pandas import RangeIndex
     from pandas.api.types import is_datetime64_any_dtype, is_timedelta64_dtype
@@ -108,6 +50,13 @@ def _stamps(frame: "pandas.DataFrame", time: str | None, unit: TimeUnit | None) 
     return seconds
 
 
+def frame_values(frame: "pandas.DataFrame", name: str) -> Times:
+    """A column; what is missing becomes NaN."""
+    if name not in frame.columns:
+        raise ReadError(unknown_name(name, map(str, frame.columns)))
+    return _numbers(name, _column(frame, name))
+
+
 def _column(frame: "pandas.DataFrame", name: str) -> "pandas.Series":
     from pandas import Series
 
@@ -118,31 +67,12 @@ def _column(frame: "pandas.DataFrame", name: str) -> "pandas.Series":
 
 
 def _numbers(label: str, series: "pandas.Series") -> Times:
-    """What is missing becomes NaN."""
     try:
         return series.to_numpy(np.float64, na_value=np.nan)
     except (TypeError, ValueError) as error:
         raise RecordError(
             f"column {label!r} holds {series.dtype}, not numbers: convert it (pandas.to_numeric)."
         ) from error
-
-
-def to_dataframe(record: Record) -> "pandas.DataFrame":
-    """`Record.to_dataframe`."""
-    import pandas
-
-    table = np.concatenate([record.inputs, record.outputs, record.references], axis=1)
-    index = pandas.Index(record.time, name="time")
-    frame = pandas.DataFrame(table, index=index, columns=pandas.Index(record.names))
-    frame.attrs[_ATTRIBUTES] = {
-        "inputs": record.input_names,
-        "outputs": record.output_names,
-        "references": record.reference_names,
-        "units": {name: record.unit(name) for name in record.names},
-        "hold": record.hold,
-        "source": record.source,
-    }
-    return frame
 
 
 _UNITS = {
@@ -153,8 +83,34 @@ _SAVE = "s = get(z); save('z.mat', 's', '-v7')"
 
 
 def from_iddata(path: str | Path, variable: str | None, references: Names) -> Record:
-    """`Record.from_iddata`, where the arguments are described."""
-    fields = _fields(path, variable)
+    """`Record.from_iddata`, from the variable of that name, the only struct, or the file itself."""
+    load_log(path)  # which refuses what is damaged, before scipy reads it
+    from scipy.io import loadmat
+
+    try:
+        content = loadmat(path, simplify_cells=True)
+    except Exception as error:  # of damaged and of HDF5 files scipy raises almost anything
+        raise ReadError(
+            f"{path}: cannot be read as a MAT file of version 5 to 7 ({type(error).__name__}): "
+            f"save it in MATLAB with {_SAVE}"
+        ) from error
+    is_iddata = lambda value: (
+        isinstance(value, Mapping)
+        and any(names <= set(value) for names in ({"y", "u"}, {"OutputData", "InputData"}))
+    )
+    structs = {name: value for name, value in content.items() if is_iddata(value)}
+    if variable is None and is_iddata(content):
+        fields = content
+    elif variable is None and len(structs) == 1:
+        fields = next(iter(structs.values()))
+    elif variable in structs:
+        fields = structs[variable]
+    else:
+        which = "which of them (variable=) is not said" if variable is None else f"not {variable!r}"
+        raise ReadError(
+            f"{path}: structs with y and u: {', '.join(structs) or 'none'}; {which}. An iddata "
+            f"object cannot be read outside of MATLAB: make a struct of it, {_SAVE}"
+        )
     y = _matrix(path, fields, "y", "OutputData")
     u = _matrix(path, fields, "u", "InputData")
     unit = str(fields.get("TimeUnit", "seconds"))
@@ -172,61 +128,22 @@ def from_iddata(path: str | Path, variable: str | None, references: Names) -> Re
         dt = float(_UNITS[unit] * interval[0])
     else:
         raise ReadError(f"{path}: Ts is {interval.tolist()}: give the sample interval, in {unit}")
-    inputs = _labels(fields, "InputName", u, "u")
-    input_units = _labels(fields, "InputUnit", u, "")
+    inputs, outputs = _labels(fields, "InputName", u, "u"), _labels(fields, "OutputName", y, "y")
+    names, columns = [*inputs, *outputs], [*u.T, *y.T]
+    labels = [*_labels(fields, "InputUnit", u, ""), *_labels(fields, "OutputUnit", y, "")]
     outer = as_tuple(references or ())
     for name in outer:
         if name not in inputs:
             raise RecordError(f"{path}: there is no input {name!r}; it has {', '.join(inputs)}.")
-    is_outer = np.array([name in outer for name in inputs], bool)
-    pick = lambda texts, chosen: [t for t, c in zip(texts, chosen, strict=True) if c]
     kinds = set(_texts(fields, "InterSample"))
-    # Held, or measured within the band.
-    hold = {"zoh": dt, "bl": 0.0}.get(kinds.pop()) if len(kinds) == 1 else None
-    return Record(
+    return assemble(
         time,
-        u[:, ~is_outer],
-        y,
-        u[:, is_outer] if outer else None,
-        input_names=pick(inputs, ~is_outer),
-        output_names=_labels(fields, "OutputName", y, "y"),
-        reference_names=pick(inputs, is_outer),
-        input_units=pick(input_units, ~is_outer),
-        output_units=_labels(fields, "OutputUnit", y, ""),
-        reference_units=pick(input_units, is_outer),
+        ([x for x in inputs if x not in outer], outputs, [x for x in inputs if x in outer]),
+        dict(zip(names, columns, strict=True)).__getitem__,
+        dict(zip(names, labels, strict=True)).__getitem__,
         source=str(path),
-        hold=hold,
-        time_unit="s",
-    )
-
-
-def _fields(path: str | Path, variable: str | None) -> Mapping:
-    """The struct with y and u: the variable of that name, the only one, or the file itself."""
-    load_log(path)  # which refuses what is damaged, before scipy reads it
-    from scipy.io import loadmat
-
-    try:
-        content = loadmat(path, simplify_cells=True)
-    except Exception as error:  # of damaged and of HDF5 files scipy raises almost anything
-        raise ReadError(
-            f"{path}: cannot be read as a MAT file of version 5 to 7 ({type(error).__name__}): "
-            f"save it in MATLAB with {_SAVE}"
-        ) from error
-    is_iddata = lambda value: (
-        isinstance(value, Mapping)
-        and any(names <= set(value) for names in ({"y", "u"}, {"OutputData", "InputData"}))
-    )
-    structs = {name: value for name, value in content.items() if is_iddata(value)}
-    if variable is None and is_iddata(content):
-        return content
-    if variable is None and len(structs) == 1:
-        return next(iter(structs.values()))
-    if variable in structs:
-        return structs[variable]
-    which = "which of them (variable=) is not said" if variable is None else f"not {variable!r}"
-    raise ReadError(
-        f"{path}: structs with y and u: {', '.join(structs) or 'none'}; {which}. An iddata object "
-        f"cannot be read outside of MATLAB: make a struct of it, {_SAVE}"
+        # Held, or measured within the band.
+        hold={"zoh": dt, "bl": 0.0}.get(kinds.pop()) if len(kinds) == 1 else None,
     )
 
 

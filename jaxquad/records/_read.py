@@ -1,98 +1,36 @@
+"""Records of the channels of a file, and of its segments."""
+
+import dataclasses
+import itertools
 import re
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
 from ._channel import (
     Channel,
     check_ranges,
+    clock_start,
+    JITTER,
+    nonuniformity,
+    Number,
     repair_values,
-    resample,
+    show_times,
+    Times,
+    TimeUnit,
     Valid,
+    window,
     within,
     without_turns,
 )
-from ._clock import clock_start, JITTER, nonuniformity, Number, show_times, TimeUnit, window
-from ._edit import combine
-from ._errors import located, ReadError, RecordError, RecordWarning, unknown_name
-from ._firmwares import firmware_log
+from ._edit import combine, resample
+from ._errors import GapError, located, ReadError, RecordError, unknown_name, warn
 from ._log import known_unit
 from ._record import as_tuple, assemble, check_distinct, Hold, Record
 from ._timebase import Timebases
-from .formats import load_log, load_signals
-
-
-class ChannelSummary(NamedTuple):
-    """One channel of a file: NaN for its rate and times where it has no usable time base.
-
-    **Arguments:**
-
-    - `name`: of the channel.
-    - `samples`: their number.
-    - `rate`: Hz, without gaps.
-    - `start`: s.
-    - `stop`: s.
-    - `minimum`: of the finite values.
-    - `maximum`: likewise.
-    - `unit`: empty where unknown.
-    """
-
-    name: str
-    samples: int
-    rate: float
-    start: float
-    stop: float
-    minimum: float
-    maximum: float
-    unit: str
-
-    def __str__(self) -> str:
-        start = clock_start(np.array([self.start]))
-        clock = f"{self.rate:.5g} Hz, t = {show_times(self.start, self.stop, start=start)}"
-        extent = f"{self.minimum:.4g} .. {self.maximum:.4g} {self.unit}".rstrip()
-        return f"{self.name}: {self.samples} samples, {clock}, {extent}"
-
-
-def channels(
-    path: str | Path,
-    *,
-    time: str | None = None,
-    time_unit: TimeUnit | None = None,
-    dt: Number | None = None,
-) -> list[ChannelSummary]:
-    """List the channels that `read` can take from a file.
-
-    **Arguments:**
-
-    - `path`: the file, of any format that `read` knows.
-    - `time`, `time_unit`, `dt`: as in `read`.
-
-    **Returns:** a `ChannelSummary` for each channel, which prints as one line.
-
-    **Raises:**
-
-    - `ReadError`: where the file is missing, damaged or of an unknown format.
-    """
-    signals = load_signals(path)
-    try:
-        timebases = Timebases(signals, time, time_unit, dt)
-    except ReadError as error:
-        raise located(error, path) from error
-    summaries = []
-    for name in timebases.names:
-        values = timebases.values(name)
-        finite = values[np.isfinite(values)]
-        low, high = (float(finite.min()), float(finite.max())) if finite.size else (np.nan, np.nan)
-        try:
-            clock = timebases.extent(name)
-        except RecordError:  # A list of channels is also for finding out what is wrong with a file.
-            clock = np.nan, np.nan, np.nan
-        unit = timebases.unit(name)
-        summaries.append(ChannelSummary(name, len(values), *clock, low, high, unit))
-    return summaries
+from .formats import load_signals
 
 
 Mixes = Mapping[str, Mapping[str, Number]]
@@ -171,59 +109,12 @@ def read(
         record = jq.read("log15.npz", inputs="M", outputs="q", references="x0", start=50, stop=76)
         ```
     """
-    roles = [_mixes(inputs), _mixes(outputs), _mixes(references or ())]
-    names = list(dict.fromkeys(name for role in roles for mix in role.values() for name in mix))
-    signals = load_signals(path)
-    if not names:
-        raise ReadError(f"{path}: no channels are named. Name them («inputs=», «outputs=»).")
-    try:
-        timebases = Timebases(signals, time, time_unit, dt, time_factor)
-        logged = [timebases.channel(name) for name in names]
-    except ReadError as error:
-        raise located(error, path) from error
-    check_ranges(valid or {}, names)
-    channels, repaired = [], {}
-    for channel in logged:
-        limits = (valid or {}).get(channel.name)
-        values, times = repair_values(channel.name, channel.time, channel.values, limits, max_gap)
-        unit = known_unit(channel.unit) or channel.unit
-        values, jumps, period = without_turns(values, unit)
-        if jumps:
-            turn = "360" if period == 360 else "2 pi"
-            count = "once" if jumps == 1 else f"{jumps} times"
-            warnings.warn(
-                f"channel {channel.name!r} jumps by {turn} {count}, as an angle does at the end of "
-                f"its range: it is taken as one that goes on.",
-                RecordWarning,
-                stacklevel=2,
-            )
-        channels.append(Channel(channel.name, channel.time, values, channel.unit))
-        repaired[channel.name] = times
-    stamps, span = channels[0].time, None
-    if sample_rate is None and all(np.array_equal(stamps, c.time) for c in channels):
-        span = window(stamps, start, stop)
-    if span is not None and nonuniformity(stamps[span]) <= JITTER:
-        stamps = stamps[span]
-        table = np.stack([channel.values[span] for channel in channels], axis=1)
-    else:
-        slowest = min(channel.rate for channel in channels)
-        rate = float(f"{slowest:.3g}") if sample_rate is None else sample_rate
-        stamps, table = resample(channels, rate, start=start, stop=stop, max_gap=max_gap)
-        # Input and output pass through one filter: a hold within a sample stays what it is.
-        longest = 1.01 * (stamps[1] - stamps[0])
-        hold = None if isinstance(hold, int | float) and hold > longest else hold
-    columns = dict(zip(names, table.T, strict=True))
-    mixes = {name: mix for role in roles for name, mix in role.items()}
-    units = _units(units or {}, {channel.name: channel.unit for channel in channels}, mixes)
-    return assemble(
-        stamps,
-        roles,
-        lambda name: combine(name, mixes[name], columns.__getitem__),
-        units.__getitem__,
-        source=str(path),
-        hold=hold,
-        repaired=within(repaired, stamps[0], stamps[-1]),
+    selections = inputs, outputs, references or ()
+    roles = [_mixes(selection) for selection in selections]
+    logged = _read_channels(
+        path, roles, time, time_unit, dt, time_factor, max_gap=max_gap, hold=hold, valid=valid or {}
     )
+    return logged.record(roles, units or {}, sample_rate, (start, stop))
 
 
 def _mixes(selection: Selection) -> Mixes:
@@ -234,78 +125,308 @@ def _mixes(selection: Selection) -> Mixes:
     return {name: {name: 1.0} for name in names}
 
 
-def _units(units: Mapping[str, str], logged: Mapping[str, str], mixes: Mixes) -> dict[str, str]:
-    """Those that the user names, else the log's where the channels of a mix agree."""
-    for name, unit in units.items():
-        if name not in mixes:
-            raise RecordError(f"a unit is given for {name!r}: {unknown_name(name, mixes)}")
-        (source, weight), *others = mixes[name].items()
-        said, stated = known_unit(unit), known_unit(logged[source])
-        if said and stated and said != stated and weight == 1 and not others:
-            raise RecordError(
-                f"the unit of {name!r} is given as {unit}, but the log says {logged[source]}: "
-                f"leave it out («units=»), or multiply the channel by the factor between the two."
+@dataclasses.dataclass(frozen=True)
+class _Logged:
+    """Channels of a file, repaired, each on its own clock."""
+
+    path: str | Path
+    channels: Sequence[Channel]
+    repaired: Mapping[str, Times]
+    max_gap: Number | None
+    hold: Hold
+
+    def record(
+        self,
+        roles: Sequence[Mixes],
+        units: Mapping[str, str],
+        sample_rate: Number | None,
+        segment: "Segment",
+    ) -> Record:
+        """Weighted sums of the channels in one segment, at one rate."""
+        channels, hold = self.channels, self.hold
+        stamps, span = channels[0].time, None
+        if sample_rate is None and all(np.array_equal(stamps, c.time) for c in channels):
+            span = window(stamps, *segment)
+        if span is not None and nonuniformity(stamps[span]) <= JITTER:
+            stamps = stamps[span]
+            table = np.stack([channel.values[span] for channel in channels], axis=1)
+        else:
+            slowest = min(channel.rate for channel in channels)
+            rate = float(f"{slowest:.3g}") if sample_rate is None else sample_rate
+            start, stop = segment
+            stamps, table = resample(channels, rate, start=start, stop=stop, max_gap=self.max_gap)
+            # Input and output pass through one filter: a hold within a sample stays what it is.
+            longest = 1.01 * (stamps[1] - stamps[0])
+            hold = None if isinstance(hold, int | float) and hold > longest else hold
+        logged = {channel.name: channel.unit for channel in channels}
+        columns = dict(zip(logged, table.T, strict=True))
+        mixes = {name: mix for role in roles for name, mix in role.items()}
+        for name, unit in units.items():
+            if name not in mixes:
+                raise RecordError(f"a unit is given for {name!r}: {unknown_name(name, mixes)}")
+            (source, weight), *others = mixes[name].items()
+            said, stated = known_unit(unit), known_unit(logged[source])
+            if said and stated and said != stated and weight == 1 and not others:
+                raise RecordError(
+                    f"the unit of {name!r} is given as {unit}, but the log says {logged[source]}: "
+                    f"leave it out («units=»), or multiply the channel by the factor between the "
+                    f"two."
+                )
+        agreed = {}
+        for name, mix in mixes.items():
+            # A single channel's factor may convert its unit.
+            converted = len(mix) == 1 and any(abs(weight) != 1 for weight in mix.values())
+            shared = {"" if converted else logged[source] for source in mix}
+            agreed[name] = shared.pop() if len(shared) == 1 else ""
+        return assemble(
+            stamps,
+            roles,
+            lambda name: combine(name, mixes[name], columns.__getitem__),
+            (agreed | dict(units)).__getitem__,
+            source=str(self.path),
+            hold=hold,
+            repaired=within(self.repaired, stamps[0], stamps[-1]),
+        )
+
+
+def _read_channels(
+    path: str | Path,
+    roles: Sequence[Mixes],
+    time: str | None,
+    time_unit: TimeUnit | None,
+    dt: Number | None,
+    time_factor: Number | None,
+    *,
+    max_gap: Number | None,
+    hold: Hold,
+    valid: Valid,
+) -> _Logged:
+    names = list(dict.fromkeys(name for role in roles for mix in role.values() for name in mix))
+    signals = load_signals(path)
+    if not names:
+        raise ReadError(f"{path}: no channels are named. Name them («inputs=», «outputs=»).")
+    try:
+        timebases = Timebases(signals, time, time_unit, dt, time_factor)
+        logged = [timebases.channel(name) for name in names]
+    except ReadError as error:
+        raise located(error, path) from error
+    check_ranges(valid, names)
+    channels, repaired = [], {}
+    for channel in logged:
+        name, limits = channel.name, valid.get(channel.name)
+        values, times = repair_values(name, channel.time, channel.values, limits, max_gap)
+        unit = known_unit(channel.unit) or channel.unit
+        values, jumps, period = without_turns(values, unit)
+        if jumps:
+            turn = "360" if period == 360 else "2 pi"
+            count = "once" if jumps == 1 else f"{jumps} times"
+            warn(
+                f"channel {name!r} jumps by {turn} {count}, as an angle does at the end of "
+                f"its range: it is taken as one that goes on."
             )
-    agreed = {}
-    for name, mix in mixes.items():
-        # A single channel's factor may convert its unit.
-        converted = len(mix) == 1 and any(abs(weight) != 1 for weight in mix.values())
-        shared = {"" if converted else logged[source] for source in mix}
-        agreed[name] = shared.pop() if len(shared) == 1 else ""
-    return agreed | dict(units)
+        channels.append(Channel(name, channel.time, values, channel.unit))
+        repaired[name] = times
+    return _Logged(path, channels, repaired, max_gap, hold)
 
 
-class Settings(NamedTuple):
-    """Firmware and parameters of a log, as text.
+Mix = dict[str, dict[str, float]]  # name -> channel, or its power `m1^2`, -> weight
 
-    **Arguments:**
-
-    - `vehicle`: ardupilot, px4 or betaflight.
-    - `version`: of the firmware, (4, 2, 0); empty where the log does not say.
-    - `values`: by name: a Betaflight header's lines, ArduPilot's PARM, PX4's parameters.
-    """
-
-    vehicle: str
-    version: tuple[int, ...]
-    values: Mapping[str, str]
+_NAME = r"(?![\d.])(?:\[[^\]]*\]|[^\s+*\[\]^-])+"  # a channel; brackets may hold anything
+_NUMBER = r"(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
+_TERM = re.compile(rf"\s*([+-]?)\s*(?:({_NUMBER})\s*\*\s*)?({_NAME})\s*(\^\s*[2-9](?![\d.]))?\s*")
 
 
-def read_settings(path: str | Path, *, log: str = "", at: Number | None = None) -> Settings:
-    """Read the parameters that a log begins with.
+class MixError(ValueError):
+    """A weighted sum that cannot be read, and the `reason` without its text."""
 
-    A parameter that was changed in flight has its value of the time `at`; by default its last one
-    in ArduPilot's and PX4's logs, and its first one in Betaflight's, which say no more.
+    def __init__(self, text: str, reason: str):
+        super().__init__(f"{text!r}: {reason}")
+        self.reason = reason
+
+
+def parse_mix(text: str) -> Mix:
+    """Parse the name of a channel, or a weighted sum of channels and of their powers.
 
     **Arguments:**
 
-    - `path`: a log of Betaflight, ArduPilot or PX4.
-    - `log`: of a Betaflight file with several logs, which one: "log2".
-    - `at`: in s of the log's own time, for logs of ArduPilot and PX4.
+    - `text`: `M`, `roll=-m1-m2+0.5*m[4]` or `thrust=0.02*m1+0.1*m1^2`.
 
-    **Returns:** the `Settings`.
+    **Returns:** name -> channel -> weight, as `read_segments` takes it.
 
     **Raises:**
 
-    - `ReadError`: the file cannot be read, is of no autopilot, or holds no parameters.
+    - `ValueError`: for anything else.
     """
-    content = load_log(path)
-    later = [change for change in content.changes if at is not None and change.time > at]
-    values = {**content.settings, **{change.name: change.before for change in reversed(later)}}
-    if log:
-        values = {
-            k.removeprefix(f"{log} "): x for k, x in values.items() if k.startswith(f"{log} ")
-        }
-    firmware = firmware_log(content.vehicle)
-    if firmware is None or not firmware.settings or not values:
-        raise ReadError(
-            f"{path}: the file holds no parameters of ArduPilot, PX4 or Betaflight"
-            + (f" under {log!r}" if log else "")
-            + ": give the log that the autopilot wrote, with its parameters logged."
+    name, sign, terms = (part.strip() for part in text.partition("="))
+    weights: dict[str, float] = {} if sign or not name else {name: 1.0}
+    place = 0
+    while place < len(terms):
+        term = _TERM.match(terms, place)
+        if not term or (place and not term[1]):
+            raise MixError(
+                text, f"cannot read {terms[place:]!r}; write NAME=-a+b+0.5*c, or 0.1*c^2"
+            )
+        power = f"^{term[4][1:].strip()}" if term[4] else ""
+        weight, channel = float(f"{term[1]}{term[2] or 1}"), f"{term[3]}{power}"
+        weights[channel] = weights.get(channel, 0.0) + weight
+        place = term.end()
+    if not name or not weights:
+        raise ValueError(f"{text!r} names no channel; write CHANNEL, or NAME=-a+b+0.5*c")
+    return {name: weights}
+
+
+Segment = tuple[Number | None, Number | None]  # start and stop in the file's time, s
+_MOST_GAPS = 30  # in a segment
+_SHORTEST = 1.0  # s, of a part between two gaps
+
+
+def read_segments(
+    path: Path,
+    segments: Sequence[Segment],
+    *,
+    inputs: Mix,
+    outputs: Mix,
+    references: Mix | None = None,
+    sample_rate: Number | None = None,
+    time: str | None = None,
+    time_unit: TimeUnit | None = None,
+    dt: Number | None = None,
+    time_factor: Number | None = None,
+    units: Mapping[str, str] | None = None,
+    hold: Hold = None,
+    max_gap: Number | None = None,
+    valid: Valid | None = None,
+) -> list[Record]:
+    """Read several segments of a file as records with one sample rate.
+
+    **Arguments:**
+
+    - `path`: the file.
+    - `segments`: pairs of start and stop in s of the file's own time.
+    - `inputs`, `outputs`, `references`: name -> channel or its power (`m1^2`) -> weight, as
+        `parse_mix` returns it.
+    - `sample_rate`: in Hz; by default that of the slowest segment.
+    - `time`, `time_unit`, `dt`, `time_factor`, `units`, `hold`, `max_gap`, `valid`: as in `read`.
+
+    **Returns:** a `Record` for each segment; several where samples are missing for longer than
+    `max_gap`, by default 10 samples or 0.05 s: a segment is cut there, and parts shorter than 1 s
+    are left out, with a `RecordWarning`. Each warning about the file is given once.
+
+    **Raises:**
+
+    - `RecordError`: for segments that overlap, are empty or leave the file's time, and for more
+        than 30 gaps in one of them.
+    - `ReadError`: as `read` raises it.
+    """
+    if len(segments) > 1:
+        for begin, end in segments:
+            if begin is None or end is None or not begin < end:
+                raise RecordError(
+                    f"the segment {begin} .. {end} s is empty: give START:STOP with START before "
+                    f"STOP."
+                )
+        ordered = sorted((begin, end) for begin, end in segments if begin is not None)
+        for (begin, end), (after, last) in itertools.pairwise(ordered):
+            if end is not None and after < end:
+                raise RecordError(
+                    f"the segments {begin:.6g} .. {end:.6g} s and {after:.6g} .. {last:.6g} s "
+                    f"overlap, so samples would count twice. Choose segments that do not overlap."
+                )
+    roles, units = (inputs, outputs, references or {}), units or {}
+    # A single channel may have any name, even one that looks like a power.
+    terms = {
+        name: [(name, 1, 1.0)] if mix == {name: 1.0} else [(*_power(x), w) for x, w in mix.items()]
+        for role in roles
+        for name, mix in role.items()
+    }
+    every = [term for mix in terms.values() for term in mix]
+    plain = all(power == 1 for _, power, _ in every)
+    names = {channel: {channel: 1.0} for channel, _, _ in every}
+
+    def mixed(segment: Segment, rate: Number | None) -> Record:
+        """One segment. Powers are taken of the channels as they are read, after resampling."""
+        if plain:
+            return logged.record(roles, units, rate, segment)
+        any_output = {"any output": dict.fromkeys(list(names)[:1], 1.0)}  # A record needs one.
+        raw = logged.record((names, any_output, {}), {}, rate, segment)
+        if unknown := set(units) - set(terms):
+            raise RecordError(
+                f"a unit is given for {unknown.pop()!r}, but the channels are {', '.join(terms)}."
+            )
+        agreed = {}
+        for name, mix in terms.items():
+            shared = {raw.unit(channel) if power == 1 else "" for channel, power, _ in mix}
+            agreed[name] = shared.pop() if len(shared) == 1 else ""
+        powers = lambda name: (weight * raw.channel(c) ** p for c, p, weight in terms[name])
+        return assemble(
+            raw.time,
+            roles,
+            lambda name: sum(powers(name), np.zeros(raw.samples)),
+            (agreed | dict(units)).__getitem__,
+            source=raw.source,
+            hold=raw.hold,
+            repaired=raw.repaired,
         )
-    text = values.get(firmware.release, content.firmware)
-    match = re.search(r"(\d+)\.(\d+)(?:\.(\d+))?", text)
-    if text.isdecimal():  # one byte each, as PX4 has them
-        version = tuple(int(text) >> shift & 0xFF for shift in (24, 16, 8))
-    else:
-        version = tuple(int(part or 0) for part in match.groups()) if match else ()
-    return Settings(content.vehicle, version, values)
+
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        logged = _read_channels(
+            path, roles if plain else (names,), time, time_unit, dt, time_factor,
+            max_gap=max_gap, hold=hold, valid=valid or {},
+        )  # fmt: skip
+        cut = [_without_gaps(lambda span: mixed(span, sample_rate), x) for x in segments]
+        parts = [part for several in cut for part in several]
+        records = [record for _, record in parts]
+        slowest = min(record.sample_rate for record in records)
+        if max(record.sample_rate for record in records) > (1 + 1e-6) * slowest:
+            rate = float(f"{slowest:.3g}")
+            records = [mixed(segment, rate) for segment, _ in parts]
+    for warning in {str(warning.message): warning for warning in caught}.values():
+        warnings.warn(str(warning.message), warning.category, stacklevel=2)
+    return records
+
+
+def _power(term: str) -> tuple[str, int]:
+    """The channel and the power in a term of a sum: `m1^2` is `m1` and 2."""
+    channel, sign, power = term.rpartition("^")
+    return (channel, int(power)) if sign and channel and power in set("23456789") else (term, 1)
+
+
+def _without_gaps(
+    mixed: Callable[[Segment], Record], segment: Segment
+) -> list[tuple[Segment, Record]]:
+    """The parts of a segment between gaps that are too long to be interpolated."""
+    try:
+        return [(segment, mixed(segment))]
+    except GapError as error:
+        gaps = error.gaps
+        begins, ends = (segment[0], *(b for _, b in gaps)), (*(a for a, _ in gaps), segment[1])
+        spans = [
+            (a, b)
+            for a, b in zip(begins, ends, strict=True)
+            if a is None or b is None or b - a >= _SHORTEST
+        ]
+        if len(gaps) > _MOST_GAPS or not spans:
+            raise
+        parts: list[tuple[Segment, Record]] = []
+        for span in spans:
+            try:
+                several = _without_gaps(mixed, span)
+            except RecordError:  # too few samples between two gaps
+                continue
+            parts += [part for part in several if part[1].duration >= _SHORTEST]
+        if not parts:
+            raise
+    records = [record for _, record in parts]
+    origin = min(clock_start(record.time) for record in records)
+    *others, last = [(float(record.time[0]), float(record.time[-1])) for record in records]
+    texts = [f"{a - origin:.6g} .. {b - origin:.6g}" for a, b in others]
+    (left, right) = max(gaps, key=lambda gap: gap[1] - gap[0])
+    warn(
+        f"samples are missing in {'one place' if len(gaps) == 1 else f'{len(gaps)} places'}, for "
+        f"up to {1e3 * (right - left):.4g} ms at t = {show_times(left, start=origin)}: the record "
+        f"is cut there into {len(parts)} segments, t = "
+        f"{', '.join([*texts, show_times(*last, start=origin)])}. "
+        f"A gap up to a length in s is bridged instead where that is allowed («max_gap=»)."
+    )
+    return parts

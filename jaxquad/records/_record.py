@@ -1,6 +1,4 @@
 import dataclasses
-import functools as ft
-import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Literal, TYPE_CHECKING
@@ -9,22 +7,20 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from ._channel import as_float64, check_ranges, repair_values, Valid
-from ._clock import (
-    check_increasing,
-    check_uniform,
-    check_unit,
+from ._channel import (
+    as_float64,
+    Channel,
+    check_ranges,
     clock_start,
-    dates_in_seconds,
-    doubt_of_seconds,
-    FEWEST,
     Number,
-    PER_SECOND,
+    repair_values,
     show_times,
     Times,
     TimeUnit,
+    uniform_stamps,
+    Valid,
 )
-from ._errors import mend_holes, RecordError, RecordWarning, unknown_name
+from ._errors import mend_holes, RecordError, unknown_name, warn
 
 
 if TYPE_CHECKING:
@@ -35,6 +31,7 @@ Names = str | Sequence[str] | None
 Hold = Number | Literal["dt"] | None
 _MOST_REPAIRED = 0.01  # of a channel, without a warning
 _CHANGES = 50  # mean times between changes of an input: no filter smears a hold so far
+_ATTRIBUTES = "jaxquad"  # entry of `DataFrame.attrs` with what columns cannot say
 _SMALLEST = 1e-20  # of a channel's size: high powers of it are still numbers
 
 
@@ -108,20 +105,50 @@ class Record:
         max_gap: Number | None = None,
         repaired: Mapping[str, ArrayLike] | None = None,
     ):
-        put = ft.partial(object.__setattr__, self)
-        put("time", _stamps(time, time_unit))
-        rows = self.time.size
-        put("inputs", _columns("inputs", inputs, rows))
-        put("outputs", _columns("outputs", outputs, rows))
-        none = np.empty((rows, 0))
-        put("references", none if references is None else _columns("references", references, rows))
-        put("input_names", _as_names(input_names, "u", self.inputs.shape[1]))
-        put("output_names", _as_names(output_names, "y", self.outputs.shape[1]))
-        put("reference_names", _as_names(reference_names, "r", self.references.shape[1]))
-        put("input_units", _as_units(input_units, self.input_names))
-        put("output_units", _as_units(output_units, self.output_names))
-        put("reference_units", _as_units(reference_units, self.reference_names))
-        put("source", source)
+        stamps = uniform_stamps(time, time_unit)
+        start, rows, none = clock_start(stamps), stamps.size, np.empty((stamps.size, 0))
+        roles = (
+            ("inputs", "u", inputs, input_names, input_units),
+            ("outputs", "y", outputs, output_names, output_units),
+            ("references", "r", none if references is None else references, reference_names,
+             reference_units),
+        )  # fmt: skip
+        fields = {"time": stamps, "source": source}
+        for role, letter, values, names, units in roles:
+            array = as_float64(role, values)
+            array = array[:, None] if array.ndim == 1 else array
+            if array.ndim != 2:
+                raise RecordError(
+                    f"{role} has shape {array.shape}: it must be (samples, channels)."
+                )
+            if array.shape[0] != rows:
+                turned = array.shape[1] == rows
+                hint = "Transpose it." if turned else "Cut or resample one of the two."
+                raise RecordError(
+                    f"{role} has {array.shape[0]} rows for {rows} time stamps; the shape must be "
+                    f"(samples, channels). {hint}"
+                )
+            count = array.shape[1]
+            if count == 0 and role != "references":
+                raise RecordError(
+                    f"{role} has no channel: a record needs at least one input and output."
+                )
+            numbered = tuple(f"{letter}{i + 1}" for i in range(count))
+            default = (letter,) if count == 1 else numbered
+            names = default if names is None else as_tuple(names)
+            if len(names) != count:
+                raise RecordError(
+                    f"{len(names)} names {names} for {count} channels: give one name for each "
+                    f"channel."
+                )
+            units = ("",) * count if units is None else as_tuple(units)
+            if len(units) != count:
+                raise RecordError(
+                    f"{len(units)} units {units} for the channels {names}: give one unit for each."
+                )
+            one = role.removesuffix("s")
+            fields |= {role: array, f"{one}_names": names, f"{one}_units": units}
+        vars(self).update(fields)
         if hold == "dt":
             hold = self.dt
         elif hold is not None and (isinstance(hold, str) or not 0 <= float(hold) < np.inf):
@@ -130,17 +157,53 @@ class Record:
                 f"for the sample interval, 0 for a continuous quantity that was measured, or None "
                 f"where it is unknown."
             )
-        put("hold", None if hold is None else float(hold))
         check_distinct(self.names)
         earlier = {name: np.asarray(times, np.float64) for name, times in (repaired or {}).items()}
+        vars(self).update(hold=None if hold is None else float(hold), repaired=earlier)
         check_ranges(valid or {}, self.names)
-        for name, values in zip(self.names, _all_channels(self), strict=True):
+        channels = dict(zip(self.names, _all_channels(self), strict=True))
+        for name, values in channels.items():
             limits = (valid or {}).get(name)
             values[:], times = repair_values(name, self.time, values, limits, max_gap)
             if times.size:
                 earlier[name] = times
-        put("repaired", earlier)
-        _check_channels(self)
+        for name, times in earlier.items():
+            if times.size > _MOST_REPAIRED * rows:
+                warn(
+                    f"channel {name!r}: {times.size} of {rows} samples are interpolated, the first "
+                    f"at t = {show_times(times.min(), start=start)}. Check «valid=» and the "
+                    "sensor."
+                )
+        for name, values in channels.items():
+            bad = np.flatnonzero(~np.isfinite(values))
+            if bad.size == values.size:
+                raise RecordError(
+                    f"channel {name!r} holds no usable number: all {values.size} samples are "
+                    f"{values[0]}, or out of the range that it was given («valid=»). Check that it "
+                    "was logged, or choose another channel."
+                )
+            if bad.size:
+                good = np.isfinite(values)
+                gap = np.max(np.diff(self.time[good])) if good[0] and good[-1] else None
+                longest = "" if gap is None else f", the longest gap {gap:.4g} s"
+                raise RecordError(
+                    f"channel {name!r} holds {np.isnan(values).sum()} NaN and "
+                    f"{np.isinf(values).sum()} inf, the first at t = "
+                    f"{show_times(float(self.time[bad[0]]), start=start)}"
+                    f"{longest}. {mend_holes('them')}"
+                )
+            largest = float(np.max(np.abs(values)))
+            if largest and not _SMALLEST <= largest <= 1 / _SMALLEST:
+                raise RecordError(
+                    f"channel {name!r} reaches {largest:.3g}: powers of it leave the range of "
+                    f"floating point numbers. Give it in another unit, between {_SMALLEST:g} and "
+                    f"{1 / _SMALLEST:g}."
+                )
+            if np.ptp(values) == 0:
+                warn(
+                    f"channel {name!r} is constant at {values[0]:.6g}: nothing can be identified "
+                    f"from it. Check that it was excited and logged."
+                )
         if self.hold is not None and self.hold > _CHANGES * self.dt:
             # A hold during which an input changes all the time.
             share = np.mean(np.diff(self.inputs, axis=0) != 0, axis=0)  # of the samples
@@ -178,12 +241,17 @@ class Record:
 
     def channel(self, name: str) -> Float[np.ndarray, " samples"]:
         """The values of one channel, whatever its role."""
-        return _all_channels(self)[_position(self, name)]
+        return _all_channels(self)[self._position(name)]
 
     def unit(self, name: str) -> str:
         """The unit of one channel, empty where unknown."""
         units = self.input_units + self.output_units + self.reference_units
-        return units[_position(self, name)]
+        return units[self._position(name)]
+
+    def _position(self, name: str) -> int:
+        if name not in self.names:
+            raise RecordError(unknown_name(name, self.names))
+        return self.names.index(name)
 
     @classmethod
     def from_dataframe(
@@ -217,11 +285,47 @@ class Record:
 
         - `RecordError`: as `Record`, and for columns that are missing or hold no numbers.
         """
-        from ._interop import from_dataframe
+        from ._edit import resample
+        from ._interop import frame_stamps, frame_values
 
-        roles = inputs, outputs, references
-        return from_dataframe(
-            frame, roles, time, time_unit, sample_rate, max_gap, units or {}, hold, source
+        stored = frame.attrs.get(_ATTRIBUTES, {})
+        roles = {"inputs": inputs, "outputs": outputs, "references": references}
+        if all(role is None for role in roles.values()):
+            if not roles.keys() <= stored.keys():
+                raise RecordError(
+                    "the table does not say which columns are inputs and outputs: name them "
+                    "(«inputs=», «outputs=»). Its columns are "
+                    f"{', '.join(map(str, frame.columns))}."
+                )
+            roles = stored
+        names = [as_tuple(roles[role] or ()) for role in ("inputs", "outputs", "references")]
+        flat = [name for role in names for name in role]
+        check_distinct(flat)
+        values = {name: frame_values(frame, name) for name in flat}
+        stamps = frame_stamps(frame, time, time_unit)
+        if sample_rate is not None:
+            channels = [
+                Channel(name, stamps, repair_values(name, stamps, column, None, max_gap)[0])
+                for name, column in values.items()
+            ]
+            stamps, table = resample(channels, sample_rate, max_gap=max_gap)
+            values = dict(zip(values, table.T, strict=True))
+        if not names[0] or not names[1]:
+            raise RecordError(
+                "a record needs at least one input and one output («inputs=», «outputs=»)."
+            )
+        for name in units or {}:
+            if name not in flat:
+                raise RecordError(f"a unit is given for {name!r}: {unknown_name(name, flat)}")
+        units = {**stored.get("units", {}), **(units or {})}
+        return assemble(
+            stamps,
+            names,
+            values.__getitem__,
+            lambda name: units.get(name, ""),
+            hold=stored.get("hold") if hold is None else hold,
+            source=source or stored.get("source", ""),
+            max_gap=max_gap,
         )
 
     def to_dataframe(self) -> "pandas.DataFrame":
@@ -230,9 +334,20 @@ class Record:
         What columns cannot say (roles, units, hold) is in `DataFrame.attrs`, from which
         `from_dataframe` takes it.
         """
-        from ._interop import to_dataframe
+        import pandas
 
-        return to_dataframe(self)
+        table = np.concatenate([self.inputs, self.outputs, self.references], axis=1)
+        index = pandas.Index(self.time, name="time")
+        frame = pandas.DataFrame(table, index=index, columns=pandas.Index(self.names))
+        frame.attrs[_ATTRIBUTES] = {
+            "inputs": self.input_names,
+            "outputs": self.output_names,
+            "references": self.reference_names,
+            "units": {name: self.unit(name) for name in self.names},
+            "hold": self.hold,
+            "source": self.source,
+        }
+        return frame
 
     @classmethod
     def from_iddata(
@@ -277,17 +392,17 @@ class Record:
         return to_iddata(self, path, variable)
 
     def __str__(self) -> str:
-        names = {
-            "inputs": self.input_names,
-            "outputs": self.output_names,
-            "references": self.reference_names,
-        }
+        roles = (
+            ("inputs", self.input_names),
+            ("outputs", self.output_names),
+            ("references", self.reference_names),
+        )
         lines = [
             f"Record {self.source}".rstrip(),
             f"  {self.samples} samples, {self.duration:.6g} s at {self.sample_rate:.6g} Hz "
             f"(t = {show_times(self.time[0], self.time[-1], start=clock_start(self.time))})",
         ]
-        for role, members in names.items():
+        for role, members in roles:
             texts = [f"{name} [{self.unit(name)}]" if self.unit(name) else name for name in members]
             lines.append(f"  {role}: {', '.join(texts) or 'none'}")
         if self.hold is not None:
@@ -336,123 +451,6 @@ def assemble(
 
 def _all_channels(record: Record) -> list[Float[np.ndarray, " samples"]]:
     return [*record.inputs.T, *record.outputs.T, *record.references.T]
-
-
-def _position(record: Record, name: str) -> int:
-    if name not in record.names:
-        raise RecordError(unknown_name(name, record.names))
-    return record.names.index(name)
-
-
-def _stamps(time: ArrayLike, unit: TimeUnit | None) -> Times:
-    check_unit(unit)
-    dates = np.asarray(time)
-    if dates.dtype.kind in "mM":
-        first = dates.flat[0] if dates.size and dates.dtype.kind == "M" else None
-        # Before they become s, of which a float holds a day of ns but not 50 years of them.
-        stamps = dates_in_seconds(dates if first is None else dates - first)
-        if stamps is None or unit is not None:
-            raise RecordError(
-                f"time has the type {dates.dtype}: give «time_unit=» to plain numbers only, and "
-                f"dates or durations in a unit between weeks and attoseconds."
-            )
-    else:
-        stamps = as_float64("time", time) / PER_SECOND[unit or "s"]
-        doubt = doubt_of_seconds(stamps) if unit is None and stamps.ndim == 1 else ""
-        if doubt:
-            raise RecordError(f"time {doubt}.")
-    if stamps.ndim != 1:
-        raise RecordError(f"time has shape {stamps.shape}: give one value for each sample.")
-    if stamps.size < FEWEST:
-        raise RecordError(f"{stamps.size} samples: a record needs at least {FEWEST}.")
-    check_increasing("time", stamps)
-    check_uniform(stamps)
-    return stamps
-
-
-def _columns(role: str, values: ArrayLike, rows: int) -> Float[np.ndarray, "samples channels"]:
-    array = as_float64(role, values)
-    array = array[:, None] if array.ndim == 1 else array
-    if array.ndim != 2:
-        raise RecordError(f"{role} has shape {array.shape}: it must be (samples, channels).")
-    if array.shape[0] != rows:
-        hint = "Transpose it." if array.shape[1] == rows else "Cut or resample one of the two."
-        raise RecordError(
-            f"{role} has {array.shape[0]} rows for {rows} time stamps; the shape must be "
-            f"(samples, channels). {hint}"
-        )
-    if array.shape[1] == 0 and role != "references":
-        raise RecordError(f"{role} has no channel: a record needs at least one input and output.")
-    return array
-
-
-def _check_channels(record: Record) -> None:
-    start = clock_start(record.time)
-    for name, times in record.repaired.items():
-        if times.size > _MOST_REPAIRED * record.samples:
-            warnings.warn(
-                f"channel {name!r}: {times.size} of {record.samples} samples are interpolated, the "
-                f"first at t = {show_times(times.min(), start=start)}. Check «valid=» and the "
-                "sensor.",
-                RecordWarning,
-                stacklevel=4,
-            )
-    for name, values in zip(record.names, _all_channels(record), strict=True):
-        bad = np.flatnonzero(~np.isfinite(values))
-        if bad.size == values.size:
-            raise RecordError(
-                f"channel {name!r} holds no usable number: all {values.size} samples are "
-                f"{values[0]}, or out of the range that it was given («valid=»). Check that it was "
-                "logged, or choose another channel."
-            )
-        if bad.size:
-            good = np.isfinite(values)
-            gap = np.max(np.diff(record.time[good])) if good[0] and good[-1] else None
-            longest = "" if gap is None else f", the longest gap {gap:.4g} s"
-            raise RecordError(
-                f"channel {name!r} holds {np.isnan(values).sum()} NaN and "
-                f"{np.isinf(values).sum()} inf, the first at t = "
-                f"{show_times(float(record.time[bad[0]]), start=start)}"
-                f"{longest}. {mend_holes('them')}"
-            )
-        largest = float(np.max(np.abs(values)))
-        if largest and not _SMALLEST <= largest <= 1 / _SMALLEST:
-            raise RecordError(
-                f"channel {name!r} reaches {largest:.3g}: powers of it leave the range of floating "
-                f"point numbers. Give it in another unit, between {_SMALLEST:g} and "
-                f"{1 / _SMALLEST:g}."
-            )
-        if np.ptp(values) == 0:
-            warnings.warn(
-                f"channel {name!r} is constant at {values[0]:.6g}: nothing can be identified from "
-                f"it. Check that it was excited and logged.",
-                RecordWarning,
-                stacklevel=4,
-            )
-
-
-def _as_names(names: Names, letter: str, count: int) -> tuple[str, ...]:
-    """Names of `count` channels; by default `letter`, or `letter` with a number from 1."""
-    if names is None:
-        return (letter,) if count == 1 else tuple(f"{letter}{i + 1}" for i in range(count))
-    names = as_tuple(names)
-    if len(names) != count:
-        raise RecordError(
-            f"{len(names)} names {names} for {count} channels: give one name for each channel."
-        )
-    return names
-
-
-def _as_units(units: Names, names: Sequence[str]) -> tuple[str, ...]:
-    """One unit for each of the `names`; by default none is known (an empty string)."""
-    if units is None:
-        return ("",) * len(names)
-    units = as_tuple(units)
-    if len(units) != len(names):
-        raise RecordError(
-            f"{len(units)} units {units} for the channels {tuple(names)}: give one unit for each."
-        )
-    return units
 
 
 def as_tuple(names: str | Iterable[str]) -> tuple[str, ...]:

@@ -1,25 +1,30 @@
+"""The channels of a file, and the time stamps of each."""
+
 import re
-import warnings
 from collections.abc import Iterator
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool
 
-from ._channel import Channel
-from ._clock import (
+from ._channel import (
+    Channel,
     check_unit,
+    clock_start,
     doubt_of_seconds,
+    FEWEST,
     Number,
     PER_SECOND,
-    repair,
+    repair_time,
     RepairedTime,
-    steady,
+    show_times,
     TimeUnit,
     unwrap,
 )
-from ._errors import listed, ReadError, RecordError, RecordWarning, unknown_name
+from ._errors import listed, located, ReadError, RecordError, unknown_name, warn
 from ._log import Signal, Signals
+from .formats import load_signals
 
 
 _SHARED = ("t", "time", "time_s", "timestamp", "Time", "Timestamp", "TIME")
@@ -36,19 +41,71 @@ _TOPIC = re.compile(r"(.+_)(t|time|timestamp|stamp|Time)")
 _COUNTED = "rows"  # the time base where dt says how far apart they are
 
 
-class _Stamps(NamedTuple):
-    seconds: np.ndarray  # of each row of the table, NaN where the time base is blank
-    wraps: int  # overflows that were undone
+class ChannelSummary(NamedTuple):
+    """One channel of a file: NaN for its rate and times where it has no usable time base."""
+
+    name: str
+    samples: int
+    rate: float  # Hz, without gaps
+    start: float  # s
+    stop: float  # s
+    minimum: float  # of the finite values
+    maximum: float
+    unit: str  # empty where unknown
+
+    def __str__(self) -> str:
+        start = clock_start(np.array([self.start]))
+        clock = f"{self.rate:.5g} Hz, t = {show_times(self.start, self.stop, start=start)}"
+        extent = f"{self.minimum:.4g} .. {self.maximum:.4g} {self.unit}".rstrip()
+        return f"{self.name}: {self.samples} samples, {clock}, {extent}"
+
+
+def channels(
+    path: str | Path,
+    *,
+    time: str | None = None,
+    time_unit: TimeUnit | None = None,
+    dt: Number | None = None,
+) -> list[ChannelSummary]:
+    """List the channels that `read` can take from a file.
+
+    **Arguments:**
+
+    - `path`: the file, of any format that `read` knows.
+    - `time`, `time_unit`, `dt`: as in `read`.
+
+    **Returns:** a `ChannelSummary` for each channel, which prints as one line.
+
+    **Raises:**
+
+    - `ReadError`: where the file is missing, damaged or of an unknown format.
+    """
+    signals = load_signals(path)
+    try:
+        timebases = Timebases(signals, time, time_unit, dt)
+    except ReadError as error:
+        raise located(error, path) from error
+    summaries = []
+    for name in timebases.names:
+        values = timebases.values(name)
+        finite = values[np.isfinite(values)]
+        low, high = (float(finite.min()), float(finite.max())) if finite.size else (np.nan, np.nan)
+        try:
+            clock = timebases.extent(name)
+        except RecordError:  # A list of channels is also for finding out what is wrong with a file.
+            clock = np.nan, np.nan, np.nan
+        unit = timebases.unit(name)
+        summaries.append(ChannelSummary(name, len(values), *clock, low, high, unit))
+    return summaries
+
+
+Place = tuple[str, int | None]  # an array, and its column
 
 
 class Timebases:
     """The channels of a log, `names`, and their time bases, each repaired once.
 
-    The columns of a matrix `x` are `x[0]`, `x[1]`, ... The time base of an array is the first that
-    exists of: its own, `t_<array>`; the one named `time`; t, time, time_s, timestamp, ... or
-    seconds and nanoseconds in the same struct, in those around it, in the whole file; those of its
-    topic (`imu_time` for `imu_x`); the first column of a matrix if that rises in steps of nearly
-    one size. Seconds and nanoseconds are `sec+nsec`.
+    `read` tells how the time base of an array is found. Seconds and nanoseconds are `sec+nsec`.
     """
 
     def __init__(
@@ -76,15 +133,43 @@ class Timebases:
         self._unit: TimeUnit | None = time_unit
         self._factor = 1.0 if time_factor is None else float(time_factor)
         self._time = None if time is None else signals.titles.get(time, time)
-        self._structs: dict[str, str] = {}  # `imu.` or "": imu.time, or imu.stamp.sec+...nanosec
+        # The best name of a time base in each struct, and the first one of each topic.
+        ranks: dict[str, tuple[int, str]] = {}
         self._topics: dict[str, str] = {}  # `imu_`: imu_time
-        self._find_clocks()
-        self._columns: dict[str, tuple[str, int | None]] = {}  # of all arrays: array and column
-        self.names: dict[str, tuple[str, int | None]] = {}  # of the channels alone
-        stamps = self._time_names()
-        for array, signal in signals.arrays.items():
+        for name in self._arrays:
+            prefix, rank, base = "", 0, ""
+            if match := _CLOCK.fullmatch(name):
+                prefix, rank, base = match[1], _KNOWN.index(match[2]), name
+            elif match := _SECONDS.fullmatch(name):
+                partners = (name.removesuffix(match[2]) + p for p in _PARTNERS.get(match[2], ()))
+                partner = next((other for other in partners if other in self._arrays), None)
+                if partner is not None:
+                    prefix, rank, base = match[1], len(_KNOWN), f"{name}+{partner}"
+            if base and (rank, base) < ranks.get(prefix, (len(_KNOWN) + 1, "")):
+                ranks[prefix] = rank, base
+            elif not base and (topic := _TOPIC.fullmatch(name)):
+                self._topics.setdefault(topic[1], name)
+        # `imu.` or "": imu.time, or imu.stamp.sec+imu.stamp.nanosec
+        self._structs = {prefix: base for prefix, (_, base) in ranks.items()}
+        self._columns: dict[str, Place] = {}  # of all arrays
+        self.names: dict[str, Place] = {}  # of the channels alone
+        arrays, stamps = self._arrays, set()  # of what holds time stamps rather than a channel
+        for name in arrays:
+            struct, dot, field = name.rpartition(".")
+            if field.startswith("t_") and f"{struct}{dot}{field.removeprefix('t_')}" in arrays:
+                stamps.add(name)
+        if self._time is not None:
+            stamps |= set(self._time.split("+"))
+        else:
+            stamps |= {name for name in arrays if _CLOCK.fullmatch(name)}
+            pairs = (base.split("+") for base in self._structs.values() if "+" in base)
+            stamps |= {part for pair in pairs for part in pair} & set(arrays)
+            if self._topics:
+                bases = {self._clock_by_name(name) for name in arrays}
+                stamps |= bases & set(self._topics.values())
+        for array, signal in self._arrays.items():
             matrix = signal.values
-            columns = {array: (array, None)}
+            columns: dict[str, Place] = {array: (array, None)}
             if matrix.ndim > 1:
                 columns = {f"{array}[{i}]": (array, i) for i in range(matrix.shape[1])}
             self._columns |= columns
@@ -97,46 +182,42 @@ class Timebases:
         if self._time is not None:
             self.names.pop(self._time, None)
             for name in self._parts(self._time):
-                if name not in self._columns and name not in signals.arrays:
-                    raise ReadError(f"time base {name!r}: {unknown_name(name, signals.arrays)}")
-        self._read: dict[str, _Stamps] = {}
+                if name not in self._columns and name not in self._arrays:
+                    raise ReadError(f"time base {name!r}: {unknown_name(name, self._arrays)}")
+        self._read: dict[str, tuple[np.ndarray, int]] = {}
         self._repaired: dict[tuple[str, bytes], RepairedTime] = {}
         self._rates: dict[tuple[str, bytes], float] = {}
 
     def channel(self, name: str) -> Channel:
-        """The named channel with its time stamps, in s.
-
-        Raises ReadError for an unknown channel and for one without a time base of its length,
-        and warns with RecordWarning of time stamps that had to be repaired.
-        """
-        values, stamps = self.values(name), self._repaired_time(name)[1]
-        values = values if stamps.kept is None else values[stamps.kept]
-        return Channel(name, stamps.time, values, self.unit(name))
+        """The named channel with its time stamps, in s; warns of those that were repaired."""
+        values, (stamps, kept, _) = self.values(name), self._repaired_time(name)[1]
+        values = values if kept is None else values[kept]
+        return Channel(name, stamps, values, self.unit(name))
 
     def extent(self, name: str) -> tuple[float, float, float]:
         """Rate in Hz, first and last time in s of a channel; raises as `channel` does."""
-        base, stamps = self._repaired_time(name)
+        base, (stamps, _, _) = self._repaired_time(name)
         if base not in self._rates:
             self._rates[base] = self.channel(name).rate
-        return self._rates[base], float(stamps.time[0]), float(stamps.time[-1])
+        return self._rates[base], float(stamps[0]), float(stamps[-1])
 
     def values(self, name: str) -> np.ndarray:
         """The values of a channel in its unit, without its time stamps."""
-        return self._column(*self._place(name))
+        return self._column(self._place(name))
 
     def unit(self, name: str) -> str:
         """The unit of a channel; a whole title has it in its name."""
         return "" if name in self._signals.titles else self._arrays[self._place(name)[0]].unit
 
-    def _place(self, name: str) -> tuple[str, int | None]:
-        """The array and the column of a channel, by its name or by its whole title."""
+    def _place(self, name: str) -> Place:
+        """Of a channel, by its name or by its whole title."""
         short = name if name in self.names else self._signals.titles.get(name, name)
         if short not in self.names:
             raise ReadError(unknown_name(name, self.names))
         return self.names[short]
 
-    def _column(self, array: str, column: int | None) -> np.ndarray:
-        signal = self._arrays[array]
+    def _column(self, place: Place) -> np.ndarray:
+        signal, column = self._arrays[place[0]], place[1]
         values = signal.values if column is None else signal.values[:, column]
         if signal.scale == 1.0:
             return values
@@ -149,57 +230,61 @@ class Timebases:
         count = len(values) if rows is None else rows.size
         key = base, b"" if rows is None else rows.tobytes()
         if self._dt is not None and base == _COUNTED:
-            stamps = _Stamps(np.arange(count) * float(self._dt), 0)
+            seconds, wraps = np.arange(count) * float(self._dt), 0
+            key = f"{base} {len(values)}", key[1]
         else:
-            stamps = self._stamps(base)
-            if len(stamps.seconds) != count:
+            if base not in self._read:
+                clock = self._signals.clocks.get(base)
+                seconds, wraps = self._count(base) if clock is None else (clock, 0)
+                seconds = seconds if self._factor == 1 else self._factor * seconds
+                self._read[base] = seconds, wraps
+            seconds, wraps = self._read[base]
+            if len(seconds) != count:
                 raise ReadError(
                     f"channel {name!r} has {len(values)} samples, but its time base {base!r} has "
-                    f"{len(stamps.seconds)}. Name another time base («time=»), or save the "
+                    f"{len(seconds)}. Name another time base («time=»), or save the "
                     f"channel's own as {'t_' + array!r}."
                 )
-        key = (f"{base} {len(values)}", key[1]) if base == _COUNTED else key
         if key in self._repaired:
             return key, self._repaired[key]
-        seconds = stamps.seconds if rows is None else stamps.seconds[rows]
+        seconds = seconds if rows is None else seconds[rows]
         blank = 0 if rows is None else int(np.count_nonzero(~np.isfinite(seconds)))
         if blank > 0.01 * seconds.size:
             raise ReadError(
                 f"in {blank} of the {seconds.size} rows in which channel {name!r} has a value, its "
                 f"time base {base!r} is blank. Name the channel's own time base («time=»)."
             )
-        repaired = self._repaired[key] = repair(seconds)
-        times = "once" if stamps.wraps == 1 else f"{stamps.wraps} times"
-        overflow = f"the counter overflowed {times}; this was undone" if stamps.wraps else ""
-        for text in filter(None, (overflow, repaired.remark)):
-            warnings.warn(f"time base {base!r}: {text}.", RecordWarning, stacklevel=2)
+        repaired = self._repaired[key] = repair_time(seconds)
+        times = "once" if wraps == 1 else f"{wraps} times"
+        overflow = f"the counter overflowed {times}; this was undone" if wraps else ""
+        for text in filter(None, (overflow, repaired[2])):
+            warn(f"time base {base!r}: {text}.")
         return key, repaired
 
     def _base(self, array: str) -> str:
-        clock = self._arrays[array].clock
-        if not clock or self._time is not None:
-            return _COUNTED if self._dt is not None else self._search_base(array)
+        """The time stamps of an array; warns of a choice where the log does not define them."""
+        signal = self._arrays[array]
+        if signal.clock and self._time is None:
+            if self._dt is not None:
+                raise ReadError(
+                    f"dt is {self._dt:g} s, but the log gives the time of {array!r}: leave dt out "
+                    f"(«dt=»), or name another time base («time=»)."
+                )
+            if self._unit not in (None, "s"):
+                raise ReadError(
+                    f"time_unit is {self._unit!r}, but the log gives the time of {array!r} in s: "
+                    f"leave the unit out («time_unit=»), or name another time base («time=»)."
+                )
+            return signal.clock
         if self._dt is not None:
-            raise ReadError(
-                f"dt is {self._dt:g} s, but the log gives the time of {array!r}: leave dt out "
-                f"(«dt=»), or name another time base («time=»)."
-            )
-        if self._unit not in (None, "s"):
-            raise ReadError(
-                f"time_unit is {self._unit!r}, but the log gives the time of {array!r} in s: "
-                f"leave the unit out («time_unit=»), or name another time base («time=»)."
-            )
-        return clock
-
-    def _search_base(self, array: str) -> str:
-        """The time stamps of an array where the log does not define them; warns of a choice."""
+            return _COUNTED
         struct, dot, field = array.rpartition(".")
         its_own = f"{struct}{dot}t_{field}"
         if self._time is None:
             base = self._clock_by_name(array)
         else:
             base = its_own if its_own in self._arrays else self._time
-        from_column = not base and _begins_with_clock(self._arrays[array])
+        from_column = not base and _begins_with_clock(signal)
         base = f"{array}[0]" if from_column else base
         if not base:
             raise ReadError(
@@ -216,6 +301,7 @@ class Timebases:
             )
         if base in self._read or self._time is not None:
             return base
+        doubt = ""
         if stamps is not None:  # Others that are called like a time base, and hold something else.
             struct, dot, field = base.rpartition(".")
             names = [f"{struct}{dot}{n}" for n in _SHARED if field in _SHARED and n != field]
@@ -223,43 +309,34 @@ class Timebases:
             alike = [n for n in alike if len(self._arrays[n].values) == len(stamps.values)]
             other = [n for n in alike if not np.array_equal(self._arrays[n].values, stamps.values)]
             if other:
-                warnings.warn(
-                    f"the time stamps are taken from {base!r}; {', '.join(map(repr, other))}, of "
-                    f"the same length, is not used. Name the right one («time=»).",
-                    RecordWarning,
-                    stacklevel=2,
+                doubt = (
+                    f"; {', '.join(map(repr, other))}, of the same length, is not used. Name the "
+                    f"right one («time=»)."
                 )
         if base == f"{array}[0]":
-            warnings.warn(
-                f"the time stamps are taken from {base!r}, which rises from row to row. Name "
-                f"another channel («time=»), or give the sampling interval («dt=»).",
-                RecordWarning,
-                stacklevel=2,
+            doubt = (
+                ", which rises from row to row. Name another channel («time=»), or give the "
+                "sampling interval («dt=»)."
             )
+        if doubt:
+            said = f"the time stamps are taken from {base!r}{doubt}"
+            warn(said)
         return base
 
-    def _stamps(self, base: str) -> _Stamps:
-        if base not in self._read:
-            clock = self._signals.clocks.get(base)
-            stamps, wraps = self._count(base) if clock is None else (clock, 0)
-            stamps = stamps if self._factor == 1 else self._factor * stamps
-            self._read[base] = _Stamps(stamps, wraps)
-        return self._read[base]
-
-    def _count(self, base: str) -> _Stamps:
-        """The time stamps of arrays that the log does not define as a clock."""
+    def _count(self, base: str) -> tuple[np.ndarray, int]:
+        """Stamps (s) that the log does not define as a clock, NaN where blank; overflows undone."""
         parts = self._parts(base)
         if len(parts) == 2:
             places = [self._columns[part] for part in parts]
             seconds, nanoseconds = (
-                _in_rows(self._column(*place), self._arrays[place[0]].rows) for place in places
+                _in_rows(self._column(place), self._arrays[place[0]].rows) for place in places
             )
             if len(seconds) != len(nanoseconds):
                 raise ReadError(
                     f"the time base {base!r} is of {len(seconds)} seconds and {len(nanoseconds)} "
                     f"nanoseconds: name two channels of one length («time=SECONDS+NANOSECONDS»)."
                 )
-            return _Stamps(seconds + 1e-9 * nanoseconds.astype(np.float64), 0)
+            return seconds + 1e-9 * nanoseconds.astype(np.float64), 0
         array, column = self._columns[base]
         signal = self._arrays[array]
         counter, wraps = unwrap(signal.values if column is None else signal.values[:, column])
@@ -274,29 +351,11 @@ class Timebases:
         doubt = doubt_of_seconds(seconds) if unit is None else ""
         if doubt:
             raise ReadError(f"the time base {base!r} {doubt}.")
-        return _Stamps(_in_rows(seconds, signal.rows), wraps)
+        return _in_rows(seconds, signal.rows), wraps
 
     def _parts(self, base: str) -> list[str]:
         """A channel, or those of seconds and of nanoseconds."""
         return [base] if base in self._columns or base.count("+") != 1 else base.split("+")
-
-    def _find_clocks(self) -> None:
-        """The best name of a time base in each struct, and the first one of each topic."""
-        ranks: dict[str, tuple[int, str]] = {}
-        for name in self._arrays:
-            prefix, rank, base = "", 0, ""
-            if match := _CLOCK.fullmatch(name):
-                prefix, rank, base = match[1], _KNOWN.index(match[2]), name
-            elif match := _SECONDS.fullmatch(name):
-                partners = (name.removesuffix(match[2]) + p for p in _PARTNERS.get(match[2], ()))
-                partner = next((other for other in partners if other in self._arrays), None)
-                if partner is not None:
-                    prefix, rank, base = match[1], len(_KNOWN), f"{name}+{partner}"
-            if base and (rank, base) < ranks.get(prefix, (len(_KNOWN) + 1, "")):
-                ranks[prefix] = rank, base
-            elif not base and (topic := _TOPIC.fullmatch(name)):
-                self._topics.setdefault(topic[1], name)
-        self._structs = {prefix: base for prefix, (_, base) in ranks.items()}
 
     def _clock_by_name(self, array: str) -> str:
         """The time base that a name gives to an array; empty where none does."""
@@ -310,22 +369,6 @@ class Timebases:
         topics = (self._topics.get(prefix, array) for prefix in _prefixes(array, "_"))
         return next((base for base in topics if base != array), "")
 
-    def _time_names(self) -> set[str]:
-        """The arrays that hold time stamps rather than a channel."""
-        arrays, stamps = self._arrays, set()
-        for name in arrays:
-            struct, dot, field = name.rpartition(".")
-            if field.startswith("t_") and f"{struct}{dot}{field.removeprefix('t_')}" in arrays:
-                stamps.add(name)
-        if self._time is not None:
-            return stamps | set(self._time.split("+"))
-        stamps |= {name for name in arrays if _CLOCK.fullmatch(name)}
-        pairs = (base.split("+") for base in self._structs.values() if "+" in base)
-        stamps |= {part for pair in pairs for part in pair} & set(arrays)
-        if self._topics:
-            stamps |= {self._clock_by_name(name) for name in arrays} & set(self._topics.values())
-        return stamps
-
 
 def _prefixes(name: str, separator: str) -> Iterator[str]:
     """`a.b.` and `a.` for `a.b.c`."""
@@ -336,7 +379,12 @@ def _prefixes(name: str, separator: str) -> Iterator[str]:
 def _begins_with_clock(signal: Signal) -> bool:
     """Whether the first column of a matrix is a clock, as Simulink's `To File` writes it."""
     matrix = signal.values
-    return matrix.ndim == 2 and matrix.shape[1] > 1 and steady(matrix[:, 0])
+    if matrix.ndim != 2 or matrix.shape[1] < 2 or len(matrix) < FEWEST:
+        return False
+    steps = np.diff(matrix[:, 0].astype(np.float64))
+    if not np.isfinite(steps).all() or not (steps > 0).all():
+        return False
+    return bool(np.mean(np.abs(steps / np.median(steps) - 1) < 0.5) > 0.9)
 
 
 def _in_rows(values: np.ndarray, rows: Bool[np.ndarray, " rows"] | None) -> np.ndarray:

@@ -1,5 +1,5 @@
-from ._fit import compare_fits as compare_fits
 from ._loop import LawLoop as LawLoop
+from ._numbers import compare_fits as compare_fits
 from ._page import (
     Cell as Cell,
     embed_figure as embed_figure,
@@ -8,7 +8,8 @@ from ._page import (
     Section as Section,
     Table as Table,
 )
-from ._provenance import (
+from ._report import write_report as write_report
+from ._results import (
     attempt as attempt,
     FAILED as FAILED,
     PageWarning as PageWarning,
@@ -18,9 +19,6 @@ from ._provenance import (
     reason_of as reason_of,
     sha256_of as sha256_of,
     Source as Source,
-)
-from ._report import write_report as write_report
-from ._results import (
     verification_content as verification_content,
     write_json as write_json,
     write_results as write_results,

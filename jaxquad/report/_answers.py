@@ -7,23 +7,16 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxquad.excitation import three_two_one_one
-from jaxquad.identify import (
-    as_sampled,
-    Fit,
-    MISFIT,
-    model_response,
-    Verification,
-    with_values,
-)
+from jaxquad.identify import as_sampled, Fit, MISFIT, model_response, Verification, with_values
 from jaxquad.plot import COHERENT
 from jaxquad.records import Record
 from jaxquad.spectra import FrequencyResponse
 
-from ._measured import GOOD_TIC
 from ._page import Section
 
 
 Grid = Float[np.ndarray, " frequencies"]
+GOOD_TIC = 0.25  # Theil inequality coefficient, below which agreement is good
 _LOOSE = 0.2  # half of a 95 % interval over the value: CIFER's Cramer-Rao guideline of 20 %
 _AIM = 0.8  # coherence that a flight is planned for
 _FAINT = 0.2  # coherence below which its estimate says nothing
@@ -53,18 +46,49 @@ class _Need(NamedTuple):
 
 
 def answer_section(
-    fit: Fit,
-    frf: FrequencyResponse,
-    record: Record | None,
-    checks: Mapping[str, Verification],
+    fit: Fit, frf: FrequencyResponse, record: Record | None, checks: Mapping[str, Verification]
 ) -> Section:
     """Verdict in plain words, lists of what is answered and what not, and the next flight."""
+    omega, good, can, cannot = np.asarray(frf.omega), _good(frf), [], []
+    answer = f"How {', '.join(frf.output_names)} answers to {', '.join(frf.input_names)}"
+    if good.any() and not _is_of_controller(frf):
+        error = float(np.median(np.asarray(frf.random_error)[good]))
+        can.append(
+            f"{answer} from {in_both(*_ends(frf, good))}: to {100 * error:.2g} % of magnitude and "
+            f"{np.degrees(error):.2g} deg of phase (median standard error)."
+        )
+    if fit.verdict.fitted:
+        units = fit.parameter_units or [""] * len(fit.names)
+        for k, (name, unit) in enumerate(zip(fit.names, units, strict=True)):
+            if fit.determined[k] and _reach(fit, k) <= _LOOSE:
+                value = f"{fit.values[k]:.4g}{f' {unit}' if unit else ''}"
+                can.append(f"{name}: {value} \u00b1 {100 * _reach(fit, k):.2g} % (95 %).")
+        for one in fit.combinations:
+            can.append(f"{one.name}: {one.value:.4g}{f' {one.unit}' if one.unit else ''}.")
+        for k in _loose(fit):
+            reach = f"only to \u00b1 {100 * _reach(fit, k):.2g} % (95 %)"
+            cannot.append(f"{fit.names[k]}: {reach if fit.determined[k] else 'not by itself'}.")
+    if _is_of_controller(frf):
+        cannot.append(f"{answer}: the response is that of the controller, -1/C.")
+    cannot += [f"The response from {in_both(*band)}: incoherent." for band in poor_bands(frf)]
+    cannot.append(f"Anything above {omega[-1] / (2 * np.pi):.3g} Hz: it was not estimated there.")
+    if record is not None and not record.reference_names:
+        cannot.append(
+            "How the closed loop follows its reference, and which part of the response is "
+            "feedback: no reference was recorded."
+        )
+    for name, check in checks.items():
+        if check.tic < GOOD_TIC:
+            can.append(f"What happens in {name}: predicted, TIC {check.tic:.3f}.")
+        else:
+            does_not = f"the model does not predict it, TIC {check.tic:.3f}"
+            cannot.append(f"What happens in {name}: {does_not}.")
+    if not checks:
+        cannot.append("Whether the model predicts another flight: no second log was simulated.")
     return {
-        "plain": _plain(fit, frf),
-        "can": _can(fit, frf, checks),
-        "cannot": _cannot(fit, frf, record, checks),
+        "plain": _plain(fit, frf), "can": can or ["Nothing about this vehicle."], "cannot": cannot,
         "flight": next_flight(fit, frf, record, checks),
-    }
+    }  # fmt: skip
 
 
 def in_both(low: float, high: float) -> str:
@@ -89,7 +113,6 @@ def _plain(fit: Fit, frf: FrequencyResponse) -> str:
         )
     if kind == "no minimum":
         return "The fit found no best values, so that its numbers are not to be used."
-    ratio = np.sqrt(fit.chi_squared)
     if not fit.identifiable:
         lost = " and ".join(fit.verdict.undetermined)
         return (
@@ -100,7 +123,8 @@ def _plain(fit: Fit, frf: FrequencyResponse) -> str:
     if fit.chi_squared > MISFIT**2:
         return (
             f"The model follows the vehicle only roughly: it misses the measured response by "
-            f"{ratio:.1f} times its random error. The intervals of its parameters count that."
+            f"{np.sqrt(fit.chi_squared):.1f} times its random error. The intervals of its "
+            "parameters count that."
         )
     good = _good(frf)
     band = f" from {in_both(*_ends(frf, good))}" if good.any() else ""
@@ -142,69 +166,6 @@ def _loose(fit: Fit) -> list[int]:
     return [k for k, is_loose in enumerate(loose) if is_loose and fit.names[k] not in limits]
 
 
-def _can(fit: Fit, frf: FrequencyResponse, checks: Mapping[str, Verification]) -> list[str]:
-    good, answers = _good(frf), []
-    if good.any() and not _is_of_controller(frf):
-        error = float(np.median(np.asarray(frf.random_error)[good]))
-        answers.append(
-            f"How {', '.join(frf.output_names)} answers to {', '.join(frf.input_names)} from "
-            f"{in_both(*_ends(frf, good))}: to {100 * error:.2g} % of magnitude and "
-            f"{np.degrees(error):.2g} deg of phase (median standard error)."
-        )
-    if fit.verdict.fitted:
-        units = [
-            f" {unit}" if unit else "" for unit in fit.parameter_units or [""] * len(fit.names)
-        ]
-        answers += [
-            f"{name}: {fit.values[k]:.4g}{units[k]} \u00b1 {100 * _reach(fit, k):.2g} % (95 %)."
-            for k, name in enumerate(fit.names)
-            if fit.determined[k] and _reach(fit, k) <= _LOOSE
-        ]
-        answers += [
-            f"{one.name}: {one.value:.4g}{f' {one.unit}' if one.unit else ''}."
-            for one in fit.combinations
-        ]
-    answers += [
-        f"What happens in {name}: predicted, TIC {c.tic:.3f}."
-        for name, c in checks.items()
-        if c.tic < GOOD_TIC
-    ]
-    return answers or ["Nothing about this vehicle."]
-
-
-def _cannot(
-    fit: Fit,
-    frf: FrequencyResponse,
-    record: Record | None,
-    checks: Mapping[str, Verification],
-) -> list[str]:
-    omega, lacks = np.asarray(frf.omega), []
-    for k in _loose(fit) if fit.verdict.fitted else []:
-        name = fit.names[k]
-        reach = f"only to \u00b1 {100 * _reach(fit, k):.2g} % (95 %)"
-        lacks.append(f"{name}: {reach if fit.determined[k] else 'not by itself'}.")
-    if _is_of_controller(frf):
-        lacks.append(
-            f"How {', '.join(frf.output_names)} answers to {', '.join(frf.input_names)}: the "
-            "response is that of the controller, -1/C."
-        )
-    lacks += [f"The response from {in_both(*band)}: incoherent." for band in poor_bands(frf)]
-    lacks.append(f"Anything above {omega[-1] / (2 * np.pi):.3g} Hz: it was not estimated there.")
-    if record is not None and not record.reference_names:
-        lacks.append(
-            "How the closed loop follows its reference, and which part of the response is "
-            "feedback: no reference was recorded."
-        )
-    lacks += [
-        f"What happens in {name}: the model does not predict it, TIC {c.tic:.3f}."
-        for name, c in checks.items()
-        if not c.tic < GOOD_TIC
-    ]
-    if not checks:
-        lacks.append("Whether the model predicts another flight: no second log was simulated.")
-    return lacks
-
-
 def poor_bands(frf: FrequencyResponse) -> list[tuple[float, float]]:
     """Bands in rad/s of at least three neighbours whose coherence is below 0.6."""
     omega, bad = np.asarray(frf.omega), ~_good(frf)
@@ -214,17 +175,10 @@ def poor_bands(frf: FrequencyResponse) -> list[tuple[float, float]]:
 
 
 def next_flight(
-    fit: Fit,
-    frf: FrequencyResponse,
-    record: Record | None,
-    checks: Mapping[str, Verification],
+    fit: Fit, frf: FrequencyResponse, record: Record | None, checks: Mapping[str, Verification]
 ) -> Flight:
-    """The flight that answers most of what is open, from the fit's own numbers.
-
-    A loose parameter asks for the band in which it acts as no other does, and for an accuracy that
-    grows with amplitude and with the root of time. A poor band asks for the amplitude that brings
-    its coherence to 0.8. With every parameter known, a 3-2-1-1 verifies the model.
-    """
+    """The flight that answers most of what is open, from the fit's own numbers."""
+    # A poor band asks for the amplitude that brings its coherence to 0.8.
     omega, poor = np.asarray(frf.omega), []
     for low, high in poor_bands(frf):
         inside = (omega >= low) & (omega <= high)
@@ -235,14 +189,12 @@ def next_flight(
     usable = fit.verdict.kind in ("identifiable", "not identifiable")
     needs = _needs_of_parameters(fit, frf) if usable else poor
     if _is_of_controller(frf):
-        needs = [_Need(*_measured_band(frf), _LOUDER, _UNEXCITED)]
+        why = "the controller moved the input of this log; record what excites the axis, and name "
+        needs = [_Need(*_measured_band(frf), _LOUDER, f"{why}it as the reference")]
     if not fit.identifiable and not needs and not fit.verdict.remedies:
         low, high = _measured_band(frf)
-        needs = [
-            _Need(
-                low / 2, 2 * high, _LOUDER, "the band of this record does not determine the model"
-            )
-        ]
+        why = "the band of this record does not determine the model"
+        needs = [_Need(low / 2, 2 * high, _LOUDER, why)]
     if needs:
         return _sweep([*needs, *poor], frf, record)
     if not fit.identifiable and fit.verdict.remedies:
@@ -260,13 +212,25 @@ def next_flight(
     if checks:
         what = "None for this model: tune with it, then fly the tuned gains."
         return Flight(what, {}, [*(_sentence(need.why) for need in poor), *wished])
-    return _verification(frf, record, wished)
-
-
-_UNEXCITED = (
-    "the controller moved the input of this log; record what excites the axis, and name it as the "
-    "reference"
-)
+    # A 3-2-1-1 whose spectrum peaks in the middle of the band.
+    good = _good(frf)
+    low, high = _ends(frf, good) if good.any() else _measured_band(frf)
+    unit = three_two_one_one(width=1.0, amplitude=1.0, sample_rate=20.0)
+    width = float(np.sqrt(unit.omega_min * unit.omega_max / (low * high)))
+    source, text = _amplitude(frf, record, 1.0)
+    facts = {
+        "axis": f"{', '.join(frf.output_names)}, by {source}",
+        "pulses": f"3-2-1-1, the shortest pulse {width:.2g} s, so that it peaks at "
+        f"{np.sqrt(low * high) / (2 * np.pi):.2g} Hz",
+        "amplitude": text,
+        "seconds": f"{7 * width + 4:.2g}, rest before and after included",
+    }
+    what = (
+        f"A 3-2-1-1 on the channel {source} with a shortest pulse of {width:.2g} s, to verify the "
+        "model on a flight that it was not fitted to."
+    )
+    why = "The log determines this model: what is missing is a check."
+    return Flight(what, facts, [why, *wished])
 
 
 def _sentence(text: str) -> str:
@@ -274,6 +238,8 @@ def _sentence(text: str) -> str:
 
 
 def _needs_of_parameters(fit: Fit, frf: FrequencyResponse) -> list[_Need]:
+    """A loose parameter asks for the band in which it acts as no other does, and for an accuracy
+    that grows with amplitude and with the root of time."""
     loose = _loose(fit)
     if not loose:
         return []
@@ -377,25 +343,3 @@ def _amplitude(frf: FrequencyResponse, record: Record | None, louder: float) -> 
     if louder > 1:
         return name, f"{text} ({louder:.2g} times this record's; less if the motors saturate)"
     return name, f"{text} (as in this record)"
-
-
-def _verification(frf: FrequencyResponse, record: Record | None, wished: Sequence[str]) -> Flight:
-    """A 3-2-1-1 whose spectrum peaks in the middle of the band."""
-    good = _good(frf)
-    low, high = _ends(frf, good if good.any() else np.ones_like(good))
-    unit = three_two_one_one(width=1.0, amplitude=1.0, sample_rate=20.0)
-    width = float(np.sqrt(unit.omega_min * unit.omega_max / (low * high)))
-    source, text = _amplitude(frf, record, 1.0)
-    facts = {
-        "axis": f"{', '.join(frf.output_names)}, by {source}",
-        "pulses": f"3-2-1-1, the shortest pulse {width:.2g} s, so that it peaks at "
-        f"{np.sqrt(low * high) / (2 * np.pi):.2g} Hz",
-        "amplitude": text,
-        "seconds": f"{7 * width + 4:.2g}, rest before and after included",
-    }
-    what = (
-        f"A 3-2-1-1 on the channel {source} with a shortest pulse of {width:.2g} s, to verify the "
-        "model on a flight that it was not fitted to."
-    )
-    why = "The log determines this model: what is missing is a check."
-    return Flight(what, facts, [why, *wished])

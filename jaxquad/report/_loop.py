@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib.figure import Figure
 
+import jaxquad.spectra as spectra
 from jaxquad.identify import (
     as_sampled,
     behind_filters,
@@ -16,16 +17,9 @@ from jaxquad.identify import (
     with_values,
 )
 from jaxquad.models import Model
-from jaxquad.plot import plain_ticks, short_names, StepBand, steps_figure, unit_label
+from jaxquad.plot import add_hertz, plain_ticks, short_names, StepBand, steps_figure, unit_label
 from jaxquad.records import Record
-from jaxquad.spectra import (
-    BrokenLoop,
-    Entry,
-    estimate_broken_loop,
-    estimate_step,
-    FrequencyResponse,
-    StepResponse,
-)
+from jaxquad.spectra import BrokenLoop, Entry, FrequencyResponse, StepResponse
 
 from ._page import embed_figure, Section, Table
 
@@ -47,21 +41,17 @@ class Prediction(NamedTuple):
 
 
 def step_section(
-    fit: Fit,
-    frf: FrequencyResponse,
-    record: Record,
-    filters: Sequence[KnownFilter] = (),
+    fit: Fit, frf: FrequencyResponse, record: Record, filters: Sequence[KnownFilter] = (),
     computed: StepBand | None = None,
-) -> Section | None:
+) -> Section | None:  # fmt: skip
     """Measured and predicted step response; None without a reference or room for one.
 
-    The model is up to the input of the `filters`. What is `computed` from law and model is shown
-    where the log does not show a step.
+    What is `computed` from law and model is shown where the log does not show a step.
     """
     if not record.reference_names:
         return None
     try:
-        step = estimate_step(record, output=frf.output_names[0])
+        step = spectra.estimate_step(record, output=frf.output_names[0])
     except ValueError:
         return None
     (reference, output), image = step.names, None
@@ -69,15 +59,16 @@ def step_section(
     if not step.is_conclusive:
         if computed is not None:
             over = 100 * max(float(np.max(computed.middle)) - 1, 0.0)
-            image = embed_figure(
-                lambda: steps_figure({"law and model": computed}),
-                alt="Rate after a step of 1 of the set-point by law and model: overshoot "
-                f"{over:.0f} %.",
-                caption="The logged rate after a step of 1 of the set-point, computed from the law "
-                "of the log's parameters, with the integral as set, and the identified model: "
-                f"overshoot {over:.0f} %; median and 95 % of the plants that the log leaves "
-                "possible.",
+            caption = (
+                "The logged rate after a step of 1 of the set-point, computed from the law of the "
+                "log's parameters, with the integral as set, and the identified model: overshoot "
+                f"{over:.0f} %; median and 95 % of the plants that the log leaves possible."
             )
+            alt = (
+                f"Rate after a step of 1 of the set-point by law and model: overshoot {over:.0f} %."
+            )
+            draw = lambda: steps_figure({"law and model": computed})
+            image = embed_figure(draw, alt=alt, caption=caption)
         return head | {"image": None, "table": None, "notes": [], "computed": image}
     predicted = None
     if fit.verdict.fitted:
@@ -104,22 +95,51 @@ def step_section(
             "The model is driven by the flown inputs, so that no controller has to be known; in "
             "each window it may drift from the output. Its band counts its parameters, and gusts."
         )
-    return head | {"image": image, "table": _step_table(step, predicted), "notes": notes}
+    in_ms = lambda seconds: f"{1e3 * seconds:.3g}" if np.isfinite(seconds) else "not in the window"
+    final = lambda value, error: f"{value:.3g} \u00b1 {1.96 * error[-1]:.1g}"
+    heads, rows = ("", "measured"), [
+        ["rise time (10 to 90 %), ms", in_ms(step.rise_time)],
+        ["overshoot, %", f"{100 * step.overshoot:.2g}"],
+        ["settling time (5 %), ms", in_ms(step.settling_time)],
+        ["final value", final(step.final, step.standard_error)],
+    ]  # fmt: skip
+    if predicted is not None:
+        model, error = step._replace(mean=predicted.mean), predicted.error
+        # Over the measured final value, which is the sharper.
+        over = max(0.0, float(np.max(model.mean)) / step.final - 1)
+        last = f"{model.final:.3g}" if error is None else final(model.final, error)
+        cells = [in_ms(model.rise_time), f"{100 * over:.2g}", "\u2013", last]
+        heads += ("model",)
+        rows = [[*row, cell] for row, cell in zip(rows, cells, strict=True)]
+    table = Table("Step response (95 % intervals)", heads, rows)
+    return head | {"image": image, "table": table, "notes": notes}
 
 
 def predict_step(fit: Fit, frf: FrequencyResponse, record: Record) -> Prediction | None:
-    """What the model makes of the flown inputs, through the filter of the measured step.
+    """What the model makes of the flown inputs, through the filter of the measured step; None for
+    an unstable one, whose output says nothing."""
+    inputs = np.stack([record.channel(name) for name in frf.input_names], axis=1)
+    inputs -= inputs.mean(0)
 
-    No controller has to be known. None for an unstable model, whose output says nothing.
-    """
-    mean = _stepped(fit.model, frf, record)
+    def stepped(model: Model) -> tuple[Samples, Samples] | None:
+        """The simulated step with its error by the scatter between windows."""
+        driven, integrators = _driven(as_sampled(model, frf), inputs, record.dt)
+        if driven is None:
+            return None
+        output = frf.output_names[0]
+        step = spectra.estimate_step(record, output=output, simulated=driven, drift=integrators)
+        if step.simulated is None or step.simulated_error is None:
+            return None
+        return step.simulated, step.simulated_error
+
+    mean = stepped(fit.model)
     if mean is None or not np.all(np.isfinite(fit.covariance)) or not np.all(fit.standard_errors):
         return None if mean is None else Prediction(mean[0], None)
     places, slopes = fit.parameters.places[: len(fit.names)], []
     for k, error in enumerate(fit.standard_errors):
         values = np.array(fit.values, float)
         values[k] += _SMALL * error
-        moved = _stepped(with_values(fit.model, places, values), frf, record)
+        moved = stepped(with_values(fit.model, places, values))
         if moved is None:
             return Prediction(mean[0], None)
         slopes.append((moved[0] - mean[0]) / (_SMALL * error))
@@ -127,28 +147,11 @@ def predict_step(fit: Fit, frf: FrequencyResponse, record: Record) -> Prediction
     return Prediction(mean[0], np.sqrt(np.maximum(spread, 0.0) + mean[1] ** 2))
 
 
-def _stepped(
-    model: Model, frf: FrequencyResponse, record: Record
-) -> tuple[Samples, Samples] | None:
-    """The simulated step with its error by the scatter between windows."""
-    inputs = np.stack([record.channel(name) for name in frf.input_names], axis=1)
-    driven, integrators = _driven(as_sampled(model, frf), inputs - inputs.mean(0), record.dt)
-    if driven is None:
-        return None
-    step = estimate_step(record, output=frf.output_names[0], simulated=driven, drift=integrators)
-    if step.simulated is None or step.simulated_error is None:
-        return None
-    return step.simulated, step.simulated_error
-
-
 def _driven(
     model: Model, inputs: Float[np.ndarray, "flight inputs"], dt: float
 ) -> tuple[Float[np.ndarray, " flight"] | None, int]:
-    """The first output of a model at rest, None if it is unstable; and its integrators.
-
-    As many integrators as the response has at low frequencies are taken out of the spectrum, where
-    they are infinite, and are done in time.
-    """
+    """The first output of a model at rest, None if it is unstable; and its integrators, which are
+    taken out of the spectrum, where they are infinite, and are done in time."""
     count = len(inputs)
     size = 2 ** int(np.ceil(np.log2(_ROOM * count)))  # quick to transform
     omega = 2 * np.pi * np.fft.rfftfreq(size, dt)
@@ -204,26 +207,6 @@ def _draw_step(record: Record, step: StepResponse, predicted: Prediction | None)
     return figure
 
 
-def _step_table(step: StepResponse, predicted: Prediction | None) -> Table:
-    in_ms = lambda seconds: f"{1e3 * seconds:.3g}" if np.isfinite(seconds) else "not in the window"
-    final = lambda value, error: f"{value:.3g} \u00b1 {1.96 * error[-1]:.1g}"
-    rows = [
-        ["rise time (10 to 90 %), ms", in_ms(step.rise_time)],
-        ["overshoot, %", f"{100 * step.overshoot:.2g}"],
-        ["settling time (5 %), ms", in_ms(step.settling_time)],
-        ["final value", final(step.final, step.standard_error)],
-    ]
-    if predicted is None:
-        return Table("Step response (95 % intervals)", ("", "measured"), rows)
-    model, error = step._replace(mean=predicted.mean), predicted.error
-    # Over the measured final value, which is the sharper.
-    over = max(0.0, float(np.max(model.mean)) / step.final - 1)
-    cells = [in_ms(model.rise_time), f"{100 * over:.2g}", "\u2013"]
-    cells.append(f"{model.final:.3g}" if error is None else final(model.final, error))
-    both = [[*row, cell] for row, cell in zip(rows, cells, strict=True)]
-    return Table("Step response (95 % intervals)", ("", "measured", "model"), both)
-
-
 _FEWEST = 8  # frequencies of a loop that is shown
 _SIGMAS = 1.96
 _ALONE = "Estimated from the record alone, without plant or controller. It holds if "
@@ -239,18 +222,11 @@ _BY_LAW = (
 
 
 class LawLoop(NamedTuple):
-    """The flown loop where the law is known.
+    """The flown loop where the law is known."""
 
-    **Attributes:**
-
-    - `measured`: law times measured response of the plant; `model`: times the identified one.
-    - `step`: from set-point to rate, of plants that the fit leaves possible.
-    - `unmodelled`: what the law leaves out.
-    """
-
-    measured: BrokenLoop
-    model: BrokenLoop | None
-    step: StepBand | None
+    measured: BrokenLoop  # law times measured response of the plant
+    model: BrokenLoop | None  # law times the identified one
+    step: StepBand | None  # from set-point to rate, of plants that the fit leaves possible
     unmodelled: Sequence[str] = ()
 
     @property
@@ -263,10 +239,8 @@ class LawLoop(NamedTuple):
 def loop_section(
     frf: FrequencyResponse, record: Record, law: LawLoop | None = None
 ) -> Section | None:
-    """Bode diagram, crossover and margins, by the law where it is known.
-
-    Without it None where the units do not tell where the reference enters.
-    """
+    """Bode diagram, crossover and margins, by the law where it is known; without it None where the
+    units do not tell where the reference enters."""
     if law is not None and law.measured.omega.size >= _FEWEST:
         loop, model, note = law.measured, law.model, law.note
         origin = "the law times the plant's response"
@@ -274,14 +248,35 @@ def loop_section(
         entry = entry_of(record, frf)
         if entry is None:
             return None
-        loop = estimate_broken_loop(
+        loop = spectra.estimate_broken_loop(
             record, entry=entry, output=frf.output_names[0], input=frf.input_names[0]
         )
         if loop.omega.size < _FEWEST:
             return None
         model, note = None, _ASSUMED[entry]
         origin = f"from {record.reference_names[0]} as {entry}"
-    facts = _margins(loop, model)
+    # Margins that are not seen are those of the model, where there is one.
+    shown, crossover, by = loop, loop.crossover, ""
+    if model is not None and np.isnan(crossover):
+        shown, crossover, by = model, model.crossover, " by the identified model"
+    if np.isnan(crossover):
+        low, high = shown.omega[[0, -1]] / (2 * np.pi)
+        where = f"|L| does not fall through 1 from {low:.3g} to {high:.3g} Hz"
+        facts = {"crossover": f"not seen: {where}, where the loop can be estimated"}
+    else:
+        (margin, error), (gain, place), beyond = shown.phase_margin, shown.gain_margin, ""
+        if model is not None and not np.isfinite(gain):
+            (gain, place), beyond = model.gain_margin, " by the identified model"
+        sure = f" \u00b1 {np.degrees(_SIGMAS * error):.2g} deg (95 %)" if error else " deg"
+        lowest = "not seen: the phase does not pass -180 deg where the loop can be estimated"
+        if np.isfinite(gain):
+            lowest = f"{20 * np.log10(gain):.3g} dB at {place / (2 * np.pi):.3g} Hz "
+            lowest += f"({place:.3g} rad/s){beyond}; 6 dB or more is usual"
+        facts = {
+            "crossover": f"{crossover / (2 * np.pi):.3g} Hz ({crossover:.3g} rad/s){by}",
+            "phase margin": f"{np.degrees(margin):.3g}{sure}; 45 deg or more is usual",
+            "gain margin": lowest,
+        }
     image = embed_figure(
         lambda: _draw_loop(loop, model),
         alt=f"Bode diagram of the broken loop with its 95 % band; crossover {facts['crossover']}.",
@@ -300,34 +295,6 @@ def entry_of(record: Record, frf: FrequencyResponse) -> Entry | None:
         return None
     entries: dict[str, Entry] = {output: "set-point", source: "plant input"}
     return entries.get(unit)
-
-
-def _margins(loop: BrokenLoop, model: BrokenLoop | None) -> dict[str, str]:
-    """Those that are not seen are those of the model, where there is one."""
-    crossover, by = loop.crossover, ""
-    if model is not None and np.isnan(crossover):
-        loop, crossover, by = model, model.crossover, " by the identified model"
-    if np.isnan(crossover):
-        low, high = loop.omega[[0, -1]] / (2 * np.pi)
-        where = f"|L| does not fall through 1 from {low:.3g} to {high:.3g} Hz"
-        return {"crossover": f"not seen: {where}, where the loop can be estimated"}
-    margin, error = loop.phase_margin
-    gain, place = loop.gain_margin
-    beyond = ""
-    if model is not None and not np.isfinite(gain):
-        (gain, place), beyond = model.gain_margin, " by the identified model"
-    sure = f" \u00b1 {np.degrees(_SIGMAS * error):.2g} deg (95 %)" if error else " deg"
-    facts = {
-        "crossover": f"{crossover / (2 * np.pi):.3g} Hz ({crossover:.3g} rad/s){by}",
-        "phase margin": f"{np.degrees(margin):.3g}{sure}; 45 deg or more is usual",
-        "gain margin": "not seen: the phase does not pass -180 deg where the loop can be estimated",
-    }
-    if np.isfinite(gain):
-        facts["gain margin"] = (
-            f"{20 * np.log10(gain):.3g} dB at {place / (2 * np.pi):.3g} Hz ({place:.3g} rad/s)"
-            f"{beyond}; 6 dB or more is usual"
-        )
-    return facts
 
 
 def _draw_loop(loop: BrokenLoop, model: BrokenLoop | None) -> Figure:
@@ -354,11 +321,8 @@ def _draw_loop(loop: BrokenLoop, model: BrokenLoop | None) -> Figure:
     phase.axhline(-180, color="0.3", lw=0.8)
     level.set(ylabel="|L|, dB", xscale="log")
     phase.set(ylabel="phase of L, deg", xlabel="frequency, rad/s")
-    turns = (lambda omega: omega / (2 * np.pi), lambda hertz: 2 * np.pi * hertz)
-    hertz = level.secondary_xaxis("top", functions=turns)
-    hertz.set_xlabel("frequency, Hz")
-    for axis in (phase.xaxis, hertz.xaxis):
-        plain_ticks(axis)
+    plain_ticks(phase.xaxis)
+    add_hertz(level)
     return figure
 
 

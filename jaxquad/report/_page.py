@@ -24,7 +24,7 @@ from matplotlib.legend import Legend
 
 from jaxquad.plot import headless, Panels, visible
 
-from ._provenance import reason_of
+from ._results import reason_of
 
 
 class Cell(NamedTuple):
@@ -60,13 +60,9 @@ def _environment() -> Environment:
     # Control characters and overrides of the reading direction do not reach the page.
     show = lambda value: value if isinstance(value, Markup) else visible(str(value))
     environment = Environment(
-        loader=FileSystemLoader(_TEMPLATES),
-        autoescape=True,
-        finalize=show,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
+        loader=FileSystemLoader(_TEMPLATES), autoescape=True, finalize=show,
+        undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True,
+    )  # fmt: skip
     script = (_TEMPLATES / "figures.js").read_text(encoding="utf-8")
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
     environment.globals |= {"script": Markup(script), "script_digest": f"sha256-{digest}"}
@@ -109,13 +105,9 @@ class Image(NamedTuple):
 
 
 def embed_figure(
-    draw: Callable[[], Panels | Figure],
-    *,
-    alt: str,
-    caption: str = "",
-    ratio: tuple[str, str] | None = None,
-    is_map: bool = False,
-) -> Image:
+    draw: Callable[[], Panels | Figure], *, alt: str, caption: str = "",
+    ratio: tuple[str, str] | None = None, is_map: bool = False,
+) -> Image:  # fmt: skip
     """What `draw()` returns as an image. Texts in it are drawn as they are, dollar signs too.
 
     Where that cannot be drawn, the page says why in its place.

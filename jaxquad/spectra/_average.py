@@ -1,27 +1,55 @@
 """Responses, coherence and errors from windowed transforms of one or several window lengths."""
 
+import functools as ft
+import itertools
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Complex, Float
+from jaxtyping import Complex, Float
 
-from ._leakage import find_bias, power_of, Slopes, without_leakage
-from ._noise import noise_root
+from jaxquad._core import one_blas_thread
+from jaxquad.records import Record
+
+from ._error_covariance import ErrorCovariance, place_windows, window_products
+from ._estimators import (
+    adjoint,
+    check_excitation,
+    Composite,
+    diagonal,
+    Grid,
+    in_hertz,
+    Method,
+    Pairs,
+    power_of,
+    Remark,
+    Responses,
+    Welch,
+)
+from ._fourier_sums import coefficients
+from ._frequency_response import Estimate
+from ._noise import covariance_of_windows, noise_root, padded, Resolved, smoothed, without_leakage
+from ._welch import frequencies_for, transform_records
 
 
+_ROUNDING = 1e-14  # of a Fourier sum, relative to the largest value summed
+_CORRELATED = 0.5  # average coherence of inputs above which Tischler & Remple, ch. 9, warn
+_LOST = 0.9999
+_LEAKED = 3.0  # bias over random error, averaged over a third of an octave, that is remarked
+_AVERAGED = 0.2  # in ln(omega)
+_FEW = (
+    "only {count:.1f} independent windows: the coherence is near 1 for any signals, and the error "
+    "bars are rough. Record longer, or use a shorter window"
+)
 _TINY = 1e-300
-_ROUNDING = 1e-15
 _COHERENCE_WEIGHT = 5.0
 _STEPS = 5  # of Gauss-Newton; each gains two digits or more
 _DEPENDENT = 1e-4  # share of an input's power below which it cannot be separated from the others
+_CYCLES = 2.0  # in a window, below which leakage outweighs what more averages gain
 
-Pairs = Float[np.ndarray, "frequencies outputs inputs"]
-Responses = Complex[np.ndarray, "frequencies outputs inputs"]
+Shares = Float[np.ndarray, "frequencies outputs inputs groups"]
 Products = Complex[np.ndarray, "groups frequencies channels channels"]
-Matrices = Complex[np.ndarray, "groups frequencies n n"]
 Counts = Float[np.ndarray, " groups"]
-Resolved = Bool[np.ndarray, "groups frequencies"]
 _Powers = Float[np.ndarray, "*groups frequencies inputs"]
 _Pairs = Float[np.ndarray, "*groups frequencies outputs inputs"]
 
@@ -54,89 +82,63 @@ class Conditioned(NamedTuple):
 
 
 def condition(products: Products, channels: Channels, counts: Counts) -> Conditioned:
-    """`(Z* X)^-1 Z* Y` from the sums of `conj(a) b` over so many windows of each length.
+    """`(Z* X)^-1 Z* Y` from sums of `conj(a) b` (Bendat, Piersol ch. 7; Tischler, Remple ch. 9)."""
 
-    With two inputs and instruments z = x, this is the closed form of the textbook.
-    Source: Bendat & Piersol, ch. 7; Tischler & Remple, ch. 9.
-    """
+    def inverse(matrix: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
+        """That of matrices in any units, which `rows` and `columns` are."""
+        if matrix.shape[-1] == 1:
+            return 1 / matrix
+        units = columns[..., :, None] * rows[..., None, :]
+        scaled = matrix / np.swapaxes(units, 2, 3)
+        try:
+            return np.linalg.inv(scaled) / units
+        except np.linalg.LinAlgError:  # One of many is singular to the last digit: make it huge.
+            return np.linalg.inv(scaled + 1e-15 * np.eye(matrix.shape[-1])) / units
+
     z, x, y = channels.split(np.arange(products.shape[-1]))
-    power = _diagonal(products)
+    power = diagonal(products)
     size = np.sqrt(np.maximum(power, _TINY))
     from_z = products[:, :, z]
-    solver = _inverse(from_z[..., x], size[..., z], size[..., x])
+    solver = inverse(from_z[..., x], size[..., z], size[..., x])
     response = np.swapaxes(solver @ from_z[..., y], 2, 3)
     # What the instruments move of the inputs, and the diagonal of its inverse.
     if channels.instruments:
-        inverted = solver @ from_z[..., z] @ np.conj(np.swapaxes(solver, 2, 3))
-        least = np.maximum(_diagonal(inverted), _TINY)
-        moving = _inverse(inverted, np.sqrt(least), np.sqrt(least))
+        inverted = solver @ from_z[..., z] @ adjoint(solver)
+        least = np.maximum(diagonal(inverted), _TINY)
+        moving = inverse(inverted, np.sqrt(least), np.sqrt(least))
     else:  # Rounding may make what is singular negative.
-        least, moving = np.maximum(np.abs(_diagonal(solver)), _TINY), from_z[..., x]
+        least, moving = np.maximum(np.abs(diagonal(solver)), _TINY), from_z[..., x]
     explained = np.sum(np.conj(response) * (response @ np.swapaxes(moving, 2, 3)), axis=3).real
     total = power[..., y]
     through = power_of(response) / least[:, :, None]
     rest = np.maximum(total - explained, 0.0)
     answer = rest[..., None] + through
     count = counts[:, None, None]
+    share = 1 / (least * np.maximum(diagonal(moving), _TINY))
+    moved = np.minimum(diagonal(moving) / np.maximum(power[..., x], _TINY), 1.0)
+    multiple = np.clip(1 - rest / np.maximum(total, _TINY), 0.0, 1.0)
     return Conditioned(
-        response,
-        solver,
-        1 / (least * count),
-        1 / (least * np.maximum(_diagonal(moving), _TINY)),
-        answer / count[..., None],
-        through / np.maximum(answer, _TINY),
-        np.minimum(_diagonal(moving) / np.maximum(power[..., x], _TINY), 1.0),
-        np.clip(1 - rest / np.maximum(total, _TINY), 0.0, 1.0),
-    )
-
-
-def _inverse(
-    matrix: Matrices,
-    rows: Float[np.ndarray, "groups frequencies n"],
-    columns: Float[np.ndarray, "groups frequencies n"],
-) -> Matrices:
-    """That of matrices in any units, which `rows` and `columns` are."""
-    if matrix.shape[-1] == 1:
-        return 1 / matrix
-    units = columns[..., :, None] * rows[..., None, :]
-    scaled = matrix / np.swapaxes(units, 2, 3)
-    try:
-        return np.linalg.inv(scaled) / units
-    except np.linalg.LinAlgError:  # One of many is singular to the last digit: make it huge.
-        return np.linalg.inv(scaled + _ROUNDING * np.eye(matrix.shape[-1])) / units
-
-
-def _diagonal(
-    matrix: Complex[np.ndarray, "*batch rows rows"],
-) -> Float[np.ndarray, "*batch rows"]:
-    return np.real(np.diagonal(matrix, axis1=-2, axis2=-1))
+        response, solver, 1 / (least * count), share, answer / count[..., None],
+        through / np.maximum(answer, _TINY), moved, multiple,
+    )  # fmt: skip
 
 
 class Combined(NamedTuple):
     response: Responses
     coherence: Pairs
-    share: Float[np.ndarray, "frequencies outputs inputs groups"]  # of each length in the response
-
-
-def single_length(part: Conditioned) -> Combined:
-    """The response of one window length, without a combination."""
-    response, coherence = part.response[0], part.coherence[0]
-    lesser = np.minimum(coherence, part.instrument_share[0][:, None, :])
-    return Combined(response, lesser, np.ones((*response.shape, 1)))
+    share: Shares  # of each length in the response
 
 
 def combine(parts: Conditioned, scales: Counts, freedom: Counts, resolved: Resolved) -> Combined:
-    """Weight spectra of several window lengths by (eps_i / eps_min)^-4 and fit one set to them.
+    """Weight spectra of several window lengths by W_i = (eps_i / eps_min)^-4 and fit one set to
+    them.
 
-    `scales` turn powers into densities, `freedom` are the independent windows less the inputs
-    that share them, and eps = sqrt(1 - g^2) / (|g| sqrt(2 freedom)); `resolved` says where a window
-    holds enough cycles. The cost is
+    The cost (Tischler & Remple eq. 10.4), each part relative to its mean under W_i^2 (G_xx~ ...),
+    is
 
         sum_i W_i {(G_xx - G_xx,i)^2 + (G_yy - G_yy,i)^2 + |G_xy - G_xy,i|^2 + 5 (g^2 - g_i^2)^2}
 
-    each part relative to its mean under W_i^2 (G_xx~ and so on). |G_xy~| stands for the textbook's
-    Re G_xy~ and Im G_xy~, one of which may be zero. Only weighted means of the spectra enter, and
-    the phase is that of the mean. Source: Tischler & Remple eq. 10.4.
+    with |G_xy~| for Re G_xy~ and Im G_xy~, one of which may be zero. The phase is that of the mean.
     """
     averages = 2 * freedom[:, None, None, None]
     error = (1 - parts.coherence + 1e-12) / (np.maximum(parts.coherence, 1e-12) * averages)
@@ -157,7 +159,16 @@ def combine(parts: Conditioned, scales: Counts, freedom: Counts, resolved: Resol
         np.sum(mean * parts.coherence, axis=0) / gg,
     ])  # fmt: skip
     level = xy**2 / (xx * yy)
-    a, b, r = _fit_spectra(targets, level / gg)
+    # Minimise (a - a0)^2 + (b - b0)^2 + (r - r0)^2 + 5 (level r^2 / (a b) - q0)^2.
+    u, level_q = targets[:3], level / gg
+    for _ in range(_STEPS):
+        q = level_q * u[2] ** 2 / (u[0] * u[1])
+        slopes = np.stack([-q / u[0], -q / u[1], 2 * q / u[2]])
+        # Normal equations of identity plus one rank, by Sherman and Morrison.
+        norm, away = np.sum(slopes**2, axis=0), np.sum((targets[:3] - u) * slopes, axis=0)
+        correction = _COHERENCE_WEIGHT * (targets[3] - q - away) / (1 + _COHERENCE_WEIGHT * norm)
+        u = targets[:3] + correction[None] * slopes
+    a, b, r = u
     moved = np.sum(mean * parts.instrument_share[:, :, None, :], axis=0)
     share = mean * gain / np.sum(mean * gain, axis=0, keepdims=True)
     return Combined(
@@ -167,63 +178,55 @@ def combine(parts: Conditioned, scales: Counts, freedom: Counts, resolved: Resol
     )
 
 
-def _fit_spectra(
-    targets: Float[np.ndarray, "4 frequencies outputs inputs"], level: Pairs
-) -> Float[np.ndarray, "3 frequencies outputs inputs"]:
-    """Minimise (a - a0)^2 + (b - b0)^2 + (r - r0)^2 + 5 (level r^2 / (a b) - q0)^2."""
-    start, q0 = targets[:3], targets[3]
-    u = start
-    for _ in range(_STEPS):
-        q = level * u[2] ** 2 / (u[0] * u[1])
-        slopes = np.stack([-q / u[0], -q / u[1], 2 * q / u[2]])
-        # Normal equations of identity plus one rank, by Sherman and Morrison.
-        norm, away = np.sum(slopes**2, axis=0), np.sum((start - u) * slopes, axis=0)
-        correction = _COHERENCE_WEIGHT * (q0 - q - away) / (1 + _COHERENCE_WEIGHT * norm)
-        u = start + correction[None] * slopes
-    return u
-
-
-# What leakage adds to the response, relative, and the standard error of that.
-Leakage = Float[np.ndarray, "2 frequencies outputs inputs"]
-
-
-class Averaged(NamedTuple):
-    response: Responses
-    coherence: Pairs
-    random_error: Pairs
-    direct_coherence: Pairs
-    multiple_coherence: Float[np.ndarray, "frequencies outputs"]
-    alone: Float[np.ndarray, "frequencies inputs"]  # share of an input's power, nan without any
-    effect: Complex[np.ndarray, "frequencies inputs windows"]
-    share: Float[np.ndarray, "frequencies outputs inputs groups"]
-    noise: Complex[np.ndarray, "frequencies outputs roots"]
-    freedom: Float[np.ndarray, "frequencies outputs groups"]  # complex, of each length's noise
-    leakage: Callable[[], Leakage]  # computed where it is asked for
-
-
+@one_blas_thread()
 @np.errstate(divide="ignore", invalid="ignore", over="ignore")
-def average(
-    transforms: tuple[Complex[np.ndarray, "frequencies _ channels"], ...],
-    sums: Products,
-    slopes: tuple[Slopes, ...],
-    channels: Channels,
-    omega: Float[np.ndarray, " frequencies"],
-    overlap: Float[np.ndarray, "windows windows"],
-    scales: Counts,
-    resolved: Resolved,
-    averages: Counts,
-) -> Averaged:
-    """One response from all window lengths, with the effect of noise in each window.
-
-    `sums` are those of the products of `transforms` over windows, `averages` the independent
-    windows of each length less the inputs, and `slopes` the transforms behind the derivatives of
-    the windows.
-    """
-    many = tuple(part.shape[1] for part in transforms)
-    counts = np.array(many, float)
+def average_windows(
+    records: Sequence[Record], omega: Grid | None, spectra: Welch | Composite, method: Method
+) -> Estimate:
+    """Response by averages over tapered windows of one or several lengths."""
+    single = isinstance(spectra, Welch)
+    members = (spectra,) if single else spectra.windowed(records, omega)
+    omega, welch = frequencies_for(omega, records, members[0]), members[0]
+    segments = transform_records(records, omega, members, derivatives=2)
+    first, dt, groups = records[0], records[0].dt, segments.groups
+    instruments = len(first.reference_names) if method == "joint" else 0
+    channels = Channels(len(first.input_names), len(first.output_names), instruments)
+    lengths, starts = zip(*groups, strict=True)
+    many = tuple(map(len, starts))
+    independent = sum(record.samples for record in records) / np.array(lengths)  # n_d
+    sums = np.stack([adjoint(part) @ part for part in segments.transforms])
+    for count, windows in zip(independent, many, strict=True):
+        if windows <= channels.inputs or count < channels.inputs:
+            raise ValueError(
+                f"{count:.1f} independent windows are too few for {channels.inputs} inputs: use "
+                f"a window shorter than 1/{channels.inputs + 2} of the record, or record longer"
+            )
+    # Mean power of the inputs and of the instruments, in the longest windows.
+    power = diagonal(sums[0]) / many[0]
+    largest = check_excitation(records, method)
+    for name in first.input_names + first.reference_names[:instruments]:
+        place = first.names.index(name)
+        least = _ROUNDING * coefficients(welch.shape)[0] * welch.length(records) * largest[place]
+        lost = np.flatnonzero(~(np.sqrt(power[:, place]) > least))
+        if lost.size:
+            raise ValueError(
+                f"no excitation at {in_hertz(omega[lost[:1]])}: the spectrum of {name!r} is zero "
+                "there. Keep the frequencies within the band that was excited"
+            )
+    transforms, counts = segments.transforms, np.array(many, float)
+    overlap = window_products(groups, welch.shape)
+    averages = np.maximum(independent - channels.inputs + 1, 0.5)
+    level, cosine = coefficients(welch.shape)
+    scales = 2 * dt / ((level**2 + cosine**2 / 2) * np.array(lengths))  # to one-sided densities
+    resolving = np.array([np.inf, *lengths[1:]])  # the longest window is used everywhere
+    resolved = (omega * dt)[None, :] * resolving[:, None] >= 2 * np.pi * _CYCLES
     parts = condition(sums, channels, counts)
-    combined = combine(parts, scales, averages, resolved) if len(many) > 1 else single_length(parts)
-    alone = np.einsum("fig,gfi->fi", np.mean(combined.share, axis=1), parts.alone)
+    if len(many) > 1:
+        response, coherence, share = combine(parts, scales, averages, resolved)
+    else:
+        response, moved = parts.response[0], parts.instrument_share[0][:, None, :]
+        coherence, share = np.minimum(parts.coherence[0], moved), np.ones((*response.shape, 1))
+    alone = np.einsum("fig,gfi->fi", np.mean(share, axis=1), parts.alone)
     inseparable = ~(alone >= _DEPENDENT)
     lost = np.any(inseparable, axis=1)
     if np.any(lost):  # finite placeholders, which are marked as nan below
@@ -232,72 +235,107 @@ def average(
         multiple = np.where(lost[:, None], 0.0, multiple)
         parts = parts._replace(solver=solver, multiple=multiple)
         equal = (resolved / np.sum(resolved, axis=0)).T[:, None, None]
-        combined = Combined(
-            np.where(gone, 1e-300, combined.response),
-            np.where(gone, 0.0, combined.coherence),
-            np.where(gone[..., None], equal, combined.share),
-        )
-    instruments = [np.conj(np.swapaxes(channels.split(part)[0], 1, 2)) for part in transforms]
-    pairs = zip(parts.solver, instruments, strict=True)
-    effect = np.concatenate([solver @ part for solver, part in pairs], axis=2)
-    gain = _unit_noise(effect, combined.share, overlap, many)
+        response, coherence = np.where(gone, 1e-300, response), np.where(gone, 0.0, coherence)
+        share = np.where(gone[..., None], equal, share)
+    instruments = [adjoint(channels.split(part)[0]) for part in transforms]
+    effect = np.concatenate(list(map(np.matmul, parts.solver, instruments)), axis=2)
+    # Variance of the responses under noise of unit power: pair of lengths by pair, since their
+    # shares differ between outputs.
+    begins, gain = np.cumsum((0, *many[:-1])), np.zeros(share.shape[:3])
+    rows = effect.reshape(-1, len(overlap))
+    rows = np.concatenate([np.real(rows), np.imag(rows)])
+    for g, (start, end) in enumerate(zip(begins, (*begins[1:], len(overlap)), strict=True)):
+        products = (rows[:, start:end] @ overlap[start:end, start:]) * rows[:, start:]
+        both = np.add.reduceat(products, begins[g:] - start, axis=1)
+        pairs = np.sum(both.reshape(2, *effect.shape[:2], -1), axis=0)
+        pairs[..., 1:] *= 2.0  # each pair of lengths once
+        gain += share[..., g] * np.einsum("fih,foih->foi", pairs, share[..., g:])
     windows = [channels.split(part)[1:] for part in transforms]
-    rest = without_leakage(windows, combined.response, slopes, overlap, resolved)
-    weights = np.mean(combined.share, axis=2)
+    rest = without_leakage(windows, response, segments.slopes, overlap, resolved)
+    weights = np.mean(share, axis=2)
     trust = np.where(lost, 1e-9, 1.0)[:, None, None]
-    outputs = np.moveaxis(channels.split(_diagonal(sums))[2], 0, 2)
+    outputs = np.moveaxis(channels.split(diagonal(sums))[2], 0, 2)
     noise = noise_root(omega, rest, outputs, weights * trust)
     power = np.sum(power_of(noise), axis=2)
-    error = np.sqrt(power[:, :, None] * gain / 2) / np.abs(combined.response)
-    response, coherence, direct = combined.response, combined.coherence, combined.coherence
+    error = np.sqrt(power[:, :, None] * gain / 2) / np.abs(response)
+    direct, finite = coherence, response
     if channels.instruments:  # partial coherence of inputs and outputs, without the instruments
         plain = condition(sums, channels._replace(instruments=0), counts).coherence
-        direct = np.einsum("foig,gfoi->foi", combined.share, plain)
+        direct = np.einsum("foig,gfoi->foi", share, plain)
     if np.any(lost):
         none = (response, np.nan), (coherence, 0.0), (error, np.inf)
         mask = inseparable[:, None, :]
         response, coherence, error = (np.where(mask, blank, field) for field, blank in none)
 
-    def leakage() -> Leakage:
-        bias, square = find_bias(rest.fits, *combined.response.shape[1:])
-        added = np.abs(np.sum(bias * combined.share, axis=3))
-        spread = np.sum(combined.share * np.sqrt(square), axis=3)
+    def leakage() -> Float[np.ndarray, "2 frequencies outputs inputs"]:
+        biases = [fit.bias(*finite.shape[1:]) for fit in rest.fits]
+        bias, square = (padded(part, omega.size) for part in zip(*biases, strict=True))
+        added = np.abs(np.sum(bias * share, axis=3))
+        spread = np.sum(share * np.sqrt(square), axis=3)
         doubt = np.sqrt(power / 2)[:, :, None] * spread
         with np.errstate(divide="ignore", invalid="ignore"):
-            return np.stack([added, doubt]) / np.abs(combined.response)
+            return np.stack([added, doubt]) / np.abs(finite)
 
-    return Averaged(
-        response,
-        coherence,
-        error,
-        direct,
-        np.einsum("fog,gfo->fo", weights, parts.multiple),
-        alone,
-        effect,
-        combined.share,
-        noise,
-        rest.freedom,
-        leakage,
-    )
+    multiple = np.einsum("fog,gfo->fo", weights, parts.multiple)
+    weights, freedom = np.mean(weights, axis=1), np.mean(rest.freedom, axis=1)
+    levels = weights / np.sqrt(freedom)
+    log_noise = covariance_of_windows(omega * dt, levels, welch.shape, lengths)
+    log_noise = smoothed(omega, log_noise, np.sum(weights * freedom, axis=1))
+    placement = place_windows(groups, welch.shape, dt, omega[-1] - omega[0])
+    errors = ErrorCovariance(omega, effect, noise, share, placement, many)
+    most = float(np.max(independent))
+    return Estimate(
+        omega, response, coherence, direct, multiple, errors, error, log_noise,
+        ft.partial(_remarks, first, omega, error, alone, leakage, most),
+        resolution=2 * np.pi / (lengths[0] * dt),
+    )  # fmt: skip
 
 
-def _unit_noise(
-    effect: Complex[np.ndarray, "frequencies inputs windows"],
-    share: Float[np.ndarray, "frequencies outputs inputs groups"],
-    overlap: Float[np.ndarray, "windows windows"],
-    counts: Sequence[int],
-) -> Pairs:
-    """Variance of the responses under noise of unit power.
-
-    Sums over windows are taken pair of groups by pair, since the shares differ between outputs.
-    """
-    first = np.cumsum((0, *counts[:-1]))
-    ends, rows = (*first[1:], len(overlap)), effect.reshape(-1, len(overlap))
-    parts, total = np.concatenate([np.real(rows), np.imag(rows)]), np.zeros(share.shape[:3])
-    for g, (start, end) in enumerate(zip(first, ends, strict=True)):
-        products = (parts[:, start:end] @ overlap[start:end, start:]) * parts[:, start:]
-        both = np.add.reduceat(products, first[g:] - start, axis=1)
-        pairs = np.sum(both.reshape(2, *effect.shape[:2], -1), axis=0)
-        pairs[..., 1:] *= 2.0  # each pair of lengths once
-        total += share[..., g] * np.einsum("fih,foih->foi", pairs, share[..., g:])
-    return total
+def _remarks(
+    record: Record,
+    omega: Grid,
+    error: Pairs,
+    alone: Float[np.ndarray, "frequencies inputs"],
+    leakage: Callable[[], Float[np.ndarray, "2 frequencies outputs inputs"]],
+    independent: float,
+) -> tuple[Remark, ...]:
+    """On inputs that are alike, on leakage with its standard error, and on few windows."""
+    remarks, names = [], record.input_names
+    coherence = 1 - np.nan_to_num(alone)  # of each input with all others
+    for i, name in enumerate(names if len(names) > 1 else ()):
+        lost = coherence[:, i] > _LOST
+        if np.any(lost):
+            text = (
+                f"input {name} cannot be separated from the other inputs {{where}}; they are left "
+                "out. Excite the inputs independently, one after the other or with interleaved "
+                "multisines"
+            )
+            remarks.append(Remark(text, omega[lost], kind="undetermined"))
+        elif np.mean(coherence[:, i]) > _CORRELATED:
+            text = (
+                f"input {name} is correlated with the other inputs: their average coherence is "
+                f"{coherence[:, i].mean():.2f} (limit {_CORRELATED}), so the errors of conditioned "
+                f"responses are larger. Excite the inputs independently"
+            )
+            remarks.append(Remark(text, kind="correlated inputs"))
+    # Pairs whose response leakage biases, clearly and beyond the random error.
+    kernel = np.exp(-0.5 * (np.log(omega[:, None] / omega) / _AVERAGED) ** 2)
+    bias, doubt = leakage()
+    least = np.maximum(doubt, error)
+    with np.errstate(invalid="ignore"):
+        ratio = np.where(np.isfinite(least) & np.isfinite(bias), bias / least, 0.0)
+    for (o, output), (i, source) in itertools.product(
+        enumerate(record.output_names), enumerate(names)
+    ):
+        leaked = kernel @ ratio[:, o, i] ** 2 > _LEAKED**2 * np.sum(kernel, axis=1)
+        if np.any(leaked):
+            text = (
+                f"leakage through the window biases the response by about "
+                f"{100 * np.median(bias[leaked, o, i]):.2g} % {{where}}; the random error does not "
+                "include it. Use «jq.spectra.LocalPolynomial()», which estimates leakage, a longer "
+                "window, or «integrators=» where the plant integrates"
+            )
+            remarks.append(Remark(text, omega[leaked], (output, source), "leakage"))
+    if independent < 3:
+        remarks.append(Remark(_FEW.format(count=independent), kind="few windows"))
+    return tuple(remarks)

@@ -2,30 +2,42 @@
 
 import dataclasses
 import re
-from collections.abc import Mapping
+import warnings
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from jaxquad._core import announce, Message
+import numpy as np
+
+from jaxquad._core import announce, marked_text, Message
 from jaxquad.autopilot import (
     ADRCAutopilot,
+    ADRCTargets,
     AutopilotProposal,
     AxesProposal,
-    best_filters,
-    check_law,
+    betaflight_adrc_loop,
+    betaflight_loop,
     check_loop,
     design_gains,
+    doubted_throttle,
+    FilterChain,
     firmware_named,
-    FlightChannels,
+    Flown,
+    FlownADRC,
     FlownAutopilot,
+    HOVER,
+    propose_adrc,
     read_channels_if_any,
     read_flown,
+    reproduce_flight,
+    Reproduction,
     settings_of,
     study_throttle,
 )
-from jaxquad.records import AXES, Proposal
+from jaxquad.identify import gain_over_throttle, GainOverThrottle, UndeterminedError
+from jaxquad.records import AXES, Proposal, RecordError, RecordWarning
+from jaxquad.spectra import frequency_response, JointInputOutput, LocalPolynomial
 
-from ._autopilot_adrc import flew_adrc, tune_adrc
 from ._identify import identify_plant
 from ._log import propose_settings, read_records
 from ._options import SettingsError
@@ -71,11 +83,17 @@ def autopilot(
     """
     path, settings = Path(path), settings or AutopilotSettings()
     record, proposal = _channels_of(path, settings)
-    adrc = flew_adrc(path, proposal)
+    firmware = firmware_named(proposal.vehicle)
+    adrc = firmware.has_adrc and firmware.flies_adrc(settings_of(path, proposal).values)
     if adrc and settings.law == "pid":
         raise SettingsError(f"`law` is pid, but the ADRC flew {path} (pid_type): leave it out")
     if adrc or settings.law == "adrc":
-        return tune_adrc(path, record, proposal, settings)
+        if not firmware.has_adrc:
+            raise SettingsError(
+                "`law` is adrc, which is proposed for Betaflight alone (its pull request 15400), "
+                f"and {path} is a log of {proposal.vehicle}: leave it out"
+            )
+        return _tune_adrc(path, record, proposal, settings, adrc)
     if settings.axis != "all":
         return _tune_axis(_read_axis(path, settings), {})
     number = re.match(r"log(\d+)\.", proposal.setup.rate)
@@ -121,51 +139,35 @@ class _ReadAxis(NamedTuple):
     record: IdentifySettings
     proposal: Proposal
     flown: FlownAutopilot
-    flight: FlightChannels | None
 
 
 def _read_axis(path: Path, settings: AutopilotSettings) -> _ReadAxis:
-    """The loop that flew, at the throttle of the log, and the channels beside the record's."""
     announce("gains and filters that flew")
     record, proposal = _channels_of(path, settings)
-    flight = read_channels_if_any(path, proposal, record, settings_of(path, proposal).values)
-    throttle = settings.throttle
-    if throttle is None and flight is not None:
-        throttle = flight.middle
-    flown = read_flown(path, proposal, throttle, {} if flight is None else flight.tracked_hz)
-    chains = tuple(chain for chain in flown.law.gyro_chains() if chain.filters)
-    filters, text = best_filters(chains, flown.unmodelled, flight, flown.axis)
-    flown = dataclasses.replace(flown, filters=filters, filters_text=text)
-    return _ReadAxis(path, settings, record, proposal, flown, flight)
+    flown = read_flown(path, proposal, record, settings.throttle)
+    return _ReadAxis(path, settings, record, proposal, flown)
 
 
 def _tune_axis(axis: _ReadAxis, filters: Mapping[str, float]) -> AutopilotProposal:
     """The gains of one axis, with `filters` that are changed already."""
-    path, settings, record, proposal, flown, flight = axis
+    path, settings, record, proposal, flown = axis
     plant = identify_plant(path, record, proposal, flown.filters)
-    result = (settings, plant, flown)
-    unsure = lambda why, again: AutopilotProposal("cannot tell", why, *result, again, flight=flight)
+    unsure = lambda why, again: AutopilotProposal("cannot tell", why, settings, plant, flown, again)
     recipe = firmware_named(flown.firmware).what_to_fly(AXES[flown.axis])
     if not plant.fit.identifiable:
         summary = plant.fit.verdict.summary
         return unsure(Message(f"this log cannot tell: «plant|{summary}». {recipe}"), None)
-    if flight is None:
+    if flown.flight is None:
         return unsure(_NO_SETPOINT, None)
     announce("the flown loop again")
-    law = check_law(flown.loop, flown.axis, flight)
-    again = check_loop(plant, flown, flight, law)
+    again = check_loop(plant, flown)
     if again.kind == "unknown":
         return unsure(f"this log cannot tell: {again.verdict}. {recipe}", again)
     if again.kind != "flown":
         return unsure(f"this log cannot tell: {again.verdict}", again)
     read = lambda inputs: read_records(path, plant.settings, further_inputs=inputs)
     throttle = study_throttle(plant, proposal, flown, read)
-    design = design_gains(settings, plant, flown, flight, throttle, filters)
-    return AutopilotProposal(
-        design.kind, design.verdict, *result, again, design.stages,
-        design.new if design.kind == "proposed" else {}, design.filters, design.noise, flight,
-        throttle,
-    )  # fmt: skip
+    return design_gains(dataclasses.replace(unsure("", again), throttle=throttle), filters)
 
 
 _NO_SETPOINT = (
@@ -184,3 +186,104 @@ def _channels_of(path: Path, settings: AutopilotSettings) -> tuple[IdentifySetti
     if proposal is None:
         raise SettingsError(f"{path} proposes no channels: give the log of an autopilot")
     return complete, proposal
+
+
+def _tune_adrc(
+    path: Path, record: IdentifySettings, proposal: Proposal, settings: AutopilotSettings,
+    flew_adrc: bool,
+) -> ADRCAutopilot:  # fmt: skip
+    """What `autopilot` does for the ADRC, from what the log proposes as channels."""
+    announce("gains and filters that flew")
+    logged = settings_of(path, proposal)
+    flight = read_channels_if_any(path, proposal, record, logged.values)
+    middle = settings.throttle or (None if flight is None else flight.middle) or HOVER
+    read = betaflight_adrc_loop if flew_adrc else betaflight_loop
+    flown = read(logged.values, logged.version, throttle=middle)
+    if isinstance(flown, FlownADRC) and settings.hover is not None:
+        hover = flown.schedule.hover
+        if abs(settings.hover - hover) > 0.005:
+            raise SettingsError(
+                f"`hover` is {settings.hover:g}, but the ADRC that flew has an adrc_hover_throttle "
+                f"of {100 * hover:.0f} %, which stays: leave it out"
+            )
+    result = ADRCAutopilot(
+        "cannot tell", "", settings, path, proposal.setup.axis, tuple(logged.version),
+        logged.values, flown, flight=flight,
+    )  # fmt: skip
+    if not proposal.setup.throttle:
+        raise RecordError(
+            f"{path} holds no throttle (setpoint[3]), which the ADRC needs: log the set-points"
+        )
+    chains = [x for x in flown.at(middle).gyro_chains() if x.filters]
+    with warnings.catch_warnings():  # the throttle is slow, or rests
+        warnings.simplefilter("ignore", RecordWarning)
+        throttle = {"throttle": dict(proposal.setup.throttle)}
+        records = list(read_records(path, record, further_inputs=throttle))
+    announce("the gain over the throttle")
+    low, high = settings.band or (0.0, 0.0)
+    band = None if settings.band is None else (2 * np.pi * low, 2 * np.pi * high)
+    unsure = lambda error: dataclasses.replace(
+        result, verdict=Message(f"this log cannot tell: {marked_text(error)}")
+    )
+    try:
+        plant = gain_over_throttle(records, filters=chains, band=band)
+    except ValueError as error:  # says what to fly
+        return unsure(error)
+    result = dataclasses.replace(result, plant=plant)
+    try:
+        plant.b0(0)  # raises where the lag is not determined
+        announce("the flown loop again")
+        again = {
+            float(x): _reproduced(path, record, plant, flown, level, chains)
+            for level, x in enumerate(plant.throttle)
+        }
+        result = dataclasses.replace(result, reproductions=again)
+        if (doubted := doubted_throttle(again)) is not None:
+            why = again[doubted].verdict
+            if again[doubted].kind == "not flown":
+                why = f"this log cannot tell: at {doubted:.2f} throttle {why}"
+            return dataclasses.replace(result, verdict=why)
+        targets = ADRCTargets(
+            sensitivity=settings.sensitivity, resonance=settings.resonance, noise=settings.noise,
+            change=settings.change,
+        )  # fmt: skip
+        design = propose_adrc(
+            plant, flown, result.axis, hover=settings.hover, members=settings.members,
+            fresh=settings.fresh, seed=settings.seed, targets=targets,
+        )  # fmt: skip
+    except UndeterminedError as error:
+        return unsure(error)
+    return dataclasses.replace(result, kind=design.kind, verdict=design.verdict, proposal=design)
+
+
+_LINES = 40  # frequencies of a reproduced response
+
+
+def _reproduced(
+    path: Path, record: IdentifySettings, plant: GainOverThrottle, flown: Flown, level: int,
+    chains: Sequence[FilterChain],
+) -> Reproduction:  # fmt: skip
+    """The flown loop at a level of throttle compared with the log."""
+    rate = record.output or ""
+    setpoint, axis = rate.replace("gyroADC", "setpoint"), int(rate[-2])
+    band = (2 * np.pi, 90 * np.pi) if plant.fit.origin is None else plant.fit.origin.band
+    local = LocalPolynomial(global_order=0)
+
+    def respond(reference: str | None):
+        part = dataclasses.replace(
+            record, segments=plant.stretches[level], start=None, stop=None, input=setpoint,
+            reference=reference,
+        )  # fmt: skip
+        return frequency_response(
+            list(read_records(path, part)), np.geomspace(*band, _LINES),
+            estimator=JointInputOutput(local) if reference else local,
+        )  # fmt: skip
+
+    try:
+        response = respond(None if record.reference == setpoint else record.reference)
+    except ValueError:  # the stick is the set-point in another unit: that one is external
+        response = respond(None)
+    return reproduce_flight(
+        plant.fit, flown.at(float(plant.throttle[level])), response,
+        plant=lambda model: model.at(level), unit="deg/s", filters=chains, axis=axis,
+    )  # fmt: skip

@@ -54,14 +54,9 @@ def find_logs(
 
 
 def batch(
-    folder: str | Path,
-    settings: BatchSettings | None = None,
-    *,
-    out: str | Path | None = None,
-    again: bool = False,
-    work: Work = identify_log,
-    listener: Listener | None = None,
-) -> list[Row]:
+    folder: str | Path, settings: BatchSettings | None = None, *, out: str | Path | None = None,
+    again: bool = False, work: Work = identify_log, listener: Listener | None = None,
+) -> list[Row]:  # fmt: skip
     """Identify all logs of a folder, as `jaxquad batch` does.
 
     Each result is stored in `out` as soon as it is there, under a key of the log's content, its

@@ -6,6 +6,7 @@ from pathlib import Path
 import jax
 import numpy as np
 
+import jaxquad.tuning as tuning
 from jaxquad._core import announce, plain_content
 from jaxquad.control import certainty_equivalence, LADRC, ScheduledLADRC
 from jaxquad.ensembles import Ensemble, LogUniform, Normal, Posterior
@@ -14,17 +15,7 @@ from jaxquad.identify import UndeterminedError
 from jaxquad.loops import Loop
 from jaxquad.report import provenance, write_json
 from jaxquad.simulation import Pulse, Saturation, Scenario, scenario, Step
-from jaxquad.tuning import (
-    describe_controller,
-    KNOWN_INERTIA,
-    Limit,
-    Objective,
-    peers,
-    Penalty,
-    tune as tune_controller,
-    Tuned,
-    worst_flights,
-)
+from jaxquad.tuning import Tuned
 
 from ._identification import Identification
 from ._identify import identify_fit
@@ -41,19 +32,11 @@ _START = 10.0, 30.0  # rad/s, wc and wo
 
 @dataclasses.dataclass(frozen=True)
 class Tuning:
-    """A tuned controller as `tune` returns it, with what it was tuned on; `str()` shows both.
+    """A tuned controller as `tune` returns it, with what it was tuned on; `str()` shows both."""
 
-    **Attributes:**
-
-    - `identification`: the axis; of a stored result its fit alone, without what stands beside it.
-    - `settings`: those that were used.
-    - `tuned`: controller, gains and certificate.
-    - `loop`, `ensemble`, `flight`: what it was tuned on.
-    """
-
-    identification: Identification
+    identification: Identification  # of a stored result the fit alone
     settings: TuneSettings
-    tuned: Tuned
+    tuned: Tuned  # controller, gains and certificate
     loop: Loop
     ensemble: Ensemble
     flight: Scenario
@@ -66,18 +49,15 @@ class Tuning:
             "holds": tuned.holds,
             "verdicts": [verdict._asdict() for verdict in tuned.verdicts],
             "values": tuned.values,
-            "controller": describe_controller(tuned.controller) | {"dt": self.loop.dt},
-            "cost": tuned.cost,
-            "converged": tuned.converged,
+            "controller": tuning.describe_controller(tuned.controller) | {"dt": self.loop.dt},
+            "cost": tuned.cost, "converged": tuned.converged,
             "bounds": [bound._asdict() for bound in tuned.bounds],
-            "stabilised": tuned.stabilised,
-            "evaluations": tuned.evaluations,
-            "seconds": tuned.seconds,
-            "remarks": tuned.remarks,
+            "stabilised": tuned.stabilised, "evaluations": tuned.evaluations,
+            "seconds": tuned.seconds, "remarks": tuned.remarks,
             "certificate": None if certificate is None else certificate.content(),
             "settings": self.settings.content(),
             "identified_with": self.identification.settings.content(),
-        }
+        }  # fmt: skip
         return {key: plain_content(value) for key, value in content.items()}
 
     def write(self, folder: str | Path) -> list[Path]:
@@ -89,7 +69,7 @@ class Tuning:
         origin = provenance(*axis.paths, settings=settings)
         write_json(folder / "tuned.json", self.content() | {"provenance": origin.content()})
         write_c_header(folder / f"{name}.h", tuned.controller, name=name, axes=1)
-        flights = worst_flights(tuned, self.loop, self.ensemble, self.flight)
+        flights = tuning.worst_flights(tuned, self.loop, self.ensemble, self.flight)
         from jaxquad.plot import certificate_figure, convergence_figure, flight, headless
         from jaxquad.report import write_report  # here: with them comes matplotlib
 
@@ -112,12 +92,9 @@ class Tuning:
 
 
 def tune(
-    result: str | Path | StoredResult | Identification,
-    settings: TuneSettings,
-    *,
-    log: str | Path | None = None,
-    progress: bool | None = None,
-) -> Tuning:
+    result: str | Path | StoredResult | Identification, settings: TuneSettings, *,
+    log: str | Path | None = None, progress: bool | None = None,
+) -> Tuning:  # fmt: skip
     """Tune and certify a controller for the angle of an identified axis, as `jaxquad tune` does.
 
     A scheduled LADRC is tuned on plants that are drawn from everything the record leaves
@@ -188,17 +165,17 @@ def tune(
     )  # fmt: skip
     # That of docs/tuning.md, whose knee of 20 V^2/s belongs to a limit of 10 V.
     penalties = (
-        Penalty("activity_rate", knee=_ACTIVITY * settings.limit**2, weight=2.0),
-        Penalty("sensitivity_peak", knee=2.0, weight=3.0),
-        Penalty("abscissa", knee=-0.5, weight=5.0),
+        tuning.Penalty("activity_rate", knee=_ACTIVITY * settings.limit**2, weight=2.0),
+        tuning.Penalty("sensitivity_peak", knee=2.0, weight=3.0),
+        tuning.Penalty("abscissa", knee=-0.5, weight=5.0),
     )
-    objective = Objective(penalties=penalties, events=(0.0, pulse, back), load_start=pulse)
-    tuned = tune_controller(
+    objective = tuning.Objective(penalties=penalties, events=(0.0, pulse, back), load_start=pulse)
+    tuned = tuning.tune(
         loop, ensemble, flight, objective=objective,
-        limits=(Limit("sensitivity_peak", at_most=settings.sensitivity),),
+        limits=(tuning.Limit("sensitivity_peak", at_most=settings.sensitivity),),
         free=None if settings.wo is None else ["ladrc.wc", "map.values"],
         members=settings.members, fresh=settings.fresh,
-        peers={KNOWN_INERTIA: peers(plant, dt=dt)[KNOWN_INERTIA]},
+        peers={tuning.KNOWN_INERTIA: tuning.peers(plant, dt=dt)[tuning.KNOWN_INERTIA]},
         key=jax.random.key(settings.seed), progress=progress,
     )  # fmt: skip
     return Tuning(axis, settings, tuned, loop, ensemble, flight)

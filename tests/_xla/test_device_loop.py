@@ -16,7 +16,6 @@ from jaxquad._xla import (
     _loop,
     _nvrtc,
     _switch,
-    _trial,
     scan_on_device,
 )
 from jaxquad.models import sincos
@@ -89,6 +88,7 @@ def have_memory(monkeypatch):
     monkeypatch.setattr(_loop, "_memory", lambda: (10**9, 228 * 1024))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("memory", ["little", "much", "much, few registers", "few registers"])
 def test_values_and_gradients_are_those_of_the_plain_scan(memory, monkeypatch):
     """With respect to what members share and what they do not, at the start and in every sample."""
@@ -161,6 +161,7 @@ def steady(scan, tuning, x):
     return jnp.sum(scan(step, x, jnp.linspace(0.0, 1.0, SAMPLES))[0] ** 2)
 
 
+@pytest.mark.slow
 def test_what_is_the_same_in_every_sample_is_computed_before_the_loop():
     args = spread(2, MEMBERS), spread(1, MEMBERS, seed=1)
     forward, reverse = written(jax.grad(ft.partial(steady, kernel)), *args)
@@ -170,6 +171,7 @@ def test_what_is_the_same_in_every_sample_is_computed_before_the_loop():
     np.testing.assert_allclose(found, expected, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_what_would_take_many_arrays_before_the_loop_stays_in_it():
     """The differences of a map's values, as many as they are."""
     knots, x = spread(40, MEMBERS), spread(1, MEMBERS, seed=1)
@@ -195,6 +197,7 @@ def limited(scan, low, high, x):
     return jnp.sum(scan(step, x, jnp.array([0.0, 0.2, 0.0]))[0] ** 2)
 
 
+@pytest.mark.slow
 def test_slopes_of_limits_are_one_choice_and_no_quotient():
     x = jnp.array([[0.1, 0.3, 0.2, 0.4, 0.05] * (MEMBERS // 5)])
     args = jnp.full((1, MEMBERS), 0.1), jnp.full((1, MEMBERS), 0.3), x
@@ -373,17 +376,18 @@ def test_without_a_gpu_no_loop_is_given_to_one():
 
 def trial():
     with _switch.device_kernels("forced"):
-        return _trial.why_no_trust_in_gpu.__wrapped__()
+        return _switch.why_no_trust_in_gpu.__wrapped__()
 
 
+@pytest.mark.slow
 def test_kernels_are_compared_with_a_plain_loop_before_they_are_trusted(monkeypatch):
     said = []
     jax.jit(lambda x: said.append(trial()))(1.0)  # while another program is traced
     assert said == [None]
-    monkeypatch.setattr(_trial, "_by_kernel", lambda *args: plain(args[0], *args[1:]))
+    monkeypatch.setattr(_switch, "_by_kernel", lambda *args: plain(args[0], *args[1:]))
     assert trial() is None
     wrong = lambda step, carry, signals: plain(step, carry, signals[::-1])
-    monkeypatch.setattr(_trial, "_by_kernel", wrong)
+    monkeypatch.setattr(_switch, "_by_kernel", wrong)
     assert "differs from a plain loop" in str(trial())
 
 
@@ -391,5 +395,5 @@ def test_a_trial_that_fails_tells_why(monkeypatch):
     def fails(*_):
         raise RuntimeError("no such instruction")
 
-    monkeypatch.setattr(_trial, "_by_kernel", fails)
+    monkeypatch.setattr(_switch, "_by_kernel", fails)
     assert "no such instruction" in str(trial())

@@ -14,7 +14,7 @@ import pytest
 
 import jaxquad as jq
 from jaxquad._compile import brief_options, compiler_options, engine, hasty_options, Jit
-from jaxquad._xla import _stablehlo, _switch, _trial, as_one_kernel
+from jaxquad._xla import _stablehlo, _switch, as_one_kernel
 
 
 TAG = "xla_cpu_small_call"
@@ -127,14 +127,15 @@ def test_what_does_not_compile_as_a_kernel_is_compiled_plain_and_said_once(silen
 @pytest.fixture
 def untested(silence, monkeypatch, tmp_path):
     """A jaxlib that no test ran on, and an empty cache folder."""
-    monkeypatch.setattr(_trial, "TESTED", ())
-    monkeypatch.setattr(_trial.platformdirs, "user_cache_dir", lambda name: str(tmp_path / name))
+    monkeypatch.setattr(_switch, "TESTED", ())
+    monkeypatch.setattr(_switch.platformdirs, "user_cache_dir", lambda name: str(tmp_path / name))
     monkeypatch.delenv("JAXQUAD_CACHE", raising=False)
-    _trial.why_not_trusted.cache_clear()
+    _switch.why_not_trusted.cache_clear()
     yield tmp_path
-    _trial.why_not_trusted.cache_clear()
+    _switch.why_not_trusted.cache_clear()
 
 
+@pytest.mark.slow
 def test_kernels_pass_their_trial_with_this_jaxlib(untested):
     assert engine().one_kernel
     (answer,) = untested.glob("jaxquad/kernel-*.json")
@@ -143,10 +144,10 @@ def test_kernels_pass_their_trial_with_this_jaxlib(untested):
 
 def test_an_answer_is_kept_and_a_failed_trial_is_warned_of(untested, monkeypatch):
     asked = []
-    monkeypatch.setattr(_trial, "_ask_child", lambda: asked.append(1) or "status -6: aborted")
+    monkeypatch.setattr(_switch, "_ask_child", lambda: asked.append(1) or "status -6: aborted")
     for _ in range(2):
         _switch._said.clear()
-        _trial.why_not_trusted.cache_clear()
+        _switch.why_not_trusted.cache_clear()
         with pytest.warns(UserWarning, match="did not pass the trial.*status -6: aborted"):
             assert not engine().one_kernel
         assert not is_kernel()
@@ -155,16 +156,16 @@ def test_an_answer_is_kept_and_a_failed_trial_is_warned_of(untested, monkeypatch
 
 def test_without_a_cache_every_process_asks_anew(untested, monkeypatch):
     monkeypatch.setenv("JAXQUAD_CACHE", "off")
-    monkeypatch.setattr(_trial, "_ask_child", lambda: "")
+    monkeypatch.setattr(_switch, "_ask_child", lambda: "")
     assert engine().one_kernel and not list(untested.iterdir())
 
 
 def test_an_answer_that_cannot_be_read_is_asked_for_again(untested, monkeypatch):
-    path = _trial._answer_path()
+    path = _switch._answer_path()
     assert path is not None
     path.parent.mkdir(parents=True)
     path.write_text("{")
-    monkeypatch.setattr(_trial, "_ask_child", lambda: "")
+    monkeypatch.setattr(_switch, "_ask_child", lambda: "")
     with pytest.warns(UserWarning, match="cannot be read"):
         assert engine().one_kernel
     assert json.loads(path.read_text()) == {"why_not": ""}
@@ -172,7 +173,7 @@ def test_an_answer_that_cannot_be_read_is_asked_for_again(untested, monkeypatch)
 
 def test_a_child_that_dies_tells_its_last_words(monkeypatch):
     monkeypatch.setattr(sys, "executable", "/no/such/python")
-    assert "/no/such/python" in _trial._ask_child()
+    assert "/no/such/python" in _switch._ask_child()
 
 
 def run_program(name, first, last):

@@ -7,14 +7,15 @@ import pytest
 from scipy.linalg import expm
 
 from jaxquad.autopilot import ArduPilotRate, FilterChain, firmware_named
+from jaxquad.autopilot._parameters import gains_of
 from jaxquad.autopilot._rate_loops import (
     cells_of,
     delay_margin,
-    gains_of,
     hold_plants,
     law_paths,
     RateLoops,
 )
+from jaxquad.autopilot._stages import certify_angle
 
 
 DT, GAIN, LAG = 1 / 400, 80.0, 0.03
@@ -80,13 +81,13 @@ def test_the_angle_loop_is_stable_up_to_the_gain_at_which_a_simulated_one_is():
         *GAINS, gyro=FilterChain((), 1 / DT), target_hz=0.0, error_hz=0.0, derivative_hz=0.0, dt=DT
     )
     angle = firmware_named("ardupilot").angle_loop({"ATC_ANG_RLL_P": "4.5"}, 0, DT, levelled=False)
-    assert angle is not None and angle.closed and angle.gain(angle.value) == 4.5
+    assert angle is not None and angle.closed and angle.unit * angle.value == 4.5
     back, ahead = law_paths(law, 0, OMEGA)
     plants = hold_plants(column(GAIN), column(LAG), column(0.0), OMEGA, DT)
     ones = np.ones(OMEGA.size, complex)
     loops = RateLoops(OMEGA, back, ahead, plants, cells_of(OMEGA), ones, angle=angle.path(OMEGA))
     assert gains_of(law, 0).tolist() == GAINS.tolist()
-    stable = lambda value: bool(loops.outer_qualities(GAINS, value).stable[0])
+    stable = lambda value: certify_angle(loops, GAINS, angle, value).stable == 1
     low, high = 1.0, 200.0
     assert stable(low) and not stable(high)
     for _ in range(12):
@@ -102,6 +103,6 @@ def test_the_angle_loop_is_stable_up_to_the_gain_at_which_a_simulated_one_is():
 def test_betaflights_angle_loop_is_open_in_acro_and_has_no_yaw():
     values = {"levelPID": "50,75,75"}
     acro = firmware_named("betaflight").angle_loop(values, 0, 1 / 4000, levelled=False)
-    assert acro is not None and not acro.closed and acro.gain(acro.value) == pytest.approx(5.0)
+    assert acro is not None and not acro.closed and acro.unit * acro.value == pytest.approx(5.0)
     assert firmware_named("betaflight").angle_loop(values, 2, 1 / 4000, levelled=True) is None
     assert firmware_named("betaflight").angle_loop({}, 0, 1 / 4000, levelled=True) is None

@@ -11,9 +11,7 @@ import pytest
 from jaxquad.autopilot import (
     AxesProposal,
     check_law,
-    read_channels_if_any,
     read_flown,
-    settings_of,
 )
 from jaxquad.cli import main
 from jaxquad.workflows import (
@@ -41,9 +39,9 @@ def flown_of(path, axis):
     """The loop that flew and the channels of its law."""
     asked, proposal = propose_settings(path, IdentifySettings(axis=axis))
     assert proposal is not None
-    flight = read_channels_if_any(path, proposal, asked, settings_of(path, proposal).values)
-    assert flight is not None
-    return read_flown(path, proposal, flight.middle, flight.tracked_hz), flight
+    flown = read_flown(path, proposal, asked)
+    assert flown.flight is not None
+    return flown, flown.flight
 
 
 def law_of(path, axis, **changed):

@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from jaxquad.autopilot._rate_design import _judge
+from jaxquad.autopilot._stages import judge
 from jaxquad.workflows import AutopilotSettings
 
 
@@ -24,8 +24,7 @@ def stage(stable, peak=1.5, rejection=0.5):
 @pytest.mark.usefixtures("without_type_checks")  # of the stand-ins
 def test_a_loop_that_flew_is_stable_on_the_plants_that_are_the_vehicle(flown, best, kind):
     stages: Any = [stage(flown, peak=30.0), stage(best), stage(best)]
-    throttle: Any = SimpleNamespace(logged=())
-    found, words = _judge(stages, AutopilotSettings(), 200.0, None, throttle)
+    found, words = judge(stages, AutopilotSettings(), 200.0, None, ())
     assert found == kind
     assert ("stable on 2.0 % only" in words) == (kind == "cannot tell")
     assert ("Allow more" in words) == (kind == "not to be flown")

@@ -15,7 +15,7 @@ from scipy.io import savemat
 from jaxquad.records import channels, formats, read, ReadError, RecordWarning
 
 
-READERS = "jaxquad.records.formats._readers"
+READERS = "jaxquad.records.formats"
 CHILD = Path(formats.__file__).with_name("_by_library.py")
 TIME = 5.0 + np.arange(400) / 100.0
 U = np.sin(3 * TIME)
@@ -153,6 +153,7 @@ def test_a_chunk_that_unfolds_to_gigabytes_is_stopped(tmp_path):
         channels(tmp_path / name)
 
 
+@pytest.mark.slow
 def test_parquet_gives_numbers_stamps_in_seconds_and_nan_for_what_is_missing(tmp_path):
     arrow = pytest.importorskip("pyarrow")
     parquet = pytest.importorskip("pyarrow.parquet")

@@ -27,9 +27,7 @@ from synthetic import response_of
 import jaxquad as jq
 from jaxquad.identify import UndeterminedError
 from jaxquad.report import (
-    _measured,
     _report,
-    _tuned,
     provenance,
     reason_of,
     write_report,
@@ -97,7 +95,7 @@ def test_the_page_is_well_formed_and_holds_every_section(whole):
 
 SECTIONS = {
     "answers": (_report, "answer_section"), "step": (_report, "step_section"),
-    "loop": (_report, "loop_section"), "tuned": (_tuned, "tuned_section"),
+    "loop": (_report, "loop_section"), "tuned": (_report, "tuned_section"),
     "response": (_report, "response_section"), "parameters": (_report, "parameter_section"),
     "identifiability": (_report, "identifiability_section"),
     "verification": (_report, "check_section"), "spectrum": (_report, "spectrum_section"),
@@ -130,8 +128,9 @@ def test_errors_of_the_package_speak_for_themselves():
     assert reason_of(KeyError("rate")) == "KeyError: 'rate'"
 
 
+@pytest.mark.slow
 def test_a_figure_that_cannot_be_drawn_leaves_its_section(tmp_path, frf, fit, record, monkeypatch):
-    monkeypatch.setattr(_measured, "record_figure", lambda *_: 1 / 0)
+    monkeypatch.setattr(jq.plot, "record_figure", lambda *_: 1 / 0)
     page = read_page(write_report(tmp_path / "report.html", fit=fit, frf=frf, record=record))
     assert page.errors == [] and len(page.of("img")) == 2  # of the response
     assert "figure could not be drawn: ZeroDivisionError" in page.text("section")
@@ -221,6 +220,7 @@ def test_equal_results_give_equal_bytes(tmp_path, frf, fit, log):
     assert pages[0].read_bytes() == pages[1].read_bytes()
 
 
+@pytest.mark.slow
 def test_names_from_a_log_are_shown_and_not_obeyed(tmp_path, frf, fit, whole):
     """Every name, unit, remark, file name and command is hostile, each in another way."""
     u, y, r, unit, source, words = HOSTILE
@@ -260,6 +260,7 @@ def test_not_identifiable_comes_first_and_marks_its_numbers(tmp_path, frf):
     assert "Null directions" in text and "direction 1" in text and "jq.identify.Prior" in text
 
 
+@pytest.mark.slow
 def test_what_could_not_be_fitted_has_a_page_too(tmp_path, frf, record):
     weak = eqx.tree_at(lambda f: f.coherence, frf, frf.coherence * 0.1)
     blind = eqx.tree_at(
@@ -305,6 +306,7 @@ def test_a_fit_without_a_minimum_is_no_result(tmp_path, frf, fit):
     assert header.split()[:3] == ["\u2717", "NO", "MINIMUM"]
 
 
+@pytest.mark.slow
 def test_several_responses_have_a_part_each(tmp_path, frf, fit):
     both = {"empty": frf, "loaded": frf}
     models = {"loaded": jq.LaggedIntegrator(140.0, 0.016, 0.011)}

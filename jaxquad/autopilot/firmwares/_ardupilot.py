@@ -1,10 +1,11 @@
-"""ArduPilot's rate and angle loops."""
+"""ArduPilot (Copter): its rate and angle loops, notches, parameters, channels and files."""
 
 import dataclasses
+import itertools
 import math
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import ClassVar, Literal, NamedTuple
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -20,25 +21,22 @@ from jaxquad._core import (
     require_positive,
 )
 from jaxquad.control import Reference, Setpoint
-from jaxquad.identify import CurveFirmware
 from jaxquad.records import AXES
 
 from .._filters import Butterworth, FilterChain, Notch, PT1, Section
-from .._firmware import Channels, Firmware, LowPass, Numbers, OuterLoop, Parameter, rows_of_axes
+from .._firmware import Channels, Firmware, Numbers, OuterLoop, Parameter, rows_of_axes
 from .._law import (
+    Advance,
     AngleLoop,
     bounded,
     filter_gyro,
-    FirmwareLoop,
     FlownLoop,
     gyro_rest,
     low_pass_share,
+    Memories,
     RateLoop,
-    require_gains,
-    require_gyro_rate,
     Signal,
     split_reference,
-    Terms,
 )
 from ._ardupilot_log import LOG
 
@@ -64,15 +62,13 @@ class ArduPilotRate(RateLoop):
     - `target_hz`, `error_hz`, `derivative_hz`: _FLTT, _FLTE, _FLTD; 0 is off.
     - `integral_limit`: _IMAX; `pd_limit`: _PDMX, of |P + D|, inf is off.
     - `dt`: in s, 1/SCHED_LOOP_RATE.
-
-    **Raises:**
-
-    - `ValueError`: a gain is not finite, the gyro's rate is no multiple of 1/dt, or a filter lies
-        beyond half of its rate.
     """
 
     firmware: ClassVar[str] = "ardupilot"
     feed_forward: ClassVar[tuple[str, ...]] = ("ff", "d_ff")
+    limits: ClassVar[tuple[str, ...]] = (
+        "target_hz", "error_hz", "derivative_hz", "integral_limit", "pd_limit",
+    )  # fmt: skip
     p: Float[Array, "..."] = per_member(rank=1, converter=as_float)
     i: Float[Array, "..."] = per_member(rank=1, converter=as_float)
     d: Float[Array, "..."] = per_member(rank=1, converter=as_float)
@@ -86,35 +82,17 @@ class ArduPilotRate(RateLoop):
     pd_limit: Float[Array, "..."] = per_member(rank=1, converter=as_float, default=float("inf"))
     dt: float = eqx.field(static=True, default=1 / 400)  # s
 
-    def __check_init__(self):
-        limits = {
-            "target_hz": self.target_hz,
-            "error_hz": self.error_hz,
-            "derivative_hz": self.derivative_hz,
-            "integral_limit": self.integral_limit,
-            "pd_limit": self.pd_limit,
-        }
-        require_gains(self.dt, {**self.gains(), "ff": self.ff, "d_ff": self.d_ff}, limits)
-        require_gyro_rate(self.gyro, self.dt)
-
     def derivative_chain(self, axis: int) -> FilterChain:
         cutoff = float(np.broadcast_to(self.derivative_hz, (3,))[axis])
         return FilterChain((PT1(cutoff),) if cutoff > 0 else (), 1 / self.dt)
-
-    def gains(self) -> dict[str, Array]:
-        return {"p": self.p, "i": self.i, "d": self.d}
 
     def rest(self, zero: Signal) -> dict[str, PyTree]:
         signals = dict.fromkeys(("target", "error", "slope", "integral"), zero)
         return {"gyro": gyro_rest(self.gyro, zero), **signals}
 
     def advance(
-        self,
-        memory: Mapping[str, PyTree],
-        excess: Signal,
-        reference: Reference,
-        measurement: Signal,
-    ) -> tuple[dict[str, PyTree], Signal, Terms]:
+        self, memory: Memories, excess: Signal, reference: Reference, measurement: Signal
+    ) -> Advance:
         at = lambda gain: broadcast_gain(gain, measurement)
         share = lambda cutoff: low_pass_share(cutoff, self.dt, measurement)
         r, _ = split_reference(reference, measurement, self.dt)
@@ -123,8 +101,15 @@ class ArduPilotRate(RateLoop):
         error = memory["error"] + share(self.error_hz) * (target - y - memory["error"])
         raw = (error - memory["error"]) / self.dt
         slope = memory["slope"] + share(self.derivative_hz) * (raw - memory["slope"])
-        integral = self._integrated(memory["integral"], excess, at(self.i) * error * self.dt)
-        p, d = self._within_limit(at(self.p) * error, at(self.d) * slope)
+        growth = at(self.i) * error * self.dt
+        # A limited mixer lets the integral shrink only.
+        growing = (jnp.abs(excess) > 1e-6) & (memory["integral"] * growth >= 0)
+        grown = memory["integral"] + jnp.where(growing, 0.0, growth)
+        integral = bounded(grown, self.integral_limit)
+        p, d, limit = at(self.p) * error, at(self.d) * slope, at(self.pd_limit)
+        both = jnp.abs(p + d)
+        scale = jnp.where(both > limit, limit, 1.0) / jnp.where(both > limit, both, 1.0)
+        p, d = p * scale, d * scale
         ahead = at(self.ff) * target + at(self.d_ff) * (target - memory["target"]) / self.dt
         terms = {"P": p, "I": integral, "D": d, "F": ahead}
         next = {
@@ -132,26 +117,13 @@ class ArduPilotRate(RateLoop):
         }  # fmt: skip
         return next, p + d + integral + ahead, terms
 
-    def _integrated(self, integral, excess, growth):
-        """A limited mixer lets the integral shrink only."""
-        limited = jnp.abs(excess) > 1e-6
-        growing = limited & (integral * growth >= 0)
-        return bounded(integral + jnp.where(growing, 0.0, growth), self.integral_limit)
-
-    def _within_limit(self, p, d):
-        limit, both = broadcast_gain(self.pd_limit, p), jnp.abs(p + d)
-        beyond = both > limit
-        scale = jnp.where(beyond, limit, 1.0) / jnp.where(beyond, both, 1.0)
-        return p * scale, d * scale
-
 
 class ArduPilotAttitude(AngleLoop):
     """ArduPilot's angle loop around a rate loop: angles in rad in, ROut out.
 
     The rate's target is `p` times the error of the angle, beyond a_max/p^2 the root of it that a
     deceleration a_max needs, plus the rate of a `Setpoint` (what input shaping gives); it is used
-    one loop later. The rate that the inner loop sees is the difference of the measured angles over
-    a sample. Source: docs/autopilots.md.
+    one loop later. Source: docs/autopilots.md.
 
     **Arguments:** (each number is a scalar, one value per axis, or `[axes, *ensemble]`)
 
@@ -160,9 +132,7 @@ class ArduPilotAttitude(AngleLoop):
     - `acceleration_limit`: half of ATC_ACCEL_x_MAX in rad/s^2; the default is 550 deg/s^2.
     - `rate_limit`: ATC_RATE_x_MAX in rad/s; inf is none.
 
-    **Raises:**
-
-    - `ValueError`: `p` or a limit is not above 0.
+    **Raises:** `ValueError`: `p` or a limit is not above 0.
     """
 
     rate: ArduPilotRate
@@ -176,33 +146,22 @@ class ArduPilotAttitude(AngleLoop):
         require_positive("p", self.p, "give 1/s")
         require_positive("acceleration_limit", self.acceleration_limit, "give rad/s^2")
 
-    def outer_gains(self) -> dict[str, Array]:
-        return {"p": self.p}
-
-    def inner(self) -> FirmwareLoop:
-        return self.rate
-
     def outer_rest(self, zero: Signal) -> dict[str, PyTree]:
         return {"wanted": zero}
 
     def wanted_rate(
-        self, memory: Mapping[str, PyTree], reference: Reference, angle: Signal, rate: Signal
+        self, memory: Memories, aim: Setpoint, angle: Signal, rate: Signal
     ) -> tuple[dict[str, PyTree], Signal]:
-        aim = reference.angle if isinstance(reference, Setpoint) else reference
-        wanted = bounded(self._rate_of(aim - angle), self.rate_limit)
-        if isinstance(reference, Setpoint):
-            wanted = wanted + reference.rate
-        return {"wanted": wanted}, memory["wanted"]
-
-    def _rate_of(self, error: Signal) -> Signal:
-        """The square-root controller: linear for small errors, then the braking parabola."""
-        p, most = (broadcast_gain(x, error) for x in (self.p, self.acceleration_limit))
-        edge = most / p**2
+        # The square-root controller: linear for small errors, then the braking parabola.
+        p, most = (broadcast_gain(x, angle) for x in (self.p, self.acceleration_limit))
+        error, edge = aim.angle - angle, most / p**2
         size = jnp.abs(error)
         far = size > edge
         root = jnp.sqrt(2 * most * (jnp.where(far, size, edge) - edge / 2))
         braking = jnp.sign(error) * jnp.minimum(root, size / self.dt)
-        return jnp.where(far, braking, jnp.minimum(p, 1 / self.dt) * error)
+        turning = jnp.where(far, braking, jnp.minimum(p, 1 / self.dt) * error)
+        wanted = bounded(turning, self.rate_limit) + aim.rate
+        return {"wanted": wanted}, memory["wanted"]
 
 
 Composite = Literal[1, 2, 3, 5]  # notches at each harmonic
@@ -230,9 +189,7 @@ class HarmonicNotch(eqx.Module):
     - `harmonics`: multiples of the centre that have notches.
     - `notches`: 1, 2, 3 or 5 at each harmonic.
 
-    **Raises:**
-
-    - `ValueError`: centre or quality is not above 0, or a multiple is below 1.
+    **Raises:** `ValueError`: centre or quality is not above 0, or a multiple is below 1.
     """
 
     centre_hz: Float[Array, "..."] = per_member(rank=1, converter=as_float)
@@ -249,20 +206,15 @@ class HarmonicNotch(eqx.Module):
             raise ValueError(f"harmonics are {self.harmonics}: give multiples of the centre from 1")
 
     def sections(self, rate_hz: float) -> tuple[Section, ...]:
-        return tuple(
-            section
-            for harmonic in self.harmonics
-            for place in _PLACES[self.notches]
-            for section in self._notch(harmonic, place, rate_hz).sections(rate_hz)
-        )
-
-    def _notch(self, harmonic: int, place: int, rate_hz: float) -> Notch:
-        """One of them; that of a harmonic without one leaves everything."""
-        multiple = harmonic * self.centre_hz
-        centre = multiple * (1 + place * self.spread)
-        on = (multiple < _HIGHEST * rate_hz) & (centre < rate_hz / 2)
-        left = jnp.where(on, self.residual, 1.0)
-        return Notch(jnp.where(on, centre, rate_hz / 4), self.quality, left)
+        sections = []
+        for harmonic, place in itertools.product(self.harmonics, _PLACES[self.notches]):
+            multiple = harmonic * self.centre_hz
+            centre = multiple * (1 + place * self.spread)
+            on = (multiple < _HIGHEST * rate_hz) & (centre < rate_hz / 2)  # else all of it passes
+            left = jnp.where(on, self.residual, 1.0)
+            notch = Notch(jnp.where(on, centre, rate_hz / 4), self.quality, left)
+            sections += notch.sections(rate_hz)
+        return tuple(sections)
 
     def in_words(self) -> str:
         kind = f"{_NAMES[self.notches]}harmonic notch"
@@ -305,96 +257,18 @@ def ardupilot_harmonic_notch(
 
 
 class Tracking(NamedTuple):
-    """Of a notch of the gyro that follows the throttle.
-
-    **Attributes:**
-
-    - `place`: in the chain of the gyro's filters.
-    - `frequency_hz`, `reference`, `least`: INS_HNTCH_FREQ, _REF and _FM_RAT.
-    """
+    """A notch in the gyro's chain that follows the throttle: INS_HNTCH_FREQ, _REF and _FM_RAT."""
 
     place: int
     frequency_hz: float
     reference: float
     least: float
 
-    def centre_hz(self, throttle: Float[ArrayLike, "..."]) -> Float[Array, "..."]:
-        """FREQ sqrt(throttle / REF), not below FM_RAT FREQ."""
-        share = jnp.maximum(as_float(throttle) / self.reference, self.least**2)
-        return self.frequency_hz * jnp.sqrt(share)
-
-
-class GyroNotches(NamedTuple):
-    """What the parameters say of the gyro's notches: filters, which follow the throttle, words."""
-
-    filters: tuple[HarmonicNotch, ...]
-    tracking: tuple[Tracking, ...]
-    unmodelled: tuple[Message, ...]
-
 
 _FOLLOWED = {
     2: "the RPM sensor", 3: "the motors, by ESC telemetry", 4: "the spectrum of the gyro",
     5: "the second RPM sensor",
 }  # fmt: skip
-
-
-def read_harmonic_notches(
-    number: Callable[[str, float], float], tracked_hz: Mapping[int, Sequence[float]]
-) -> GyroNotches:
-    """The notches of INS_HNTCH_* and INS_HNTC2_*, those of the throttle at their reference.
-
-    `number` gives the value of a parameter, or the default; `tracked_hz` what those of each other
-    mode follow.
-    """
-    filters: list[HarmonicNotch] = []
-    tracking: list[Tracking] = []
-    unmodelled: list[Message] = []
-    for name in ("INS_HNTCH", "INS_HNTC2"):
-        read = lambda end, default, name=name: number(f"{name}_{end}", default)
-        mask = round(read("HMNCS", 3.0))
-        if read("ENABLE", 0.0) <= 0 or mask == 0:
-            continue
-        frequency, reference = read("FREQ", 80.0), read("REF", 0.0)
-        mode = round(read("MODE", 1.0)) if reference > 0 else 0
-        options = round(read("OPTS", 0.0))
-        notch = ardupilot_harmonic_notch(
-            frequency, read("BW", 40.0), read("ATT", 40.0),
-            harmonics=[k + 1 for k in range(16) if mask >> k & 1], notches=_composite(options),
-        )  # fmt: skip
-        if mode == 1:
-            tracking.append(Tracking(len(filters), frequency, reference, read("FM_RAT", 1.0)))
-        if mode not in _FOLLOWED:
-            filters.append(notch)
-        elif sources := tracked_hz.get(mode):
-            filters += _followed(notch, mode, reference, bool(options & 2), sources)
-        else:
-            text = (
-                f"{name}_MODE {mode}: the harmonic notch follows {_FOLLOWED[mode]}, from "
-                f"{frequency:g} Hz on; give what it followed in Hz (`tracked_hz={{{mode}: [...]}}`)"
-            )
-            unmodelled.append(Message(text, "notch"))
-    return GyroNotches(tuple(filters), tuple(tracking), tuple(unmodelled))
-
-
-def _followed(
-    notch: HarmonicNotch, mode: int, reference: float, separate: bool, sources: Sequence[float]
-) -> list[HarmonicNotch]:
-    """A notch for each source, or one for their mean, which REF scales but for the spectrum."""
-    centres = list(sources)
-    if not separate or mode in (2, 5):
-        centres = [(1.0 if mode == 4 else reference) * float(np.mean(sources))]
-    lowest = notch.centre_hz
-    moved = [jnp.maximum(lowest, centre) for centre in centres]
-    return [dataclasses.replace(notch, centre_hz=centre) for centre in moved]
-
-
-def _composite(options: int) -> Composite:
-    """Of INS_HNTCH_OPTS: the double notch goes before the triple one."""
-    if options & 1:
-        return 2
-    if options & 16:
-        return 3
-    return 5 if options & 64 else 1
 
 
 class FlownArduPilot(FlownLoop[ArduPilotRate]):
@@ -409,15 +283,17 @@ class FlownArduPilot(FlownLoop[ArduPilotRate]):
 
     def at(self, throttle: Float[ArrayLike, "..."]) -> ArduPilotRate:
         """The law at a throttle of 0 to 1: where its notches are."""
-        filters = list(self.law.gyro.filters)
-        for notch_tracking in self.tracking:
-            notch = filters[notch_tracking.place]
-            assert isinstance(notch, HarmonicNotch)
-            filters[notch_tracking.place] = dataclasses.replace(
-                notch, centre_hz=notch_tracking.centre_hz(throttle)
-            )
+        filters: list[Any] = list(self.law.gyro.filters)
+        for place, frequency, reference, least in self.tracking:
+            share = jnp.maximum(as_float(throttle) / reference, least**2)
+            centre = frequency * jnp.sqrt(share)
+            filters[place] = dataclasses.replace(filters[place], centre_hz=centre)
         chain = FilterChain(tuple(filters), self.law.gyro.rate_hz)
         return dataclasses.replace(self.law, gyro=chain)
+
+
+_SHORT = ("RLL", "PIT", "YAW")
+_of = lambda end: [f"ATC_RAT_{axis}_{end}" for axis in _SHORT]
 
 
 def ardupilot_loop(
@@ -435,89 +311,101 @@ def ardupilot_loop(
     - `tracked_hz`: what harmonic notches follow that go by an RPM sensor (2, 5), ESC telemetry (3)
         or the gyro's spectrum (4), in Hz: by INS_HNTCH_MODE, with a number for each source.
 
-    **Raises:**
-
-    - `ValueError`: a gain is missing.
+    **Raises:** `ValueError`: a gain is missing.
     """
-    read = Numbers(values)
-    rate = read.number("SCHED_LOOP_RATE", 400.0)
-    gyro_rate = 1000.0 * 2 ** read.number("INS_GYRO_RATE", 0.0)
+    number = Numbers(values).number
+    rate = number("SCHED_LOOP_RATE", 400.0)
+    gyro_rate = 1000.0 * 2 ** number("INS_GYRO_RATE", 0.0)
     gyro_rate = rate * max(1, math.ceil(gyro_rate / rate - 1e-9))
-    per_axis = lambda end, default=None: [
-        read.number(f"ATC_RAT_{x}_{end}", default) for x in ("RLL", "PIT", "YAW")
-    ]
+    per_axis = lambda end, default=None: [number(name, default) for name in _of(end)]
+    switched = {
+        **dict.fromkeys(_of("SMAX"), "the slew limiter lowers P and D"),
+        **{f"ATC_RAT_{x}_{n}": Message("a notch", "notch") for x in _SHORT for n in ("NTF", "NEF")},
+        "FSTRATE_ENABLE": "the rate loop runs faster than SCHED_LOOP_RATE",
+    }
+    unmodelled = [
+        Message(f"{name}: {what}", Message(what).kind)
+        for name, what in switched.items() if number(name, 0.0) > 0
+    ]  # fmt: skip
+    filters: list[HarmonicNotch] = []
+    tracking: list[Tracking] = []
+    for name in ("INS_HNTCH", "INS_HNTC2"):
+        read = lambda end, default, name=name: number(f"{name}_{end}", default)
+        mask = round(read("HMNCS", 3.0))
+        if read("ENABLE", 0.0) <= 0 or mask == 0:
+            continue
+        frequency, reference = read("FREQ", 80.0), read("REF", 0.0)
+        mode = round(read("MODE", 1.0)) if reference > 0 else 0
+        options = round(read("OPTS", 0.0))  # the double notch goes before the triple one
+        notch = ardupilot_harmonic_notch(
+            frequency, read("BW", 40.0), read("ATT", 40.0),
+            harmonics=[k + 1 for k in range(16) if mask >> k & 1],
+            notches=2 if options & 1 else 3 if options & 16 else 5 if options & 64 else 1,
+        )  # fmt: skip
+        if mode == 1:
+            tracking.append(Tracking(len(filters), frequency, reference, read("FM_RAT", 1.0)))
+        if mode not in _FOLLOWED:
+            filters.append(notch)
+        elif sources := (tracked_hz or {}).get(mode):
+            centres = list(sources)  # a notch for each, or one for their mean
+            if not options & 2 or mode in (2, 5):
+                centres = [(1.0 if mode == 4 else reference) * float(np.mean(sources))]
+            lowest = notch.centre_hz
+            filters += [
+                dataclasses.replace(notch, centre_hz=jnp.maximum(lowest, x)) for x in centres
+            ]
+        else:
+            text = (
+                f"{name}_MODE {mode}: the harmonic notch follows {_FOLLOWED[mode]}, from "
+                f"{frequency:g} Hz on; give what it followed in Hz (`tracked_hz={{{mode}: [...]}}`)"
+            )
+            unmodelled.append(Message(text, "notch"))
     limit = np.array(per_axis("PDMX", 0.0))
-    cutoff = read.number("INS_GYRO_FILTER", 20.0)
-    notches = read_harmonic_notches(read.number, tracked_hz or {})
+    cutoff = number("INS_GYRO_FILTER", 20.0)
     low_pass = (Butterworth(cutoff),) if cutoff > 0 else ()
     law = ArduPilotRate(
         p=per_axis("P"), i=per_axis("I"), d=per_axis("D"), ff=per_axis("FF", 0.0),
-        d_ff=per_axis("D_FF", 0.0), gyro=FilterChain((*notches.filters, *low_pass), gyro_rate),
+        d_ff=per_axis("D_FF", 0.0), gyro=FilterChain((*filters, *low_pass), gyro_rate),
         target_hz=per_axis("FLTT", 20.0), error_hz=per_axis("FLTE", 0.0),
         derivative_hz=per_axis("FLTD", 20.0), integral_limit=per_axis("IMAX", 0.5),
         pd_limit=np.where(limit > 0, limit, np.inf), dt=1 / rate,
     )  # fmt: skip
-    switched = {
-        **{f"ATC_RAT_{x}_SMAX": "the slew limiter lowers P and D" for x in ("RLL", "PIT", "YAW")},
-        **{
-            f"ATC_RAT_{x}_{n}": Message("a notch", "notch")
-            for x in ("RLL", "PIT", "YAW")
-            for n in ("NTF", "NEF")
-        },
-        "FSTRATE_ENABLE": "the rate loop runs faster than SCHED_LOOP_RATE",
-    }
-    left_out = [
-        Message(f"{name}: {what}", Message(what).kind)
-        for name, what in switched.items()
-        if read.number(name, 0.0) > 0
-    ]
-    flown = FlownArduPilot(law, (*left_out, *notches.unmodelled), notches.tracking)
+    flown = FlownArduPilot(law, tuple(unmodelled), tuple(tracking))
     return dataclasses.replace(flown, law=flown.at(throttle))
 
 
-def _table() -> list[Parameter]:
-    short = ("RLL", "PIT", "YAW")
-    of = lambda end: [f"ATC_RAT_{axis}_{end}" for axis in short]
-    two = lambda level, yaw: (level, level, yaw)
-    return [
-        *rows_of_axes(of("P"), "", (0.135, 0.135, 0.18), two((0.01, 0.5), (0.1, 2.5)), "p"),
-        *rows_of_axes(of("I"), "1/s", (0.135, 0.135, 0.018), two((0.01, 2), (0.01, 1)), "i"),
-        *rows_of_axes(of("D"), "s", (0.0036, 0.0036, 0), two((0, 0.05), (0, 0.02)), "d"),
-        *rows_of_axes(of("FF"), "", (0, 0, 0), (0, 0.5), "ff"),
-        *rows_of_axes(of("D_FF"), "s", (0, 0, 0), (0, 0.02), "d_ff"),
-        *rows_of_axes(of("IMAX"), "", (0.5,) * 3, (0, 1), "integral_limit"),
-        *rows_of_axes(of("FLTT"), "Hz", (20,) * 3, two((5, 100), (1, 50)), "target_hz"),
-        *rows_of_axes(of("FLTE"), "Hz", (0, 0, 2.5), two((0, 100), (0, 20)), "error_hz"),
-        *rows_of_axes(of("FLTD"), "Hz", (20,) * 3, two((5, 100), (5, 50)), "derivative_hz"),
-        *rows_of_axes(of("SMAX"), "", (0,) * 3, (0, 200), ""),
-        *rows_of_axes(
-            [f"ATC_ANG_{axis}_P" for axis in short], "1/s", (4.5,) * 3, (3, 12), "angle.p"
-        ),
-        Parameter("INS_GYRO_FILTER", "Hz", 20, 0, 256, True, "gyro"),
-        Parameter("MOT_THST_EXPO", "", 0.65, -1, 1),
-    ]
-
-
-_SHORT = ("RLL", "PIT", "YAW")
 _POST, _BOTH = 4, 8  # of INS_RAW_LOG_OPT: behind the filters, or before and behind them
 _GYRO = re.compile(r"(GYR(\d|\[\d\])?)\.GyrX")
+_two = lambda level, yaw: (level, level, yaw)
+_ROWS = [
+    *rows_of_axes(_of("P"), "", (0.135, 0.135, 0.18), _two((0.01, 0.5), (0.1, 2.5)), "p"),
+    *rows_of_axes(_of("I"), "1/s", (0.135, 0.135, 0.018), _two((0.01, 2), (0.01, 1)), "i"),
+    *rows_of_axes(_of("D"), "s", (0.0036, 0.0036, 0), _two((0, 0.05), (0, 0.02)), "d"),
+    *rows_of_axes(_of("FF"), "", (0, 0, 0), (0, 0.5), "ff"),
+    *rows_of_axes(_of("D_FF"), "s", (0, 0, 0), (0, 0.02), "d_ff"),
+    *rows_of_axes(_of("IMAX"), "", (0.5,) * 3, (0, 1), "integral_limit"),
+    *rows_of_axes(_of("FLTT"), "Hz", (20,) * 3, _two((5, 100), (1, 50)), "target_hz"),
+    *rows_of_axes(_of("FLTE"), "Hz", (0, 0, 2.5), _two((0, 100), (0, 20)), "error_hz"),
+    *rows_of_axes(_of("FLTD"), "Hz", (20,) * 3, _two((5, 100), (5, 50)), "derivative_hz"),
+    *rows_of_axes(_of("SMAX"), "", (0,) * 3, (0, 200), ""),
+    *rows_of_axes([f"ATC_ANG_{x}_P" for x in _SHORT], "1/s", (4.5,) * 3, (3, 12), "angle.p"),
+    Parameter("INS_GYRO_FILTER", "Hz", 20, 0, 256, True, "gyro"),
+    Parameter("MOT_THST_EXPO", "", 0.65, -1, 1),
+]
 
 
 class ArduPilot(Firmware):
     """ArduPilot, Copter; files hold a name and a value in a line, as Mission Planner has them."""
 
     log = LOG
-    parameters = {row.name: row for row in _table()}
+    parameters = {row.name: row for row in _ROWS}
     unit = "ROut"
     motor_shares = (0.5, 0.5, 0.5)
     follows_throttle = True
     thrust_curve = "MOT_THST_EXPO"
     weighs_setpoint = True
 
-    def flown_loop(
-        self, values: Mapping[str, str], version: Sequence[int], *, throttle: float,
-        tracked_hz: Mapping[int, Sequence[float]],
-    ) -> FlownLoop:  # fmt: skip
+    def flown_loop(self, values, version, *, throttle, tracked_hz):
         return ardupilot_loop(values, throttle=throttle, tracked_hz=tracked_hz)
 
     def channels(self, prefix: str, axis: int) -> Channels:
@@ -569,30 +457,8 @@ class ArduPilot(Firmware):
         ends = number("MOT_SPIN_MIN", 0.15), number("MOT_SPIN_MAX", 0.95)
         return low + ends[0] * (high - low), low + ends[1] * (high - low)
 
-    def angle_loop(
-        self, values: Mapping[str, str], axis: int, dt: float, *, levelled: bool
-    ) -> OuterLoop | None:
+    def angle_loop(self, values, axis, dt, *, levelled):
         return OuterLoop.of(values, f"ATC_ANG_{_SHORT[axis]}_P", 1.0, dt, closed=True)
-
-    def low_passes(
-        self, loop: FlownLoop, values: Mapping[str, str], version: Sequence[int], axis: int,
-        throttle: float,
-    ) -> Iterator[LowPass]:  # fmt: skip
-        law, of_axis = loop.law, lambda x: float(np.broadcast_to(x, (3,))[axis])
-        for x in law.gyro.filters:
-            if isinstance(x, Butterworth):
-                flown = {"INS_GYRO_FILTER": float(x.cutoff_hz)}
-                yield LowPass("gyro", flown, x, law.gyro.rate_hz)
-        slope = of_axis(law.derivative_hz)
-        if slope > 0 and of_axis(law.d) > 0:
-            flown = {f"ATC_RAT_{_SHORT[axis]}_FLTD": slope}
-            yield LowPass("derivative", flown, PT1(slope), 1 / law.dt, shared=False)
-
-    def curve_kind(self, version: Sequence[int]) -> CurveFirmware:
-        return "ardupilot"
-
-    def angle_parameters(self, axis: str, p: float) -> dict[str, float]:
-        return {f"ATC_ANG_{_SHORT[AXES.index(axis)]}_P": p}
 
 
 FIRMWARE = ArduPilot()

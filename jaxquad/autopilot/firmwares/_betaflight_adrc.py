@@ -1,173 +1,50 @@
-"""Betaflight's proposed ADRC (pull request 15400): its law, and what a log says of it."""
+"""Betaflight's proposed ADRC (pull request 15400) of a log, and its loops with drawn plants.
+
+The observer's response is rational in exp(-j omega T), and b0 divides it.
+"""
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from typing import ClassVar
+from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Float, PyTree
+import numpy as np
+from jaxtyping import Float
 
-from jaxquad._core import (
-    as_float,
-    as_messages,
-    broadcast_gain,
-    Message,
-    per_member,
-    require_positive,
-)
-from jaxquad.control import Reference
-from jaxquad.identify import B0Law, B0Schedule
+from jaxquad._core import as_messages
+from jaxquad.identify import B0Law, B0Schedule, draw_models, filter_response, GainOverThrottle
 from jaxquad.records import AXES
 
-from .._filters import Filter, FilterChain, PT2
-from .._law import (
-    bounded,
-    DEGREES,
-    filter_gyro,
-    FlownLoop,
-    gyro_rest,
-    low_pass_share,
-    RateLoop,
-    require_gains,
-    require_gyro_rate,
-    Signal,
-    split_reference,
-    sum_of,
-    Terms,
-)
+from .._filters import FilterChain, PT2
+from .._law import FlownLoop, law_responses
 from .._parameters import list_parameters
+from .._rate_loops import cells_of, Frequencies, hold_plants, LoopQualities, Paths, RateLoops
 from ._betaflight import betaflight_loop, flies_adrc, FlownBetaflight
-from ._betaflight_law import F_SCALE
-
-
-class BetaflightADRC(RateLoop):
-    """The ADRC proposed for Betaflight (pull request 15400): rates in rad/s in, pidsum units out.
-
-    An observer of y'' = b u + f, y the rate in deg/s, estimates y, y' and f by forward Euler:
-
-        z1 += T (z2 - 3 wo e),  z2 += T (z3 + b u - 3 wo^2 e),  z3 += -T (sigma z3 + wo^3 e)
-        b u = wc^2 (r - z1) - 2 wc z2 - z3,    e = z1 - y before the update
-
-    where u in the observer is the command that reached the mixer. In the air: the gate before
-    liftoff is not modelled. wo is at most 0.5/T. Source: docs/autopilots.md.
-
-    **Arguments:** (each number is a scalar, one value per axis, or `[axes, *ensemble]`)
-
-    - `wc`, `wo`: adrc_wc, adrc_wo in rad/s.
-    - `b0`: adrc_b0 in deg/s^3 per unit of pidsum, see `adrc_b0`.
-    - `f`: feed-forward as in `BetaflightPID`.
-    - `gyro`, `filters`: as in `BetaflightPID`; `lowpass`: adrc_gyro_lpf_hz, a pt2 at 150 Hz.
-    - `setpoint_lowpass_hz`: adrc_td_hz, 0 is off.
-    - `b0_scale`: of b0 by the throttle.
-    - `forgetting`: adrc_sigma_decay / 10 in 1/s.
-    - `limit`: pidsum_limit; `dt`: in s.
-
-    **Raises:**
-
-    - `ValueError`: a gain is not finite, the gyro's rate is no multiple of 1/dt, or a filter lies
-        beyond half of its rate.
-    """
-
-    firmware: ClassVar[str] = "betaflight"
-    feed_forward: ClassVar[tuple[str, ...]] = ("f",)
-    of_sticks: ClassVar[bool] = True
-    wc: Float[Array, "..."] = per_member(rank=1, converter=as_float, default=60.0)
-    wo: Float[Array, "..."] = per_member(rank=1, converter=as_float, default=100.0)
-    b0: Float[Array, "..."] = per_member(rank=1, converter=as_float, default=2000.0)
-    f: Float[Array, "..."] = per_member(rank=1, converter=as_float, default=0.0)
-    gyro: FilterChain = FilterChain()
-    filters: tuple[Filter, ...] = ()
-    lowpass: tuple[Filter, ...] | None = None
-    setpoint_lowpass_hz: Float[Array, "..."] = per_member(rank=1, converter=as_float, default=0.0)
-    b0_scale: Float[Array, "..."] = per_member(rank=1, converter=as_float, default=1.0)
-    forgetting: Float[Array, "..."] = per_member(rank=1, converter=as_float, default=0.3)
-    limit: Float[Array, "..."] = per_member(rank=1, converter=as_float, default=500.0)
-    dt: float = eqx.field(static=True, default=1 / 4000)  # s
-
-    def __check_init__(self):
-        for name, gain in self.gains().items():
-            require_positive(name, gain)
-        require_gains(self.dt, {**self.gains(), "f": self.f}, {"limit": self.limit})
-        require_gyro_rate(self.gyro, self.dt)
-        self._chain()  # refuses what lies beyond half of the loop's rate
-
-    def _chain(self) -> FilterChain:
-        """All filters of the rate at the loop's rate."""
-        lowpass = (PT2(150.0),) if self.lowpass is None else self.lowpass
-        return FilterChain((*self.filters, *lowpass), 1 / self.dt)
-
-    def gyro_chains(self) -> list[FilterChain]:
-        return [self.gyro, FilterChain(self.filters, 1 / self.dt)] if self.filters else [self.gyro]
-
-    def without_gyro_filters(self) -> "BetaflightADRC":
-        return dataclasses.replace(self, gyro=FilterChain(), filters=())
-
-    def gains(self) -> dict[str, Array]:
-        return {"wc": self.wc, "wo": self.wo, "b0": self.b0}
-
-    def rest(self, zero: Signal) -> dict[str, PyTree]:
-        return {
-            "gyro": gyro_rest(self.gyro, zero), "filters": self._chain().init(zero),
-            "reference": zero, "slow": zero, "z": (zero, zero, zero), "command": zero,
-        }  # fmt: skip
-
-    def advance(
-        self,
-        memory: Mapping[str, PyTree],
-        excess: Signal,
-        reference: Reference,
-        measurement: Signal,
-    ) -> tuple[dict[str, PyTree], Signal, Terms]:
-        at = lambda gain: broadcast_gain(gain, measurement)
-        r, speed = split_reference(reference, memory["reference"], self.dt)
-        gyro, (smooth, _) = filter_gyro(self.gyro, self.dt, memory["gyro"], DEGREES * measurement)
-        filters, y = self._chain().step(memory["filters"], smooth)
-        share = low_pass_share(self.setpoint_lowpass_hz, self.dt, r)
-        slow = memory["slow"] + share * (DEGREES * r - memory["slow"])
-        b, wc = at(self.b0) * at(self.b0_scale), at(self.wc)
-        z = self._observed(memory["z"], b * (memory["command"] - excess), y, b)
-        terms = {
-            "P": wc**2 * (slow - z[0]) / b, "I": -z[2] / b, "D": -2 * wc * z[1] / b,
-            "F": F_SCALE * at(self.f) * DEGREES * speed,
-        }  # fmt: skip
-        command = bounded(sum_of(terms), self.limit)
-        next = {
-            "gyro": gyro, "filters": filters, "reference": r, "slow": slow, "z": z,
-            "command": command,
-        }  # fmt: skip
-        return next, command, terms
-
-    def _observed(self, z, drive, y, b):
-        at = lambda gain: broadcast_gain(gain, y)
-        wo, dt = jnp.minimum(at(self.wo), 0.5 / self.dt), self.dt
-        error = z[0] - y
-        most = at(self.limit) * b
-        first = z[0] + dt * (z[1] - 3 * wo * error)
-        second = z[1] + dt * (z[2] + drive - 3 * wo**2 * error)
-        third = z[2] - dt * (at(self.forgetting) * z[2] + wo**3 * error)
-        return (
-            jnp.clip(first, -8000.0, 8000.0),
-            jnp.clip(second, -1e5, 1e5),
-            jnp.clip(third, -most, most),
-        )
-
-
-def adrc_b0(gain: Float[ArrayLike, "..."], lag: Float[ArrayLike, "..."]) -> Float[Array, "..."]:
-    """b0 of `BetaflightADRC` in deg/s^3 per pidsum, of an identified plant gain/(s (lag s + 1)).
-
-    Differentiable: `fit.derived` propagates the covariance of gain and lag.
-
-    **Arguments:**
-
-    - `gain`: from the sum that the mixer gets over 1000 to the angular acceleration, in rad/s^2.
-    - `lag`: of the motors in s.
-    """
-    return DEGREES * as_float(gain) / (1000 * as_float(lag))
+from ._betaflight_law import BetaflightADRC
 
 
 _NUMBERED: tuple[B0Law, ...] = ("QUADRATIC", "SQRT", "LINEAR", "FIXED")  # as the header counts them
 _LARGEST_WITHOUT_LAW = 9.0  # adrc_b0_scale_max of a build without adrc_b0_law
+Design = Float[np.ndarray, "3"]  # wc, wo, b0
+Designs = Float[np.ndarray, "designs 3"]
+
+
+class ADRCFrame(NamedTuple):
+    """What of the ADRC is not tuned: b0 over the throttle, filters, and the observer's leak."""
+
+    schedule: B0Schedule
+    lowpass_hz: float = 150.0  # 0 is off
+    setpoint_hz: float = 0.0
+    forgetting: float = 0.3  # 1/s
+
+    def parameters(self) -> dict[str, float]:
+        """By the firmware's names."""
+        return {
+            "adrc_gyro_lpf_hz": self.lowpass_hz, "adrc_td_hz": self.setpoint_hz,
+            "adrc_hover_throttle": 100 * self.schedule.hover,
+            "adrc_sigma_decay": 10 * self.forgetting,
+        }  # fmt: skip
 
 
 class FlownADRC(FlownLoop[BetaflightADRC]):
@@ -182,21 +59,21 @@ class FlownADRC(FlownLoop[BetaflightADRC]):
     pid: FlownBetaflight = eqx.field(kw_only=True)
     schedule: B0Schedule = eqx.field(static=True, kw_only=True)
 
+    @property
+    def frame(self) -> ADRCFrame:
+        """What a search leaves as it flew."""
+        law = self.law
+        cutoffs = [float(x.cutoff_hz) for x in law.lowpass or () if isinstance(x, PT2)]
+        leak, setpoint_hz = float(law.forgetting), float(law.setpoint_lowpass_hz)
+        return ADRCFrame(self.schedule, (*cutoffs, 0.0)[0], setpoint_hz, leak)
+
     def parameters(self) -> dict[str, float]:
         """The values that flew, by the names of `PARAMETERS`."""
-        law = self.law
-        return list_parameters(law) | {
-            "adrc_gyro_lpf_hz": self.lowpass_hz,
-            "adrc_td_hz": float(law.setpoint_lowpass_hz),
-            "adrc_hover_throttle": 100 * self.schedule.hover,
-            "adrc_sigma_decay": 10 * float(law.forgetting),
-        }
+        return list_parameters(self.law) | self.frame.parameters()
 
-    @property
-    def lowpass_hz(self) -> float:
-        """adrc_gyro_lpf_hz; 0 is off."""
-        cutoffs = [float(x.cutoff_hz) for x in self.law.lowpass or () if isinstance(x, PT2)]
-        return cutoffs[0] if cutoffs else 0.0
+    def design(self, axis: int) -> Design:
+        """wc, wo and b0 of one axis."""
+        return np.array([float(np.broadcast_to(x, (3,))[axis]) for x in self.law.gains().values()])
 
     def at(self, throttle: float) -> BetaflightADRC:
         """The law at a throttle of 0 to 1: dynamic cutoffs and the scale of b0."""
@@ -204,25 +81,22 @@ class FlownADRC(FlownLoop[BetaflightADRC]):
         return dataclasses.replace(self.law, filters=self.pid.at(throttle).filters, b0_scale=scale)
 
 
-_OF_AXES = {"adrc_wc": "adrcWC", "adrc_wo": "adrcWO", "adrc_b0": "adrcB0"}
-_OF_ALL = ("adrc_gyro_lpf_hz", "adrc_td_hz", "adrc_hover_throttle", "adrc_sigma_decay")
+Flown = FlownBetaflight | FlownADRC
 
 
 def adrc_parameters(values: Mapping[str, str]) -> dict[str, float]:
     """The parameters of the proposed ADRC that a Betaflight header holds, flown or not.
 
-    **Arguments:**
-
-    - `values`: the header's lines by name, `jq.records.read_settings(path).values`.
-
-    **Returns:** values by the names of `PARAMETERS`; empty for a firmware without the ADRC.
+    `values` are as for `betaflight_loop`. Empty for a firmware without the ADRC.
     """
+    lines = {"adrc_wc": "adrcWC", "adrc_wo": "adrcWO", "adrc_b0": "adrcB0"}
     parameters = {
         f"{name}_{axis}": value
-        for name, line in _OF_AXES.items() if line in values
+        for name, line in lines.items() if line in values
         for axis, value in zip(AXES, _three(values, line), strict=True)
     }  # fmt: skip
-    return parameters | {name: float(values[name]) for name in _OF_ALL if name in values}
+    of_all = ("adrc_gyro_lpf_hz", "adrc_td_hz", "adrc_hover_throttle", "adrc_sigma_decay")
+    return parameters | {name: float(values[name]) for name in of_all if name in values}
 
 
 def betaflight_adrc_loop(
@@ -230,47 +104,45 @@ def betaflight_adrc_loop(
 ) -> FlownADRC:
     """The rate loop of a Betaflight header that was flown with the proposed ADRC.
 
-    A header without adrc_b0_law is of a build in which b0 follows the square of the throttle.
-    Source: docs/autopilots.md.
+    Arguments are as for `betaflight_loop`. A header without adrc_b0_law is of a build in which b0
+    follows the square of the throttle. Source: docs/autopilots.md.
 
-    **Arguments:**
-
-    - `values`: the header's lines by name, `jq.records.read_settings(path).values`.
-    - `version`: of the firmware, (2026, 6, 0).
-    - `throttle`: 0 to 1, at which the cutoffs and b0 of `law` are.
-
-    **Raises:**
-
-    - `ValueError`: the PID flew, or the header lacks a number.
+    **Raises:** `ValueError`: the PID flew, or the header lacks a number.
     """
     if not flies_adrc(values):
         raise ValueError(
             "the header has no pid_type of 1, so the PID flew: read it with betaflight_loop."
         )
-    pid = betaflight_loop(values, version, throttle=throttle)
-    lowpass = _number(values, "adrc_gyro_lpf_hz", 150.0)
+    number = lambda name, default: float(values.get(name, default))
+    pid, b0_of = betaflight_loop(values, version, throttle=throttle), b0_law(values)
+    lowpass = number("adrc_gyro_lpf_hz", 150.0)
     law = BetaflightADRC(
         wc=_three(values, "adrcWC"), wo=_three(values, "adrcWO"), b0=_three(values, "adrcB0"),
         f=pid.law.f * pid.law.f_share, gyro=pid.law.gyro, filters=pid.law.filters,
         lowpass=(PT2(lowpass),) if lowpass > 0 else (),
-        setpoint_lowpass_hz=_number(values, "adrc_td_hz", 0.0),
-        forgetting=_number(values, "adrc_sigma_decay", 3.0) / 10,
-        limit=pid.law.limit, dt=pid.law.dt,
+        setpoint_lowpass_hz=number("adrc_td_hz", 0.0),
+        forgetting=number("adrc_sigma_decay", 3.0) / 10, limit=pid.law.limit, dt=pid.law.dt,
     )  # fmt: skip
-    flown = FlownADRC(law, _unmodelled(values, pid), pid=pid, schedule=_schedule(values))
+    schedule = B0Schedule(
+        b0_of or "QUADRATIC", number("adrc_hover_throttle", 35.0) / 100,
+        number("adrc_b0_scale_min", 100.0) / 100,
+        number("adrc_b0_scale_max", 3.0 if b0_of else _LARGEST_WITHOUT_LAW),
+    )  # fmt: skip
+    # What concerns P, I and D did not fly.
+    left_out: list[str] = [x for x in pid.unmodelled if x.kind in ("notch", "feedforward")]
+    left_out.append("the gate before liftoff, and wc on the ground")
+    if number("adrc_sat_z3_inhibit", 0.0) > 0:
+        left_out += ["adrc_sat_z3_inhibit: the observer's integrator rests at the mixer's limits"]
+    if any(float(x) != 100 for k in values if "adrc_zeta" in k for x in values[k].split(",")):
+        left_out.append("adrc_zeta: the damping ratio is taken as 1")
+    flown = FlownADRC(law, as_messages(left_out), pid=pid, schedule=schedule)
     return dataclasses.replace(flown, law=flown.at(throttle))
 
 
 def b0_law(values: Mapping[str, str]) -> B0Law | None:
-    """adrc_b0_law of a Betaflight header; None where it has none.
+    """adrc_b0_law of a Betaflight header, as for `betaflight_loop`; None where it has none.
 
-    **Arguments:**
-
-    - `values`: the header's lines by name, `jq.records.read_settings(path).values`.
-
-    **Raises:**
-
-    - `ValueError`: the header's number stands for no law.
+    **Raises:** `ValueError`: the header's number stands for no law.
     """
     if "adrc_b0_law" not in values:
         return None
@@ -278,27 +150,6 @@ def b0_law(values: Mapping[str, str]) -> B0Law | None:
     if not 0 <= number < len(_NUMBERED):
         raise ValueError(f"adrc_b0_law is {number} in the header: 0 to {len(_NUMBERED) - 1} exist.")
     return _NUMBERED[number]
-
-
-def _schedule(values: Mapping[str, str]) -> B0Schedule:
-    law = b0_law(values)
-    return B0Schedule(
-        law or "QUADRATIC",
-        _number(values, "adrc_hover_throttle", 35.0) / 100,
-        _number(values, "adrc_b0_scale_min", 100.0) / 100,
-        _number(values, "adrc_b0_scale_max", 3.0 if law else _LARGEST_WITHOUT_LAW),
-    )
-
-
-def _unmodelled(values: Mapping[str, str], pid: FlownBetaflight) -> tuple[Message, ...]:
-    # What concerns P, I and D did not fly.
-    common: list[str] = [text for text in pid.unmodelled if text.kind in ("notch", "feedforward")]
-    common.append("the gate before liftoff, and wc on the ground")
-    if _number(values, "adrc_sat_z3_inhibit", 0.0) > 0:
-        common.append("adrc_sat_z3_inhibit: the observer's integrator rests at the mixer's limits")
-    if any(float(x) != 100 for k in values if "adrc_zeta" in k for x in values[k].split(",")):
-        common.append("adrc_zeta: the damping ratio is taken as 1")
-    return as_messages(common)
 
 
 def _three(values: Mapping[str, str], name: str) -> list[float]:
@@ -310,5 +161,98 @@ def _three(values: Mapping[str, str], name: str) -> list[float]:
     return [float(x) for x in values[name].split(",")]
 
 
-def _number(values: Mapping[str, str], name: str, default: float) -> float:
-    return float(values.get(name, default))
+_DEGREES = 180 / np.pi
+_LOWEST, _FREQUENCIES = 0.05, 300  # rad/s
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ADRCLoops(RateLoops):
+    """The loops of all plants at one throttle, of which a design is a row of wc, wo and b0.
+
+    Its `feedback` and `ahead` are those of the law that flew, and `passed` is of all filters of the
+    rate; `scale` is that of b0.
+    """
+
+    dt: float
+    scale: float
+    frame: ADRCFrame
+
+    def flown(self) -> LoopQualities:
+        """What flew gives."""
+        return self._qualities(self.feedback, self.ahead)
+
+    def closed(self, design: Design | None) -> Paths:
+        """From set-point to rate, of each plant; None is what flew."""
+        flown = self.feedback, self.ahead
+        [back], [ahead] = flown if design is None else self.paths(design[None])
+        return ahead * self.plants / (1 + back * self.plants)
+
+    def paths(self, gains: Designs, filters: None = None) -> tuple[Paths, Paths]:
+        """From the rate to minus the command, and from the set-point to it.
+
+        With q = exp(-j omega T) the observer of `BetaflightADRC` is (1 - q M) z = N y + q T b u,
+        and b u = wc^2 r - (wc^2, 2 wc, 1) z: solved by elimination.
+        """
+        dt, frame = self.dt, self.frame
+        wc, wo, b0 = (column[:, None] for column in gains.T)
+        wo = np.minimum(wo, 0.5 / dt)
+        q = np.exp(-1j * self.omega * dt)[None]
+        updates = dt * np.stack([3 * wo, 3 * wo**2, wo**3])
+        leak, one = 1 - q * (1 - frame.forgetting * dt), 1 - q
+
+        def weighed(inputs: Sequence[np.ndarray | float] | np.ndarray) -> np.ndarray:
+            """z for what enters each of its rows: z2 and z3 by z1 from the last up, then z1."""
+            third = inputs[2] / leak, -q * updates[2] / leak
+            second = (
+                (inputs[1] + q * dt * third[0]) / one,
+                (-q * updates[1] + q * dt * third[1]) / one,
+            )
+            first = inputs[0] + q * dt * second[0]
+            first = first / (1 - q * (1 - updates[0]) - q * dt * second[1])
+            return (
+                wc**2 * first + 2 * wc * (second[0] + second[1] * first)
+                + (third[0] + third[1] * first)
+            )  # fmt: skip
+
+        by_rate, by_drive = weighed(updates), weighed((0.0, q * dt, 0.0))
+        back = by_rate / (b0 * (1 + by_drive)) * self.passed / self.scale
+        ahead = wc**2 / (b0 * (1 + by_drive)) / self.scale
+        if frame.setpoint_hz > 0:  # adrc_td_hz, a pt1
+            w = 2 * np.pi * frame.setpoint_hz * dt
+            ahead = ahead * (w / (w + 1) / (1 - np.exp(-1j * self.omega * dt) / (w + 1)))
+        return _DEGREES * back, _DEGREES * ahead
+
+
+def adrc_loops(
+    plant: GainOverThrottle, flown: Flown, axis: int, throttle: float, frame: ADRCFrame,
+    plants: int, seed: int, omega: Frequencies | None = None,
+) -> ADRCLoops:  # fmt: skip
+    """The loops of plants drawn at a throttle, behind the filters of what flew."""
+    law, scale = flown.at(throttle), float(frame.schedule.scale(throttle))
+    if omega is None:
+        omega = np.geomspace(_LOWEST, 0.999 * np.pi / law.dt, _FREQUENCIES)
+    gain, lag, delay = (x[:, None] for x in draw_at(plant, throttle, plants, seed))
+    per_radian = 1.0 if plant.output_unit == "rad/s" else 1 / _DEGREES
+    responses = hold_plants(per_radian * gain, lag, delay, omega, law.dt)
+    ahead, back = law_responses(law, axis, omega)
+    observer = FilterChain((PT2(frame.lowpass_hz),) if frame.lowpass_hz > 0 else (), 1 / law.dt)
+    chains = [x for x in law.gyro_chains() if x.filters]
+    passed = filter_response([*chains, observer], omega)
+    return ADRCLoops(
+        omega, -back[None], ahead[None], responses, cells_of(omega), passed, dt=law.dt,
+        scale=scale, frame=frame,
+    )  # fmt: skip
+
+
+def draw_at(
+    plant: GainOverThrottle, throttle: float, plants: int, seed: int
+) -> Sequence[Float[np.ndarray, " plants"]]:
+    """Gain, lag and delay of drawn plants; of a record with one level, at that level's throttle."""
+    if plant.throttle.size > 1:
+        drawn = plant.draw(np.array([throttle]), plants, seed=seed)
+        return drawn.gain[0], drawn.lag, drawn.delay
+    plant.b0(0)  # says what to fly where the lag is not determined
+    scores = np.random.default_rng(seed).standard_normal((len(plant.fit.names), plants))
+    models = draw_models(plant.fit, jnp.asarray(scores))
+    wide = lambda x: np.broadcast_to(np.asarray(x, float), (plants,))
+    return wide(np.asarray(models.gain)[0]), wide(models.lag), wide(models.delay)

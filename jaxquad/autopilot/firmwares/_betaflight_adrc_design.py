@@ -1,192 +1,41 @@
-"""Rate loops with Betaflight's proposed ADRC, on plants drawn over the throttle."""
+"""From the gain over the throttle to the parameters of Betaflight's proposed ADRC.
+
+A design is a search over wc, wo and b0 on responses, as that of a PID is one over P, I and D.
+"""
 
 import dataclasses
-import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Complex, Float
+from jaxtyping import Float
 
 from jaxquad._core import announce, plain_content
-from jaxquad.identify import (
-    B0Law,
-    B0Schedule,
-    draw_models,
-    GainOverThrottle,
-    ScaledB0,
-    UndeterminedError,
-)
+from jaxquad.identify import B0Law, B0Schedule, GainOverThrottle, ScaledB0, UndeterminedError
 from jaxquad.records import AXES
 
-from .._filters import FilterChain, PT2
-from .._firmware import Parameter
 from .._parameters import find_parameter, store_parameters
-from .._rate_design import Kind
-from .._rate_loops import cells_of, hold_plants, law_responses, LoopQualities, RateLoops
-from .._stages import beyond_limits
-from ._betaflight import FlownBetaflight
-from ._betaflight_adrc import FlownADRC
+from .._rate_design import best_on_grid, stored_near
+from .._rate_loops import LoopQualities, together
+from .._stages import beyond_limits, Kind
+from ._betaflight_adrc import (
+    adrc_loops,
+    ADRCFrame,
+    ADRCLoops,
+    Design,
+    Designs,
+    draw_at,
+    Flown,
+    FlownADRC,
+)
 
 
-Designs = Float[np.ndarray, "designs 3"]  # wc, wo, b0
-Paths = Complex[np.ndarray, "designs frequencies"]
-Frequencies = Float[np.ndarray, " frequencies"]
-Flown = FlownBetaflight | FlownADRC
-_DEGREES = 180 / np.pi
-_LOWEST, _FREQUENCIES = 0.05, 300  # rad/s
-_WORST = 8
-
-
-class ADRCFrame(NamedTuple):
-    """What of the ADRC is not tuned: b0 over the throttle, filters, and the observer's leak."""
-
-    schedule: B0Schedule
-    lowpass_hz: float = 150.0  # 0 is off
-    setpoint_hz: float = 0.0
-    forgetting: float = 0.3  # 1/s
-
-
-@dataclasses.dataclass(frozen=True)
-class ADRCLoop:
-    """The loops of all plants at one throttle.
-
-    **Attributes:**
-
-    - `loops`: with the law that flew as its only design.
-    - `passed`: response of all filters of the rate.
-    - `scale`: of b0.
-    """
-
-    dt: float
-    loops: RateLoops
-    passed: Complex[np.ndarray, " frequencies"]
-    scale: float
-    frame: ADRCFrame
-
-    def qualities(self, designs: Designs) -> LoopQualities:
-        """What each row of wc, wo and b0 gives."""
-        return self._with(designs).qualities(np.eye(len(designs)))
-
-    def flown(self) -> LoopQualities:
-        """What flew gives."""
-        return self.loops.qualities(np.eye(1))
-
-    def first(self) -> "ADRCLoop":
-        """With one plant alone."""
-        one = dataclasses.replace(self.loops, plants=self.loops.plants[:1])
-        return dataclasses.replace(self, loops=one)
-
-    def joined(self, others: "ADRCLoop", design: Float[np.ndarray, "3"]) -> "ADRCLoop":
-        """With the worst plants of the others."""
-        worst = others._with(design[None]).worst(np.eye(1), _WORST)
-        return dataclasses.replace(self, loops=self.loops.joined(worst))
-
-    def closed(self, design: Float[np.ndarray, "3"] | None) -> Paths:
-        """From set-point to rate, of each plant; None is what flew."""
-        loops = self.loops if design is None else self._with(design[None])
-        [back], [ahead] = loops.feedback, loops.ahead
-        return ahead * loops.plants / (1 + back * loops.plants)
-
-    def _with(self, designs: Designs) -> RateLoops:
-        omega, frame = self.loops.omega, self.frame
-        back, ahead = observer_responses(designs, omega, self.dt, frame.forgetting)
-        back, ahead = back * self.passed / self.scale, ahead / self.scale
-        ahead = ahead * _setpoint_response(frame.setpoint_hz, omega, self.dt)
-        return dataclasses.replace(self.loops, feedback=_DEGREES * back, ahead=_DEGREES * ahead)
-
-
-def observer_responses(
-    designs: Designs, omega: Frequencies, dt: float, forgetting: float = 0.3
-) -> tuple[Paths, Paths]:
-    """From the rate behind its low-pass to minus the command, and from the set-point to it.
-
-    Per deg/s. With q = exp(-j omega T) the observer of `BetaflightADRC` is
-    (1 - q M) z = N y + q T b u, and b u = wc^2 r - (wc^2, 2 wc, 1) z: solved by elimination.
-    """
-    wc, wo, b0 = (column[:, None] for column in designs.T)
-    wo = np.minimum(wo, 0.5 / dt)
-    q = np.exp(-1j * omega * dt)[None]
-    gains = dt * np.stack([3 * wo, 3 * wo**2, wo**3])
-    leak, one = 1 - q * (1 - forgetting * dt), 1 - q
-
-    def observed(inputs: tuple[np.ndarray | float, ...]):
-        """z for what enters each of its three rows."""
-        # z2 and z3 by z1, from the last row up; then the first row alone.
-        third = (inputs[2] / leak, -q * gains[2] / leak)
-        second = [
-            (inputs[1] + q * dt * third[0]) / one,
-            (-q * gains[1] + q * dt * third[1]) / one,
-        ]
-        first = (inputs[0] + q * dt * second[0]) / (1 - q * (1 - gains[0]) - q * dt * second[1])
-        return first, second[0] + second[1] * first, third[0] + third[1] * first
-
-    weigh = lambda z: wc**2 * z[0] + 2 * wc * z[1] + z[2]
-    by_rate, by_drive = weigh(observed(tuple(gains))), weigh(observed((0.0, q * dt, 0.0)))
-    return by_rate / (b0 * (1 + by_drive)), wc**2 / (b0 * (1 + by_drive))
-
-
-def _setpoint_response(
-    cutoff_hz: float, omega: Frequencies, dt: float
-) -> Complex[np.ndarray, " frequencies"]:
-    """Of adrc_td_hz, a pt1."""
-    if cutoff_hz == 0:
-        return np.ones(omega.size, complex)
-    w = 2 * np.pi * cutoff_hz * dt
-    return w / (w + 1) / (1 - np.exp(-1j * omega * dt) / (w + 1))
-
-
-def make_adrc_loop(
-    plant: GainOverThrottle, flown: Flown, axis: int, throttle: float, frame: ADRCFrame,
-    plants: int, seed: int, omega: Frequencies | None = None,
-) -> ADRCLoop:  # fmt: skip
-    """The loops of plants drawn at a throttle, behind the filters of what flew."""
-    law, scale = flown.at(throttle), float(frame.schedule.scale(throttle))
-    if omega is None:
-        omega = np.geomspace(_LOWEST, 0.999 * np.pi / law.dt, _FREQUENCIES)
-    gain, lag, delay = draw_at(plant, throttle, plants, seed)
-    per_radian = 1.0 if plant.output_unit == "rad/s" else 1 / _DEGREES
-    responses = hold_plants(per_radian * gain[:, None], lag[:, None], delay[:, None], omega, law.dt)
-    ahead, back = law_responses(law, axis, omega)
-    passed = np.ones(omega.size, complex)
-    for chain in rate_filters(flown, throttle, frame):
-        passed = passed * np.asarray(chain.response(omega / (2 * np.pi)))
-    before = RateLoops(
-        omega, -back[None], ahead[None], responses, cells_of(omega), np.ones_like(passed)
-    )
-    return ADRCLoop(law.dt, before, passed, scale, frame)
-
-
-def gyro_filters(flown: Flown, throttle: float) -> list[FilterChain]:
-    """The chains that a rate passed before it was logged."""
-    law = flown.at(throttle)
-    return [x for x in (law.gyro, FilterChain(law.filters, 1 / law.dt)) if x.filters]
-
-
-def rate_filters(flown: Flown, throttle: float, frame: ADRCFrame) -> list[FilterChain]:
-    """The chains before the observer: those of the gyro, and adrc_gyro_lpf_hz."""
-    observer = (PT2(frame.lowpass_hz),) if frame.lowpass_hz > 0 else ()
-    return [*gyro_filters(flown, throttle), FilterChain(observer, 1 / flown.law.dt)]
-
-
-def draw_at(
-    plant: GainOverThrottle, throttle: float, plants: int, seed: int
-) -> Sequence[Float[np.ndarray, " plants"]]:
-    """Gain, lag and delay of drawn plants; of a record with one level, at that level's throttle."""
-    if plant.throttle.size > 1:
-        drawn = plant.draw(np.array([throttle]), plants, seed=seed)
-        return drawn.gain[0], drawn.lag, drawn.delay
-    plant.b0(0)  # says what to fly where the lag is not determined
-    scores = np.random.default_rng(seed).standard_normal((len(plant.fit.names), plants))
-    models = draw_models(plant.fit, jnp.asarray(scores))
-    wide = lambda x: np.broadcast_to(np.asarray(x, float), (plants,))
-    return wide(np.asarray(models.gain)[0]), wide(models.lag), wide(models.delay)
-
-
-Design = Float[np.ndarray, "3"]  # wc, wo, b0
+_LAW: B0Law = "SQRT"  # of the firmware by default
+_POINTS, _LEVELS, _ROUGH, _NARROWED = 5, 8, 5, 0.55  # the first levels on one plant each
+_RESERVE = 0.97  # of the limits, because fresh plants reach further than those that were tuned on
+_CERTIFICATES, _WORST = 3, 8
+_SPREAD = 4.0  # factor on b0 to either side
 _WORTH = 0.95  # of the flown effect of torque, above which other numbers are not worth a change
-_THIRD = 1 / 3
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -236,91 +85,12 @@ class ADRCStage(NamedTuple):
     rejection: float
     noise: float
 
-
-def rows_of(axis: str) -> list[Parameter]:
-    """Of wc, wo and b0."""
-    return [find_parameter("betaflight", f"adrc_{name}_{axis}") for name in ("wc", "wo", "b0")]
-
-
-def a_third(before: Design, designs: Designs) -> Designs:
-    """A third of the way."""
-    return before + _THIRD * (designs - before)
-
-
-def stages_of(
-    loops: Sequence[ADRCLoop], axis: str, before: Design | None, best: Design
-) -> dict[str, ADRCStage]:
-    """What flew, a third of the way where that has a meaning, the proposal, and the defaults."""
-    flown = [loop.flown() for loop in loops]
-    of = lambda design: _stage(design, [x.qualities(design[None]) for x in loops], flown)
-    none = np.full(3, np.nan)
-    stages = {"what flew": _stage(none if before is None else before, flown, flown)}
-    if before is not None:
-        stages["a third of the way"] = of(np.rint(a_third(before, best[None])[0]))
-    default = np.array([row.default for row in rows_of(axis)], float)
-    return stages | {"proposed": of(best), "defaults": of(default)}
-
-
-def _stage(
-    design: Design, qualities: Sequence[LoopQualities], flown: Sequence[LoopQualities]
-) -> ADRCStage:
-    joined, before = _together(qualities), _together(flown)
-    relative = lambda new, old: float(np.sqrt(np.mean((new / old) ** 2)))
-    wc, wo, b0 = map(float, design)
-    return ADRCStage(
-        wc,
-        wo,
-        b0,
-        float(np.mean(joined.stable)),
-        float(np.max(joined.peak)),
-        float(np.max(joined.resonance)),
-        float(np.median(joined.crossover)),
-        relative(joined.rejection, before.rejection),
-        relative(joined.noise, before.noise),
-    )
-
-
-def _together(qualities: Sequence[LoopQualities]) -> LoopQualities:
-    """Of one design, the plants of all throttles one after the other."""
-    columns = zip(*qualities, strict=True)
-    return LoopQualities(*(np.concatenate([x[0] for x in column]) for column in columns))
-
-
-def judge(
-    stages: Mapping[str, ADRCStage], targets: ADRCTargets, edge: float, fresh: int, grid: np.ndarray
-) -> tuple[Kind, str]:
-    """The verdict, in words too."""
-    if beyond := beyond_targets(stages, targets, edge):
-        return "not to be flown", (
-            f"no parameters are proposed: {'; '.join(beyond)}. Allow more (`sensitivity`, "
-            "`resonance`, `noise`), or fly more excitation"
-        )
-    flown, best = stages["what flew"], stages["proposed"]
-    better = f"{best.rejection:.2f} of the effect of torque with what flew"
-    within = flown.peak <= targets.sensitivity and flown.resonance <= targets.resonance
-    if not np.isnan(flown.wc) and flown.stable == 1 and within and best.rejection > _WORTH:
-        return "kept", (
-            f"what flew is kept: within the limits the best parameters leave {better}. Its worst "
-            f"Ms on {fresh} fresh plants is {flown.peak:.2f}"
-        )
-    where = f"from {grid[0]:.2f} to {grid[-1]:.2f}" if len(grid) > 1 else f"at {grid[0]:.2f}"
-    return "proposed", (
-        f"proposed: stable on all {fresh} fresh plants {where} throttle, worst Ms {best.peak:.2f} "
-        f"of at most {targets.sensitivity:g}, {better}"
-    )
-
-
-def beyond_targets(stages: Mapping[str, ADRCStage], targets: ADRCTargets, edge: float) -> list[str]:
-    """In words, which of the targets are not kept."""
-    flown, best = stages["what flew"], stages["proposed"]
-    return beyond_limits(flown, stages.get("a third of the way", best), best, targets, edge)
-
-
-_LAW: B0Law = "SQRT"  # of the firmware by default
-_POINTS, _LEVELS, _ROUGH, _NARROWED = 5, 8, 5, 0.55  # the first levels on one plant each
-_RESERVE = 0.97  # of the limits, because fresh plants reach further than those that were tuned on
-_CERTIFICATES = 3
-_SPREAD = 4.0  # factor on b0 to either side
+    def cells(self) -> list[str]:
+        """The numbers as both tables print them, the crossover in Hz."""
+        tuned = ["-" if np.isnan(x) else f"{x:.0f}" for x in self[:3]]
+        peaks, ends = ([f"{x:.2f}" for x in part] for part in (self[4:6], self[7:]))
+        hertz = self.crossover / (2 * np.pi)
+        return [*tuned, f"{100 * self.stable:.1f}", *peaks, f"{hertz:.1f}", *ends]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -333,7 +103,7 @@ class ADRCProposal:
         parameters keep the targets.
     - `verdict`: the same in words.
     - `parameters`: of the firmware by name, empty where nothing is proposed.
-    - `schedule`: adrc_b0_law, adrc_hover_throttle and the limits of b0's scale.
+    - `frame`: what was not tuned.
     - `throttle`: at which the loops were certified.
     - `stages`: by name, what parameters give on fresh plants: "what flew", "proposed" and
         "defaults"; "a third of the way" where the ADRC flew.
@@ -344,7 +114,7 @@ class ADRCProposal:
     kind: Kind
     verdict: str
     parameters: Mapping[str, float]
-    schedule: B0Schedule
+    frame: ADRCFrame
     throttle: tuple[float, ...]
     stages: Mapping[str, ADRCStage]
     scaled: ScaledB0 | None = None
@@ -355,9 +125,9 @@ class ADRCProposal:
         return self.stages["proposed"]
 
     @property
-    def defaults(self) -> ADRCStage:
-        """Of the firmware's default wc, wo and b0."""
-        return self.stages["defaults"]
+    def schedule(self) -> B0Schedule:
+        """adrc_b0_law, adrc_hover_throttle and the limits of b0's scale."""
+        return self.frame.schedule
 
     @property
     def law(self) -> B0Law:
@@ -367,19 +137,13 @@ class ADRCProposal:
     def content(self) -> dict[str, object]:
         """All of it, for JSON."""
         return plain_content({
-            "kind": self.kind,
-            "verdict": self.verdict,
-            "parameters": dict(self.parameters),
+            "kind": self.kind, "verdict": self.verdict, "parameters": dict(self.parameters),
             "schedule": self.schedule._asdict(),
             "throttle": self.throttle,
             "stages": {name: stage._asdict() for name, stage in self.stages.items()},
-            "b0_of_the_log": None if self.scaled is None else {
-                "hover": self.scaled.hover,
-                "b0": self.scaled.b0.value,
-                "interval_95": self.scaled.b0.interval,
-                "law": self.scaled.law,
-                "deviations": dict(self.scaled.deviations),
-                "extrapolated": self.scaled.extrapolated,
+            "b0_of_the_log": None if (x := self.scaled) is None else {
+                "hover": x.hover, "b0": x.b0.value, "interval_95": x.b0.interval, "law": x.law,
+                "deviations": dict(x.deviations), "extrapolated": x.extrapolated,
             },
         })  # fmt: skip
 
@@ -389,13 +153,8 @@ class ADRCProposal:
             f"{'on fresh plants':<18} {'wc':>4} {'wo':>4} {'b0':>6}   stable   worst Ms   resonance"
             "   crossover   torque   noise"
         ]
-        for name, x in self.stages.items():
-            numbers = f"{x.wc:4.0f} {x.wo:4.0f} {x.b0:6.0f}"
-            rows.append(
-                f"{name:<18} {numbers.replace('nan', '  -')} {100 * x.stable:6.1f} % "
-                f"{x.peak:10.2f} {x.resonance:11.2f} {x.crossover / (2 * np.pi):8.1f} Hz "
-                f"{x.rejection:8.2f} {x.noise:7.2f}"
-            )
+        form = "{:<18} {:>4} {:>4} {:>6} {:>6} % {:>10} {:>11} {:>8} Hz {:>8} {:>7}"
+        rows += [form.format(name, *stage.cells()) for name, stage in self.stages.items()]
         return "\n".join(rows)
 
     def __str__(self) -> str:
@@ -432,18 +191,14 @@ def propose_adrc(
 
     **Arguments:**
 
-    - `found`: of `jq.identify.gain_over_throttle`, with the filters of the gyro divided out.
-    - `flown`: the loop of the log's header, `betaflight_loop` or `betaflight_adrc_loop`: its
-        filters stay, and it is what noise and torque are compared with.
+    - `plant`: of `jq.identify.gain_over_throttle`, with the filters of the gyro divided out.
+    - `flown`: of `betaflight_loop` or `betaflight_adrc_loop`: its filters stay, and it is what
+        noise and torque are compared with.
     - `axis`: "roll", "pitch" or "yaw".
     - `hover`: adrc_hover_throttle, 0 to 1; by default that of the ADRC that flew, else the lowest
         level of throttle, because b0 is scaled up from there alone.
-    - `targets`: an `ADRCTargets`.
     - `bins`: throttles, evenly from the lowest to the highest flown.
     - `members`, `fresh`: plants to tune on, and to certify on at each throttle.
-    - `seed`: of the draws.
-
-    **Returns:** an `ADRCProposal`.
 
     **Raises:**
 
@@ -463,33 +218,56 @@ def propose_adrc(
     """
     if axis not in AXES:
         raise ValueError(f"axis is {axis!r}: give one of {', '.join(AXES)}")
-    targets, one = targets or ADRCTargets(), plant.throttle.size == 1
+    targets, one, place = targets or ADRCTargets(), plant.throttle.size == 1, AXES.index(axis)
     grid = plant.throttle if one else np.linspace(plant.low.min(), plant.high.max(), bins)
-    frame, scaled, middle = _frame(plant, flown, hover)
-    make = lambda plants, seed: [
-        make_adrc_loop(plant, flown, AXES.index(axis), float(x), frame, plants, seed) for x in grid
+    frame, scaled, b0 = _frame(plant, flown, hover)
+    draw = lambda plants, seed: [
+        adrc_loops(plant, flown, place, float(x), frame, plants, seed) for x in grid
     ]
-    _require_gains(plant, grid, fresh, seed)
+    if min(float(draw_at(plant, float(x), fresh, seed)[0].min()) for x in grid) <= 0:
+        raise UndeterminedError(
+            "the log does not tell the gain from the command to the rate: 0 is within what it "
+            "leaves possible. Fly a chirp of the rate set-point, or stronger and quicker stick"
+        )
     edge = np.inf if plant.fit.origin is None else plant.fit.origin.band[1]
-    before, bounds = _flown_design(flown, axis), _bounds(flown, axis, middle, targets.change)
-    loops = make(max(1, members // len(grid)), seed)
-    attempt = 1
-    while True:
-        announce(f"searching wc, wo and b0 at {len(grid)} throttles")
-        best = _search(loops, bounds, targets, edge, before)
-        announce(f"certifying the whole numbers on {fresh} new plants")
-        new = make(fresh, seed + attempt)
-        stages = stages_of(new, axis, before, best)
-        if attempt == _CERTIFICATES or not beyond_targets(stages, targets, edge):
-            break
-        loops = [old.joined(fresh_loop, best) for old, fresh_loop in zip(loops, new, strict=True)]
-        attempt += 1
-    kind, verdict = judge(stages, targets, edge, fresh, grid)
-    values = _parameters(axis, best, frame) if kind == "proposed" else {}
-    stored = store_parameters("betaflight", values)
-    return ADRCProposal(
-        kind, verdict, stored, frame.schedule, tuple(map(float, grid)), stages, scaled
+    rows = [find_parameter("betaflight", f"adrc_{name}_{axis}") for name in ("wc", "wo", "b0")]
+    low, high, usual = (
+        np.array([getattr(row, name) for row in rows], float) for name in ("low", "high", "default")
     )
+    before = flown.design(place) if isinstance(flown, FlownADRC) else None
+    if before is not None:
+        ways = before / targets.change, before * targets.change
+        low, high = (np.clip(x, low, high) for x in ways)
+    else:
+        low[2], high[2] = np.clip([b0 / _SPREAD, b0 * _SPREAD], low[2], high[2])
+    loops = draw(max(1, members // len(grid)), seed)
+    for attempt in range(1, _CERTIFICATES + 1):
+        announce(f"searching wc, wo and b0 at {len(grid)} throttles")
+        score = _score(loops, targets, edge, before)
+        first = [dataclasses.replace(loop, plants=loop.plants[:1]) for loop in loops]
+        rough, ends = _score(first, targets, edge, before), (np.log(low), np.log(high))
+        middle, half = np.log(low * high) / 2, np.log(high / low) / 2
+        for level in range(_LEVELS):
+            used = rough if level < _ROUGH else score
+            middle, half = best_on_grid(used, middle, half, ends, _POINTS), _NARROWED * half
+        near = stored_near(np.exp(middle), rows, (low, high))
+        best = near[np.argmin(score(near))]  # where none keep the targets: the nearest
+        announce(f"certifying the whole numbers on {fresh} new plants")
+        certified = draw(fresh, seed + attempt)
+        stages = _stages(certified, before, best, usual)
+        third = stages.get("a third of the way", stages["proposed"])
+        beyond = beyond_limits(stages["what flew"], third, stages["proposed"], targets, edge)
+        if not beyond:
+            break
+        worst = [x.worst(best[None], _WORST).plants for x in certified]
+        loops = [
+            dataclasses.replace(x, plants=np.concatenate([x.plants, more]))
+            for x, more in zip(loops, worst, strict=True)
+        ]
+    kind, verdict = _judge(stages, beyond, targets, fresh, grid)
+    values = {row.name: float(x) for row, x in zip(rows, best, strict=True)} | frame.parameters()
+    stored = store_parameters("betaflight", values if kind == "proposed" else {})
+    return ADRCProposal(kind, verdict, stored, frame, tuple(map(float, grid)), stages, scaled)
 
 
 def _frame(
@@ -499,132 +277,101 @@ def _frame(
     if hover is not None and not 0 < hover <= 1:
         raise ValueError(f"hover is {hover}: give the throttle at hover, above 0 and up to 1")
     if isinstance(flown, FlownADRC):
-        schedule = flown.schedule
-        if hover is not None and abs(hover - schedule.hover) > 0.005:
+        frame, flew = flown.frame, flown.schedule.hover
+        if hover is not None and abs(hover - flew) > 0.005:
             raise ValueError(
                 f"hover is {hover:g}, but the ADRC that flew has an adrc_hover_throttle of "
-                f"{100 * schedule.hover:.0f} %, which stays: leave hover out"
+                f"{100 * flew:.0f} %, which stays: leave hover out"
             )
-        law = flown.law
-        frame = ADRCFrame(
-            schedule, flown.lowpass_hz, float(law.setpoint_lowpass_hz), float(law.forgetting)
-        )
     else:
         lowest = float(plant.throttle[0]) if hover is None else hover
         frame = ADRCFrame(B0Schedule(_LAW, max(0.05, round(lowest, 2))))
-    at = frame.schedule.hover
+    schedule = frame.schedule
     if plant.throttle.size == 1:
         degrees = 1.0 if plant.output_unit == "deg/s" else 180 / np.pi
-        scale = float(frame.schedule.scale(plant.throttle[0]))
+        scale = float(schedule.scale(plant.throttle[0]))
         return frame, None, degrees * plant.b0(0).value / scale
-    scaled = plant.adrc_b0(at, largest=frame.schedule.high)
+    scaled = plant.adrc_b0(schedule.hover, largest=schedule.high)
     if not isinstance(flown, FlownADRC):
-        frame = frame._replace(schedule=frame.schedule._replace(law=scaled.law))
+        frame = frame._replace(schedule=schedule._replace(law=scaled.law))
     return frame, scaled, scaled.b0.value
 
 
-def _require_gains(plant: GainOverThrottle, grid: np.ndarray, plants: int, seed: int) -> None:
-    """Raise UndeterminedError where the log leaves gains of 0 or below possible."""
-    drawn = [draw_at(plant, float(x), plants, seed)[0] for x in grid]
-    if min(float(gains.min()) for gains in drawn) <= 0:
-        raise UndeterminedError(
-            "the log does not tell the gain from the command to the rate: 0 is within what it "
-            "leaves possible. Fly a chirp of the rate set-point, or stronger and quicker stick"
-        )
+def _third(before: Design, designs: Designs) -> Designs:
+    return before + 1 / 3 * (designs - before)
 
 
-def _flown_design(flown: Flown, axis: str) -> Design | None:
-    """wc, wo and b0 that flew; None of a PID."""
-    if not isinstance(flown, FlownADRC):
-        return None
-    law, k = flown.law, AXES.index(axis)
-    return np.array([float(np.broadcast_to(x, (3,))[k]) for x in (law.wc, law.wo, law.b0)])
+def _stages(
+    loops: Sequence[ADRCLoops], before: Design | None, best: Design, usual: Design
+) -> dict[str, ADRCStage]:
+    """What flew, a third of the way where that has a meaning, the proposal, and the defaults."""
+    flown = together([loop.flown() for loop in loops])
+    rms = lambda ratio: float(np.sqrt(np.mean(ratio**2)))
 
+    def stage(design: Design, x: LoopQualities) -> ADRCStage:
+        wc, wo, b0 = map(float, design)
+        return ADRCStage(
+            wc, wo, b0, float(np.mean(x.stable)), float(np.max(x.peak)),
+            float(np.max(x.resonance)), float(np.median(x.crossover)),
+            rms(x.rejection / flown.rejection), rms(x.noise / flown.noise),
+        )  # fmt: skip
 
-def _bounds(flown: Flown, axis: str, b0: float, change: float) -> tuple[Design, Design]:
-    """Least and most of wc, wo and b0."""
-    rows = rows_of(axis)
-    low = np.array([row.low for row in rows], float)
-    high = np.array([row.high for row in rows], float)
-    before = _flown_design(flown, axis)
+    of = lambda design: stage(design, together([loop.qualities(design[None]) for loop in loops]))
+    stages = {"what flew": stage(np.full(3, np.nan) if before is None else before, flown)}
     if before is not None:
-        return np.clip(before / change, low, high), np.clip(before * change, low, high)
-    low[2], high[2] = np.clip([b0 / _SPREAD, b0 * _SPREAD], low[2], high[2])
-    return low, high
+        stages["a third of the way"] = of(np.rint(_third(before, best)))
+    return stages | {"proposed": of(best), "defaults": of(usual)}
 
 
-def _parameters(axis: str, design: Design, frame: ADRCFrame) -> dict[str, float]:
-    """What the firmware has to hold for the loops that were certified."""
-    values = {row.name: float(x) for row, x in zip(rows_of(axis), design, strict=True)}
-    return values | {
-        "adrc_gyro_lpf_hz": frame.lowpass_hz,
-        "adrc_td_hz": frame.setpoint_hz,
-        "adrc_hover_throttle": 100 * frame.schedule.hover,
-        "adrc_sigma_decay": 10 * frame.forgetting,
-    }
+def _judge(
+    stages: Mapping[str, ADRCStage], beyond: Sequence[str], targets: ADRCTargets, fresh: int,
+    grid: np.ndarray,
+) -> tuple[Kind, str]:  # fmt: skip
+    """The verdict, in words too."""
+    if beyond:
+        return "not to be flown", (
+            f"no parameters are proposed: {'; '.join(beyond)}. Allow more (`sensitivity`, "
+            "`resonance`, `noise`), or fly more excitation"
+        )
+    flown, best = stages["what flew"], stages["proposed"]
+    better = f"{best.rejection:.2f} of the effect of torque with what flew"
+    within = flown.peak <= targets.sensitivity and flown.resonance <= targets.resonance
+    if not np.isnan(flown.wc) and flown.stable == 1 and within and best.rejection > _WORTH:
+        return "kept", (
+            f"what flew is kept: within the limits the best parameters leave {better}. Its worst "
+            f"Ms on {fresh} fresh plants is {flown.peak:.2f}"
+        )
+    where = f"from {grid[0]:.2f} to {grid[-1]:.2f}" if len(grid) > 1 else f"at {grid[0]:.2f}"
+    return "proposed", (
+        f"proposed: stable on all {fresh} fresh plants {where} throttle, worst Ms {best.peak:.2f} "
+        f"of at most {targets.sensitivity:g}, {better}"
+    )
 
 
-def _search(
-    loops: Sequence[ADRCLoop], bounds: tuple[Design, Design], targets: ADRCTargets, edge: float,
-    before: Design | None,
-) -> Design:  # fmt: skip
-    """The whole numbers with the least effect of torque; where none keep the targets: nearest."""
-    low, high = bounds
-    score = _Score(loops, targets, edge, before)
-    rough = _Score([loop.first() for loop in loops], targets, edge, before)
-    middle, half = np.log(low * high) / 2, np.log(high / low) / 2
-    for level in range(_LEVELS):
-        axes = [
-            np.clip(np.linspace(m - h, m + h, _POINTS), np.log(a), np.log(b))
-            for m, h, a, b in zip(middle, half, low, high, strict=True)
-        ]
-        points = np.stack([x.ravel() for x in np.meshgrid(*axes, indexing="ij")], axis=1)
-        used = rough if level < _ROUGH else score
-        middle, half = points[np.argmin(used(np.exp(points)))], _NARROWED * half
-    edges = zip(np.exp(middle), np.ceil(low), np.floor(high), strict=True)
-    near = [np.unique(np.clip([np.floor(x), np.ceil(x)], a, b)) for x, a, b in edges]
-    stored = np.array(list(itertools.product(*near)))
-    return stored[np.argmin(score(stored))]
-
-
-class _Score:
+def _score(
+    loops: Sequence[ADRCLoops], targets: ADRCTargets, edge: float, before: Design | None
+) -> Callable[[Designs], Float[np.ndarray, " designs"]]:
     """The effect of torque; designs beyond a target come after all that keep them."""
+    limit, flown = _RESERVE * targets.sensitivity, [loop.flown() for loop in loops]
+    last = lambda x, beyond: np.where(np.all(x.stable, axis=1), beyond, 1e6 * beyond)
 
-    def __init__(
-        self, loops: Sequence[ADRCLoop], targets: ADRCTargets, edge: float, before: Design | None
-    ):
-        self.loops, self.targets, self.edge, self.before = loops, targets, edge, before
-        self.flown = [loop.flown() for loop in loops]
-
-    def __call__(self, designs: Designs) -> Float[np.ndarray, " designs"]:
-        parts = np.array_split(designs, max(1, len(designs) // 64))
-        return np.concatenate([self._of(part) for part in parts])
-
-    def _of(self, designs: Designs) -> Float[np.ndarray, " designs"]:
+    def score(designs: Designs) -> Float[np.ndarray, " designs"]:
         worst, rejected = designs[:, 0] / designs[:, 1], np.zeros(len(designs))  # wc at most wo
-        targets = self.targets
-        for loop, flown in zip(self.loops, self.flown, strict=True):
-            qualities = loop.qualities(designs)
+        for loop, flew in zip(loops, flown, strict=True):
+            x = loop.qualities(designs)
             beyond = np.stack([
-                np.max(qualities.peak, axis=1) / (_RESERVE * targets.sensitivity),
-                np.max(qualities.resonance, axis=1) / (_RESERVE * targets.resonance),
-                np.mean(qualities.noise / flown.noise, axis=1) / (_RESERVE * targets.noise),
-                np.max(qualities.crossover, axis=1) / self.edge,
-            ]).max(axis=0)  # fmt: skip
-            worst = np.maximum(
-                worst, np.where(np.all(qualities.stable, axis=1), beyond, 1e6 * beyond)
-            )
-            worst = np.maximum(worst, self._on_the_way(loop, flown, designs))
-            rejected += np.mean((qualities.rejection / flown.rejection) ** 2, axis=1)
-        return np.where(worst <= 1, np.sqrt(rejected / len(self.loops)), 1e9 * worst)
+                np.max(x.peak, axis=1) / limit,
+                np.max(x.resonance, axis=1) / (_RESERVE * targets.resonance),
+                np.mean(x.noise / flew.noise, axis=1) / (_RESERVE * targets.noise),
+                np.max(x.crossover, axis=1) / edge,
+            ])  # fmt: skip
+            worst = np.maximum(worst, last(x, beyond.max(axis=0)))
+            if before is not None:  # Ms a third of the way, or that of what flew
+                third = loop.qualities(_third(before, designs))
+                allowed = max(limit, float(np.max(flew.peak)))
+                worst = np.maximum(worst, last(third, np.max(third.peak, axis=1) / allowed))
+            rejected += np.mean((x.rejection / flew.rejection) ** 2, axis=1)
+        return np.where(worst <= 1, np.sqrt(rejected / len(loops)), 1e9 * worst)
 
-    def _on_the_way(
-        self, loop: ADRCLoop, flown: LoopQualities, designs: Designs
-    ) -> Float[np.ndarray, " designs"]:
-        """Ms a third of the way, over the greatest that is allowed there."""
-        if self.before is None:
-            return np.zeros(len(designs))
-        qualities = loop.qualities(a_third(self.before, designs))
-        allowed = max(_RESERVE * self.targets.sensitivity, float(np.max(flown.peak)))
-        beyond = np.max(qualities.peak, axis=1) / allowed
-        return np.where(np.all(qualities.stable, axis=1), beyond, 1e6 * beyond)
+    parts = lambda designs: np.array_split(designs, max(1, len(designs) // 64))
+    return lambda designs: np.concatenate([score(part) for part in parts(designs)])

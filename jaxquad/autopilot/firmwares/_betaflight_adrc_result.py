@@ -1,34 +1,47 @@
 """What a Betaflight log says for its proposed ADRC: the report, and the files to load."""
 
 import dataclasses
-import shlex
 from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 
-from jaxquad._core import announce, plain_content, write_file
+from jaxquad._core import plain_content, write_file
 from jaxquad.identify import GainBand, GainOverThrottle
 from jaxquad.plot import StepBand, ThrottleCurve
 from jaxquad.records import AXES
-from jaxquad.report import Headline, Provenance, provenance, Table, write_json
+from jaxquad.report import Headline, Provenance, Table
 
-from .._files import change_table, parameter_file, ParameterChange, propose_changes, WordChange
 from .._filters import FilterChain, PT2
 from .._flight_channels import FlightChannels
-from .._identified import DesignSettings
-from .._page import B0Section, Chains, PilotPage, write_pilot_page
-from .._parameters import find_parameter
-from .._pilot_page import chains_of, change_rows, logged_terms, motor_rows, StepGrid, VERDICTS
-from .._rate_design import Kind
-from .._reproduce_flight import Reproduction
-from ._betaflight_adrc import adrc_parameters, b0_law, FlownADRC
-from ._betaflight_adrc_design import ADRCFrame, ADRCProposal, Flown, make_adrc_loop
+from .._page import (
+    B0Section,
+    Chains,
+    chains_of,
+    change_rows,
+    logged_terms,
+    motor_rows,
+    PilotPage,
+    VERDICTS,
+)
+from .._parameters import (
+    change_table,
+    find_parameter,
+    parameter_file,
+    ParameterChange,
+    propose_changes,
+    WordChange,
+)
+from .._proposal import write_result
+from .._rate_loops import StepGrid
+from .._replay import Reproduction
+from .._stages import DesignSettings, Kind
+from ._betaflight_adrc import adrc_loops, adrc_parameters, b0_law, Flown, FlownADRC
+from ._betaflight_adrc_design import ADRCProposal
 
 
 _BUILD = (2026, 6)  # whose names a file of the ADRC has
 _STEM = "proposal"
-_PID = ("p", "i", "d")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -65,27 +78,37 @@ class ADRCAutopilot:
         return isinstance(self.flown, FlownADRC)
 
     @property
-    def old(self) -> dict[str, float]:
-        """What the firmware held of the parameters that are proposed; its defaults where the log
-        does not say."""
-        flown = adrc_parameters(self.values)
-        default = lambda name: float(find_parameter("betaflight", name).default)
-        return {name: flown.get(name, default(name)) for name in self.new}
-
-    @property
     def new(self) -> dict[str, float]:
         """The parameters that are proposed; empty where nothing is."""
         return {} if self.proposal is None else dict(self.proposal.parameters)
 
     @property
+    def old(self) -> dict[str, float]:
+        """What the firmware held of these; its defaults where the log does not say it."""
+        flown = adrc_parameters(self.values)
+        default = lambda name: float(find_parameter("betaflight", name).default)
+        return {name: flown.get(name, default(name)) for name in self.new}
+
+    @property
     def changes(self) -> tuple[ParameterChange, ...]:
         """From what the firmware held to the proposal; where the PID flew all, changed or not."""
+        return self._changes(1.0)
+
+    def _changes(self, share: float) -> tuple[ParameterChange, ...]:
+        old, new, reasons = self.old, self.new, {}
+        if self.proposal is not None:
+            after, before = self.proposal.stage, self.proposal.stages["what flew"]
+            tuned = (
+                f"effect of torque {after.rejection:.2f} and command noise {after.noise:.2f} of "
+                f"what flew; Ms {before.peak:.2f} -> {after.peak:.2f}"
+            )
+            kept = "the certificate is of this value"
+            reasons = {name: tuned if name.endswith(self.axis) else kept for name in new}
         if self.flew_adrc:
-            return propose_changes("betaflight", self.old, self.new, reasons=self._reasons)
-        old, reasons = self.old, self._reasons
+            return propose_changes("betaflight", old, new, share=share, reasons=reasons)
         return tuple(
             ParameterChange(find_parameter("betaflight", name), old[name], value, reasons[name])
-            for name, value in self.new.items()
+            for name, value in new.items()
         )
 
     @property
@@ -104,42 +127,22 @@ class ADRCAutopilot:
             WordChange("pid_type", "CLASSIC", "ADRC", "the ADRC of pull request 15400 flies"),
         )
 
-    @property
-    def _reasons(self) -> dict[str, str]:
-        if self.proposal is None:
-            return {}
-        after, before = self.proposal.stage, self.proposal.stages["what flew"]
-        tuned = (
-            f"effect of torque {after.rejection:.2f} and command noise {after.noise:.2f} of what "
-            f"flew; Ms {before.peak:.2f} -> {after.peak:.2f}"
-        )
-        kept = "the certificate is of this value"
-        return {name: tuned if name.endswith(self.axis) else kept for name in self.new}
-
     def content(self) -> dict[str, object]:
         """All of it, for JSON."""
+        proposal, plant = self.proposal, self.plant
         content = {
-            "kind": self.kind,
-            "verdict": self.verdict,
-            "firmware": "betaflight",
-            "version": self.version,
-            "axis": self.axis,
-            "law": "adrc",
-            "flown_law": "adrc" if self.flew_adrc else "pid",
-            "flown": self.flown.parameters(),
-            "unmodelled": self.flown.unmodelled,
-            "old": self.old,
-            "new": self.new,
+            "kind": self.kind, "verdict": self.verdict, "firmware": "betaflight",
+            "version": self.version, "axis": self.axis, "law": "adrc",
+            "flown_law": "adrc" if self.flew_adrc else "pid", "flown": self.flown.parameters(),
+            "unmodelled": self.flown.unmodelled, "old": self.old, "new": self.new,
             "words": [x._asdict() for x in self.words],
-            "proposal": None if self.proposal is None else self.proposal.content(),
+            "proposal": None if proposal is None else proposal.content(),
             "reproduction": [
-                {"throttle": throttle} | loop.to_dict()
-                for throttle, loop in self.reproductions.items()
+                {"throttle": x} | loop.to_dict() for x, loop in self.reproductions.items()
             ],
-            "plant": None if self.plant is None else self.plant.to_dict(),
-            "remarks": self.remarks,
-            "settings": self.settings.content(),
-        }
+            "plant": None if plant is None else plant.to_dict(),
+            "remarks": self.remarks, "settings": self.settings.content(),
+        }  # fmt: skip
         return {key: plain_content(value) for key, value in content.items()}
 
     @property
@@ -159,15 +162,13 @@ class ADRCAutopilot:
             )
         if self.words:
             others = " and ".join(axis for axis in AXES if axis != self.axis)
-            remarks.append(
+            remarks += [
                 "pid_type, adrc_hover_throttle and adrc_b0_law are those of all three axes: before "
                 f"a flight tune {others}, too, from logs of their own with the same hover throttle "
-                f"({self.new['adrc_hover_throttle']:.0f} %), and load all three files"
-            )
-            remarks.append(
+                f"({self.new['adrc_hover_throttle']:.0f} %), and load all three files",
                 "there is no file for a third of the way, because between PID and ADRC there is "
-                "none; the file that reverts it switches back to the PID"
-            )
+                "none; the file that reverts it switches back to the PID",
+            ]
         if self.words and not adrc_parameters(self.values):
             remarks.append("the log does not hold the old values: they are the firmware's defaults")
         if (linear := float(self.values.get("thrust_linear", 0.0))) > 0:
@@ -175,8 +176,33 @@ class ADRCAutopilot:
                 f"thrust_linear {linear:g} flew and stays: the gain over the throttle is that with "
                 "it, taken as a straight line"
             )
-        if self.proposal is not None and self.plant is not None:
-            remarks += _remarks_on_b0(self.plant, self.proposal, self.flew_adrc)
+        proposal, plant = self.proposal, self.plant
+        if proposal is None or plant is None:
+            return tuple(remarks)
+        schedule, scaled, throttle = proposal.schedule, proposal.scaled, proposal.throttle
+        most = float(schedule.scale(throttle[-1]))
+        if scaled is None:
+            remarks.append(
+                f"b0 over the throttle is not known, and adrc_b0_law {schedule.law} is "
+                f"{'what flew' if self.flew_adrc else 'the default'}: the certificate is of "
+                f"{throttle[0]:.2f} throttle alone; {plant.what_to_fly()}"
+            )
+            return tuple(remarks)
+        if most >= schedule.high > 1:
+            remarks.append(
+                f"at {throttle[-1]:.2f} throttle b0 is at adrc_b0_scale_max, {schedule.high:g}"
+            )
+        if self.flew_adrc and scaled.law != schedule.law:
+            off = {law: f"{100 * share:.0f} %" for law, share in scaled.deviations.items()}
+            remarks.append(
+                f"adrc_b0_law {schedule.law} stays as it flew: it is off by up to "
+                f"{off[schedule.law]}, and {scaled.law} by {off[scaled.law]}"
+            )
+        if scaled.extrapolated:
+            remarks.append(
+                f"the hover throttle of {scaled.hover:.2f} lies outside of what was flown, "
+                f"{float(plant.low.min()):.2f} to {float(plant.high.max()):.2f}"
+            )
         return tuple(remarks)
 
     def write(self, folder: str | Path) -> list[Path]:
@@ -184,52 +210,36 @@ class ADRCAutopilot:
 
         **Returns:** their paths.
         """
-        announce("parameter files")
-        folder = Path(folder)
-        stated = {k: v for k, v in self.settings.content().items() if v is not None}
-        words = ["jaxquad", "autopilot", str(self.path), *self.settings.words()]
-        origin = provenance(self.path, command=shlex.join(words), settings=stated)
-        content = self.content() | {"provenance": origin.content()}
-        stored = write_json(folder / "autopilot.json", content)
-        announce("the page")
-        page = write_pilot_page(folder / "autopilot.html", adrc_page(self, origin))
-        return [page, stored, *(write_file(folder / k, text) for k, text in self._texts().items())]
+        path = Path(folder)
+        files = lambda: [write_file(path / name, text) for name, text in self._texts().items()]
+        pages = lambda origin: [adrc_page(self, origin)]
+        return write_result(path, self.path, self.settings, self.content(), files, pages)
 
     def _texts(self) -> dict[str, str]:
-        """The parameter files, and the table of what changes."""
+        """The parameter files, and the table of what changes; without a proposal what flew."""
         if not self.new:
-            return {f"{_STEM}_revert.txt": self._what_flew()}
+            start = ("adrc_wc", "adrc_wo", "adrc_b0") if self.flew_adrc else ("p", "i", "d")
+            flown, version = self.flown.parameters(), self.version or (2025, 12)
+            names = [f"{name}_{self.axis}" for name in start]
+            rows = [(find_parameter("betaflight", name), flown[name]) for name in names]
+            text = parameter_file(
+                "betaflight", [ParameterChange(row, x, x) for row, x in rows], revert=True,
+                version=version, profile=None, title="what flew",
+                raised=[axis for axis in AXES if f"d_max_{axis}" in flown],
+            )  # fmt: skip
+            return {f"{_STEM}_revert.txt": text}
+        texts, table = {}, []
         file = lambda changes, title, revert=False: parameter_file(
             "betaflight", changes, revert=revert, version=_BUILD, profile=None, words=self.words,
             title="\n".join([title, *self.remarks]),
         )  # fmt: skip
-        stages, table = {}, []
         for percent in (33, 100) if self.flew_adrc else (100,):
-            share = 1.0 if percent == 100 else 1 / 3
-            changes = (
-                propose_changes(
-                    "betaflight", self.old, self.new, share=share, reasons=self._reasons
-                )
-                if self.flew_adrc else self.changes
-            )  # fmt: skip
+            changes = self._changes(1.0 if percent == 100 else 1 / 3)
             title = f"{percent} % of the way from what flew to the proposal"
-            stages[f"{_STEM}_{percent:03d}.txt"] = file(changes, title)
+            texts[f"{_STEM}_{percent:03d}.txt"] = file(changes, title)
             table.append(f"## {title}\n\n{change_table(changes, self.words)}")
-        back = {f"{_STEM}_revert.txt": file(self.changes, "what flew", True)}
-        return stages | back | {f"{_STEM}.md": "\n".join(table)}
-
-    def _what_flew(self) -> str:
-        """The parameters of the axis that flew, as a file."""
-        start = ("adrc_wc", "adrc_wo", "adrc_b0") if self.flew_adrc else _PID
-        flown, version = self.flown.parameters(), self.version or (2025, 12)
-        same = [
-            ParameterChange(find_parameter("betaflight", name), flown[name], flown[name])
-            for name in (f"{name_start}_{self.axis}" for name_start in start)
-        ]
-        return parameter_file(
-            "betaflight", same, revert=True, version=version, profile=None, title="what flew",
-            raised=[axis for axis in AXES if f"d_max_{axis}" in flown],
-        )  # fmt: skip
+        texts[f"{_STEM}_revert.txt"] = file(self.changes, "what flew", True)
+        return texts | {f"{_STEM}.md": "\n".join(table)}
 
     @property
     def shown_again(self) -> Mapping[float, Reproduction]:
@@ -242,26 +252,25 @@ class ADRCAutopilot:
 
     def __str__(self) -> str:
         version, law = ".".join(map(str, self.version)), "ADRC" if self.flew_adrc else "PID"
-        lines = [
-            f"betaflight {version}, rate loop of {self.axis}: the {law} flew".replace(" ,", ",")
-        ]
-        of_axis = {k: x for k, x in self.flown.parameters().items() if k.endswith(f"_{self.axis}")}
-        lines += [f"  {name} = {value:.6g}" for name, value in of_axis.items()]
+        head = f"betaflight {version}, rate loop of {self.axis}: the {law} flew"
+        values = self.flown.parameters().items()
+        lines = [head.replace(" ,", ",")]
+        lines += [f"  {name} = {x:.6g}" for name, x in values if name.endswith(f"_{self.axis}")]
         if isinstance(self.flown, FlownADRC):
             schedule = self.flown.schedule
             lines.append(f"  adrc_b0_law = {schedule.law}, hover {100 * schedule.hover:.0f} %")
         lines += [f"  not modelled: {x}" for x in self.flown.unmodelled]
-        lines += ["", str(self.plant)] if self.plant is not None else []
         again = [
-            f"flown loop at {throttle:.2f} throttle: {loop.verdict}"
-            for throttle, loop in self.shown_again.items()
+            f"flown loop at {x:.2f} throttle: {y.verdict}" for x, y in self.shown_again.items()
         ]
-        lines += ["", *again] if again else []
-        if self.proposal is not None:
-            lines += ["", self.proposal.table()]
-        if self.new:
-            lines += ["", change_table(self.changes, self.words).rstrip()]
-        lines += ["", *(f"! {x}" for x in self.remarks)] if self.remarks else []
+        parts = (
+            [] if self.plant is None else [str(self.plant)], again,
+            [] if self.proposal is None else [self.proposal.table()],
+            [change_table(self.changes, self.words).rstrip()] if self.new else [],
+            [f"! {x}" for x in self.remarks],
+        )  # fmt: skip
+        for part in parts:
+            lines += ["", *part] if part else []
         return "\n".join([*lines, "", self.verdict])
 
 
@@ -272,40 +281,13 @@ def doubted_throttle(again: Mapping[float, Reproduction]) -> float | None:
     return next(iter(off or (again if blind else ())), None)
 
 
-def _remarks_on_b0(plant: GainOverThrottle, proposal: ADRCProposal, flew: bool) -> list[str]:
-    schedule, scaled = proposal.schedule, proposal.scaled
-    if scaled is None:
-        return [
-            f"b0 over the throttle is not known, and adrc_b0_law {schedule.law} is "
-            f"{'what flew' if flew else 'the default'}: the certificate is of "
-            f"{proposal.throttle[0]:.2f} throttle alone; {plant.what_to_fly()}"
-        ]
-    remarks, most = [], float(schedule.scale(proposal.throttle[-1]))
-    if most >= schedule.high > 1:
-        remarks.append(
-            f"at {proposal.throttle[-1]:.2f} throttle b0 is at adrc_b0_scale_max, {schedule.high:g}"
-        )
-    if flew and scaled.law != schedule.law:
-        off = scaled.deviations
-        remarks.append(
-            f"adrc_b0_law {schedule.law} stays as it flew: it is off by up to "
-            f"{100 * off[schedule.law]:.0f} %, and {scaled.law} by {100 * off[scaled.law]:.0f} %"
-        )
-    if scaled.extrapolated:
-        remarks.append(
-            f"the hover throttle of {scaled.hover:.2f} lies outside of what was flown, "
-            f"{float(plant.low.min()):.2f} to {float(plant.high.max()):.2f}"
-        )
-    return remarks
-
-
 _PLANTS, _SEED = 100, 77  # of the steps' bands
 _POINTS = 60  # of a curve over the throttle
 
 
 def adrc_page(result: ADRCAutopilot, origin: Provenance) -> PilotPage:
     """All that the page shows."""
-    version, proposal, plant = ".".join(map(str, result.version)), result.proposal, result.plant
+    version, proposal = ".".join(map(str, result.version)), result.proposal
     flown, flight, axis = result.flown, result.flight, AXES.index(result.axis)
     headlines = [Headline(*VERDICTS[result.kind], result.verdict)]
     for throttle, again in result.shown_again.items():
@@ -313,56 +295,40 @@ def adrc_page(result: ADRCAutopilot, origin: Provenance) -> PilotPage:
         word = "THE FLOWN LOOP AGAIN" if flew else "THE FLOWN LOOP IS NOT REPRODUCED"
         level = "good" if flew else "warn" if again.kind == "unknown" else "bad"
         headlines.append(Headline(level, word, f"at {throttle:.2f} throttle: {again.verdict}"))
-    pid = flown.pid.law if isinstance(flown, FlownADRC) else flown.law
-    chains = chains_of(pid, axis)
-
-    def with_observer(cutoff: float) -> Chains:
-        observer = (FilterChain((PT2(cutoff),), 1 / pid.dt),) if cutoff > 0 else ()
-        return {"gyro": chains["gyro"], "observer": observer}
-
-    filters: dict[str, Chains] = {"flown": chains}
+    pid, cutoff = flown, result.new.get("adrc_gyro_lpf_hz", 0.0)
     if isinstance(flown, FlownADRC):
-        filters = {"flown": with_observer(flown.lowpass_hz)}
-    elif result.new:
-        filters["proposed"] = with_observer(result.new["adrc_gyro_lpf_hz"])
-    steps, b0, stages = {}, None, None
-    if proposal is not None and plant is not None:
-        steps, b0 = _steps_and_b0(result, proposal, plant)
-        stages = stage_table(proposal, result.settings.fresh)
+        pid, cutoff = flown.pid, flown.frame.lowpass_hz
+    chains = chains_of(pid.law, axis)
+    observer = (FilterChain((PT2(cutoff),), 1 / pid.law.dt),) if cutoff > 0 else ()
+    filters: dict[str, Chains] = {"flown": chains}
+    if result.flew_adrc or result.new:
+        design = "flown" if result.flew_adrc else "proposed"
+        filters[design] = {"gyro": chains["gyro"], "observer": observer}
+    steps, b0 = ({}, None) if proposal is None else _steps_and_b0(result, proposal)
     return PilotPage(
         title=f"betaflight {version}, ADRC for {result.axis}".replace(" ,", ","),
         headlines=headlines,
         remarks=[*result.remarks, *(f"not modelled: {text}" for text in flown.unmodelled)],
-        filters=filters,
-        steps=steps,
-        b0=b0,
+        filters=filters, steps=steps, b0=b0, terms_are="as logged", unit="pidsum",
         terms={} if flight is None or not flight.terms else logged_terms(flight),
-        terms_are="as logged",
         motors=[] if flight is None else motor_rows(flight),
-        stages=stages,
+        stages=None if proposal is None else stage_table(proposal, result.settings.fresh),
         changes=change_rows(result.changes, result.words) if result.new else None,
-        text=str(result),
-        unit="pidsum",
-        provenance=origin,
-    )
+        text=str(result), provenance=origin,
+    )  # fmt: skip
 
 
 def _steps_and_b0(
-    result: ADRCAutopilot, proposal: ADRCProposal, plant: GainOverThrottle
-) -> tuple[dict[str, StepBand], B0Section]:
+    result: ADRCAutopilot, proposal: ADRCProposal
+) -> tuple[dict[str, StepBand], B0Section | None]:
     """Steps at the middle one of the throttles that were certified, and b0 over all of them."""
-    flown, schedule = result.flown, proposal.schedule
+    flown, schedule, plant = result.flown, proposal.schedule, result.plant
+    if plant is None:
+        return {}, None
     middle = proposal.throttle[len(proposal.throttle) // 2]
-    values = result.new or flown.parameters()
-    frame = ADRCFrame(
-        schedule, values.get("adrc_gyro_lpf_hz", 150.0), values.get("adrc_td_hz", 0.0),
-        values.get("adrc_sigma_decay", 3.0) / 10,
-    )  # fmt: skip
-    grid = StepGrid.of(flown.law.dt)
-    loop = make_adrc_loop(
-        plant, flown, AXES.index(result.axis), middle, frame, _PLANTS,
-        result.settings.seed + _SEED, grid.omega,
-    )  # fmt: skip
+    grid, place = StepGrid.of(flown.law.dt), AXES.index(result.axis)
+    seed = result.settings.seed + _SEED
+    loop = adrc_loops(plant, flown, place, middle, proposal.frame, _PLANTS, seed, grid.omega)
     at = f", {middle:.2f} throttle"
     steps = {f"{'ADRC' if result.flew_adrc else 'PID'} flown{at}": grid.band(loop.closed(None))}
     levels = [plant.b0(k) for k in range(plant.throttle.size)]
@@ -387,15 +353,7 @@ def _steps_and_b0(
 
 def stage_table(proposal: ADRCProposal, fresh: int) -> Table:
     """What parameters give on fresh plants, for the page."""
-    number = lambda x: "-" if np.isnan(x) else f"{x:.0f}"
-    rows = [
-        [
-            name, number(x.wc), number(x.wo), number(x.b0), f"{100 * x.stable:.1f}",
-            f"{x.peak:.2f}", f"{x.resonance:.2f}", f"{x.crossover / (2 * np.pi):.1f}",
-            f"{x.rejection:.2f}", f"{x.noise:.2f}",
-        ]
-        for name, x in proposal.stages.items()
-    ]  # fmt: skip
+    rows = [[name, *stage.cells()] for name, stage in proposal.stages.items()]
     heads = (
         "parameters", "wc", "wo", "b0", "stable, %", "worst Ms", "worst peak", "crossover, Hz",
         "torque", "noise",

@@ -24,12 +24,16 @@ _SWEEP = (0.5, 40.0, 15.0, 150.0)  # Hz, Hz, s, deg/s
 _LAG, _LATE = 0.025, 2  # of the motors in s; of speed controllers and sensor, in PID loops
 _NOISE, _GUST_TIME = 1.0, 0.3  # deg/s, s
 _START_US = 6_500_000
+_PT2_HZ = 5.0 * 1.553773974  # of the poles of anti-gravity's filter
 _ARMED, _CHIRPING = 1, 1 | 1 << 6  # flightModeFlags: ARM, CHIRP
 
 # Beyond the hold: the motors' part, and the gyro sample from the filters to the PID loop.
 CHIRP_TRUTH: Mapping[str, float] = MappingProxyType(
     {"gain": 36.0, "lag": _LAG, "delay": (_LATE + 0.5) * _DT}
 )
+
+
+Loops = Float[np.ndarray, " loops"]
 
 
 class _Axis(NamedTuple):
@@ -88,58 +92,63 @@ def write_chirp_log(path: str | Path, seed: int = 0) -> Path:
     slow = [_coded(np.array([[ord("S"), mode, 0, 0, 1, 1]])) for mode in (_ARMED, _CHIRPING)]
     frames = slow[0] + _coded(rows[:first]) + slow[1] + _coded(rows[first : last + 1])
     frames += slow[0] + _coded(rows[last + 1 :]) + b"E\xffEnd of log\0"
-    return write_file(Path(path), _header(list(columns)).encode() + frames)
+    joined, count = lambda numbers: ",".join(map(str, numbers)), len(columns)
+    signs = [int(name not in _UNSIGNED) for name in columns]
+    lines = {
+        "Product": "Blackbox flight data recorder by Nicholas Sherlock", "Data version": 2,
+        "Field I name": ",".join(columns), "Field I signed": joined(signs),
+        "Field I predictor": joined([0] * count),
+        "Field I encoding": joined([1 - sign for sign in signs]),
+        "Field P predictor": joined([1] * count), "Field P encoding": joined([0] * count),
+        "Field S name": "flightModeFlags,stateFlags,failsafePhase,rxSignalReceived,"
+        "rxFlightChannelsValid",
+        "Field S signed": "0,0,0,0,0", "Field S predictor": "0,0,0,0,0",
+        "Field S encoding": "1,1,1,1,1", **_SETTINGS,
+    }  # fmt: skip
+    header = "".join(f"H {name}:{value}\n" for name, value in lines.items())
+    return write_file(Path(path), header.encode() + frames)
 
 
 def _fly(random: np.random.Generator) -> tuple[dict[str, np.ndarray], np.ndarray]:
     """The log's columns as coded integers, and where the chirp is on."""
     time = np.arange(round(_END * _LOOP_HZ)) * _DT
     throttle = _HOVER * np.clip((time - _LIFT_OFF) / _RISE, 0, 1)
-    phase, frequency, excitation = _chirp(time)
-    setpoint = np.zeros((3, time.size))
-    setpoint[0] = _SWEEP[3] * _lead_lag(excitation)
-    now = slice(None, None, _LOGGED)
-    flown = [_fly_axis(x, r, throttle, random) for x, r in zip(_AXES, setpoint, strict=True)]
-    p, i, d, gyro, raw = np.stack(flown, axis=1)[:, :, now]
-    stick, wanted, boosted = throttle[now], setpoint[:, now], _boosted(throttle)[now]
-    on, off = frequency[now] > 0, np.zeros_like(stick)
-    values = {
-        "loopIteration": np.arange(time.size)[now],
-        "time": _START_US + np.round(1e6 * time[now]),
-        **_three("axisP", p), **_three("axisI", i), "axisD[0]": d[0], "axisD[1]": d[1],
-        **_three("axisF", np.zeros_like(p)), **_three("rcCommand", np.zeros_like(p)),
-        "rcCommand[3]": 1000 + 1000 * stick, **_three("setpoint", wanted),
-        "setpoint[3]": 1000 * boosted, **_three("gyroADC", gyro), **_three("gyroUnfilt", raw),
-        "debug[0]": 5000 * phase[now], "debug[1]": np.where(on, off, -1),
-        "debug[2]": 10 * frequency[now], "debug[3]": 1000 * excitation[now],
-        **_motors(boosted, (p + i + d) / 1000),
-    }  # fmt: skip
-    unsigned = np.array([name in _UNSIGNED for name in values])
-    rounded = np.rint(np.stack(list(values.values()))).astype(np.int64)
-    folded = np.where(unsigned[:, None], rounded, (rounded << 1) ^ (rounded >> 63))
-    return dict(zip(values, folded, strict=True)), on
-
-
-def _three(name: str, rows: Float[np.ndarray, "3 samples"]) -> dict[str, np.ndarray]:
-    return {f"{name}[{k}]": row for k, row in enumerate(rows)}
-
-
-def _chirp(time: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Phase from 0 to 2 pi, frequency in Hz and excitation: zero where the chirp is off."""
-    low, high, duration, _ = _SWEEP
+    low, high, duration, amplitude = _SWEEP
     on = (time >= _CHIRP) & (time < _CHIRP + duration)
     frequency = np.where(on, low * (high / low) ** ((time - _CHIRP) / duration), 0.0)
     turns = 2 * np.pi * duration / np.log(high / low) * (frequency - low)
     phase = np.where(on, turns % (2 * np.pi), 0.0)
-    return phase, frequency, on * np.cos(phase) * np.minimum(frequency, 1.0)
-
-
-def _lead_lag(excitation: np.ndarray) -> np.ndarray:
-    """From chirp_lag_freq_hz 3 to chirp_lead_freq_hz 30, as the firmware makes it discrete."""
+    excitation = on * np.cos(phase) * np.minimum(frequency, 1.0)
+    # From chirp_lag_freq_hz 3 to chirp_lead_freq_hz 30, as the firmware makes it discrete.
     omega, share = 2 * np.pi * np.sqrt(3.0 * 30.0) * _DT, 3.0 / 30.0
     alpha = (12 - omega**2) / (6 * omega * np.sqrt(share))
     ahead, behind = [1 + alpha * share, 1 - alpha * share], [1 + alpha, 1 - alpha]
-    return np.asarray(lfilter(ahead, behind, excitation))
+    setpoint = np.zeros((3, time.size))
+    setpoint[0] = amplitude * np.asarray(lfilter(ahead, behind, excitation))
+    now = slice(None, None, _LOGGED)
+    flown = [_fly_axis(x, r, throttle, random) for x, r in zip(_AXES, setpoint, strict=True)]
+    p, i, d, gyro, raw = np.stack(flown, axis=1)[:, :, now]
+    roll, pitch, yaw = (p + i + d) / 1000
+    # Of the mixer: throttle_boost 5, throttle_boost_cutoff 15.
+    boosted = np.clip(throttle + 0.5 * (throttle - _low_passed(15.0, throttle)), 0, 1)[now]
+    three = lambda name, rows: {f"{name}[{k}]": row for k, row in enumerate(rows)}
+    # A quad X: rear right, front right, rear left, front left.
+    mixed = (-roll + pitch + yaw, -roll - pitch - yaw, roll + pitch - yaw, roll - pitch + yaw)
+    values = {
+        "loopIteration": np.arange(time.size)[now],
+        "time": _START_US + np.round(1e6 * time[now]),
+        **three("axisP", p), **three("axisI", i), "axisD[0]": d[0], "axisD[1]": d[1],
+        **three("axisF", np.zeros_like(p)), **three("rcCommand", np.zeros_like(p)),
+        "rcCommand[3]": 1000 + 1000 * throttle[now], **three("setpoint", setpoint[:, now]),
+        "setpoint[3]": 1000 * boosted, **three("gyroADC", gyro), **three("gyroUnfilt", raw),
+        "debug[0]": 5000 * phase[now], "debug[1]": np.where(on[now], 0.0, -1),
+        "debug[2]": 10 * frequency[now], "debug[3]": 1000 * excitation[now],
+        **three("motor", [1055 + 945 * np.clip(boosted + x, 0, 1) for x in mixed]),
+    }  # fmt: skip
+    unsigned = np.array([name in _UNSIGNED for name in values])
+    rounded = np.rint(np.stack(list(values.values()))).astype(np.int64)
+    folded = np.where(unsigned[:, None], rounded, (rounded << 1) ^ (rounded >> 63))
+    return dict(zip(values, folded, strict=True)), on[now]
 
 
 def _share(cutoff_hz: float | np.ndarray, dt: float) -> float | np.ndarray:
@@ -153,33 +162,8 @@ def _low_passed(cutoff_hz: float, signal: np.ndarray) -> np.ndarray:
     return np.asarray(lfilter([share], [1, share - 1], signal))
 
 
-def _boosted(throttle: np.ndarray) -> np.ndarray:
-    """Of the mixer: throttle_boost 5, throttle_boost_cutoff 15."""
-    return np.clip(throttle + 0.5 * (throttle - _low_passed(15.0, throttle)), 0, 1)
-
-
-def _by_throttle(throttle: np.ndarray) -> tuple[np.ndarray, ...]:
-    """TPA, anti-gravity, and dynamic low-passes of gyro and D: they act one loop later."""
-    previous = np.concatenate([throttle[:1], throttle[:-1]])
-    before = np.concatenate([throttle[:1], previous[:-1]])
-    faded = np.maximum.accumulate(previous) >= 0.05
-    low = 1 - 0.2 / 0.05 * (0.05 - previous)
-    tpa = np.where(faded, 1.0, low)  # the throttle stays below tpa_breakpoint
-    speed = np.abs(previous - before) * _LOOP_HZ * (1 - previous) ** 2
-    speed = speed * np.where(previous > before, 0.5 * (1 - previous), 1)
-    pt2 = 5.0 * 1.553773974
-    gravity = 80 * _low_passed(pt2, _low_passed(pt2, speed))
-    steps = np.rint(100 * previous) / 100
-    curve = steps * (1 - steps) * 0.5 + steps
-    gyro, dterm = (_share(low * (1 + curve), _DT) for low in (250.0, 75.0))
-    return tpa, gravity, np.asarray(gyro), np.asarray(dterm)
-
-
 def _fly_axis(
-    axis: _Axis,
-    setpoint: Float[np.ndarray, " loops"],
-    throttle: Float[np.ndarray, " loops"],
-    random: np.random.Generator,
+    axis: _Axis, setpoint: Loops, throttle: Loops, random: np.random.Generator
 ) -> Float[np.ndarray, "5 loops"]:
     """P, I, D, the gyro that the law takes and the newest raw gyro, loop by loop.
 
@@ -190,18 +174,26 @@ def _fly_axis(
     hold = np.exp(-_DT / _GUST_TIME)
     shocks = axis.gust * np.sqrt(1 - hold**2) * random.standard_normal(setpoint.size)
     gusts = np.asarray(lfilter([1], [1, -hold], shocks))
-    tpa, gravity, gyro_share, d_share = _by_throttle(throttle)
-    relax = np.ones_like(setpoint)
-    boost = np.zeros_like(setpoint)
+    # TPA, anti-gravity, and dynamic low-passes of gyro and D act one loop later.
+    previous = np.concatenate([throttle[:1], throttle[:-1]])
+    before = np.concatenate([throttle[:1], previous[:-1]])
+    # The throttle stays below tpa_breakpoint.
+    low = 1 - 0.2 / 0.05 * (0.05 - previous)
+    tpa = np.where(np.maximum.accumulate(previous) >= 0.05, 1.0, low)
+    steps = np.rint(100 * previous) / 100
+    curve = steps * (1 - steps) * 0.5 + steps
+    gyro_share, d_share = (np.asarray(_share(hz * (1 + curve), _DT)) for hz in (250.0, 75.0))
+    relax, boost = np.ones_like(setpoint), np.zeros_like(setpoint)
     if not axis.p_lowpass_hz:  # roll and pitch: iterm_relax RP, SETPOINT, and anti-gravity
         relax = np.maximum(0, 1 - np.abs(setpoint - _low_passed(15.0, setpoint)) / 40)
-        boost = gravity
+        moved = np.abs(previous - before) * _LOOP_HZ * (1 - previous) ** 2
+        moved = moved * np.where(previous > before, 0.5 * (1 - previous), 1)
+        boost = 80 * _low_passed(_PT2_HZ, _low_passed(_PT2_HZ, moved))
     kp, ki, kd = np.array([0.032029, 0.244381 * axis.integral_factor, 0.000529]) * axis.pid
     attenuated = 1 + boost / np.maximum(np.abs(setpoint) / 50, 1) * 0.0034
     inputs = (
-        setpoint, noise[:, 0], noise[:, 1], gusts, throttle > 0,
-        kp * attenuated, (ki + 0.34 * boost) * _DT * relax, kd * _LOOP_HZ * tpa, gyro_share,
-        d_share,
+        setpoint, noise[:, 0], noise[:, 1], gusts, throttle > 0, kp * attenuated,
+        (ki + 0.34 * boost) * _DT * relax, kd * _LOOP_HZ * tpa, gyro_share, d_share,
     )  # fmt: skip
     ceiling, limit = 0.8 * axis.sum_limit, float(axis.sum_limit)
     step, gain = _DT / 2, axis.gain
@@ -234,30 +226,6 @@ def _fly_axis(
                 fast += second * (rate + last - fast)
                 gyro += share * (fast - gyro)
     return np.array(rows).T
-
-
-def _motors(throttle: np.ndarray, command: Float[np.ndarray, "3 samples"]) -> dict[str, np.ndarray]:
-    """A quad X: rear right, front right, rear left, front left."""
-    roll, pitch, yaw = command
-    mixed = (-roll + pitch + yaw, -roll - pitch - yaw, roll + pitch - yaw, roll - pitch + yaw)
-    return {f"motor[{k}]": 1055 + 945 * np.clip(throttle + x, 0, 1) for k, x in enumerate(mixed)}
-
-
-def _header(names: list[str]) -> str:
-    signs = [int(name not in _UNSIGNED) for name in names]
-    joined = lambda numbers: ",".join(map(str, numbers))
-    lines = {
-        "Product": "Blackbox flight data recorder by Nicholas Sherlock", "Data version": 2,
-        "Field I name": ",".join(names), "Field I signed": joined(signs),
-        "Field I predictor": joined([0] * len(names)),
-        "Field I encoding": joined([1 - sign for sign in signs]),
-        "Field P predictor": joined([1] * len(names)), "Field P encoding": joined([0] * len(names)),
-        "Field S name": "flightModeFlags,stateFlags,failsafePhase,rxSignalReceived,"
-        "rxFlightChannelsValid",
-        "Field S signed": "0,0,0,0,0", "Field S predictor": "0,0,0,0,0",
-        "Field S encoding": "1,1,1,1,1", **_SETTINGS,
-    }  # fmt: skip
-    return "".join(f"H {name}:{value}\n" for name, value in lines.items())
 
 
 def _coded(rows: Int[np.ndarray, "samples fields"]) -> bytes:

@@ -1,7 +1,6 @@
-"""Betaflight's PID, its angle mode, and what changes them in flight."""
+"""Betaflight's PID, its proposed ADRC, its angle mode, and what changes them in flight."""
 
 import dataclasses
-from collections.abc import Mapping
 from typing import ClassVar, Literal
 
 import equinox as eqx
@@ -10,23 +9,22 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
 from jaxquad._core import as_float, broadcast_gain, per_member, require_positive
-from jaxquad.control import Reference
+from jaxquad.control import Reference, Setpoint
 
 from .._filters import Filter, FilterChain, PT2, PT3
 from .._law import (
+    Advance,
     AngleLoop,
     bounded,
     DEGREES,
     filter_gyro,
     gyro_rest,
     low_pass_share,
+    Memories,
     RateLoop,
-    require_gains,
-    require_gyro_rate,
     Signal,
     split_reference,
     sum_of,
-    Terms,
 )
 
 
@@ -90,17 +88,17 @@ class DMax(eqx.Module):
     range: tuple[Filter, ...] | None = None
     smooth: tuple[Filter, ...] | None = None
 
-    def chains(self, rate_hz: float) -> tuple[FilterChain, FilterChain]:
-        """The low-pass of delta and that of the factor, at the loop's rate."""
+    def chains(self, dt: float) -> tuple[FilterChain, FilterChain]:
+        """The low-pass of delta and that of the factor."""
         range = (PT2(85.0),) if self.range is None else self.range
         smooth = (PT2(35.0),) if self.smooth is None else self.smooth
-        return FilterChain(range, rate_hz), FilterChain(smooth, rate_hz)
+        return FilterChain(range, 1 / dt), FilterChain(smooth, 1 / dt)
 
     def factor(
-        self, chains: tuple[FilterChain, FilterChain], memory: tuple[PyTree, PyTree],
-        delta: Signal, speed: Signal, d: Array,
-    ) -> tuple[tuple[PyTree, PyTree], Signal]:  # fmt: skip
+        self, dt: float, memory: tuple[PyTree, PyTree], delta: Signal, speed: Signal, d: Array
+    ) -> tuple[tuple[PyTree, PyTree], Signal]:
         """Of the D gain, 1 or above."""
+        chains = self.chains(dt)
         state, quick = chains[0].step(memory[0], delta)
         base = broadcast_gain(d, delta)
         most = broadcast_gain(self.ceiling, delta) / jnp.where(base > 0, base, 1.0)
@@ -111,7 +109,22 @@ class DMax(eqx.Module):
         return (state, smooth), jnp.minimum(1 + (most - 1) * share, most)
 
 
-class BetaflightPID(RateLoop):
+class BetaflightRate(RateLoop):
+    """What the rate laws of Betaflight have in common: the filters of the gyro, and its sticks."""
+
+    firmware: ClassVar[str] = "betaflight"
+    feed_forward: ClassVar[tuple[str, ...]] = ("f",)
+    of_sticks: ClassVar[bool] = True
+    filters: eqx.AbstractVar[tuple[Filter, ...]]  # of the gyro, at the loop's rate
+
+    def gyro_chains(self) -> list[FilterChain]:
+        return [self.gyro, FilterChain(self.filters, 1 / self.dt)] if self.filters else [self.gyro]
+
+    def without_gyro_filters(self) -> "BetaflightRate":
+        return dataclasses.replace(self, gyro=FilterChain(), filters=())
+
+
+class BetaflightPID(BetaflightRate):
     """Betaflight's rate loop: rates in rad/s in, the sum of P, I, D and F in pidsum units out.
 
         Sum = Kp e + I - Kd d/dt (filtered gyro) + Kf d/dt (set-point),    e = set-point - gyro
@@ -143,16 +156,9 @@ class BetaflightPID(RateLoop):
     - `integral_share`: of what the integral grows by; below 1 near the mixer's limits until 4.5.
     - `limit`: pidsum_limit; `integral_limit`: of the I term.
     - `dt`: of the PID loop in s.
-
-    **Raises:**
-
-    - `ValueError`: a gain is not finite, the gyro's rate is no multiple of 1/dt, or a filter lies
-        beyond half of its rate.
     """
 
-    firmware: ClassVar[str] = "betaflight"
-    feed_forward: ClassVar[tuple[str, ...]] = ("f",)
-    of_sticks: ClassVar[bool] = True
+    limits: ClassVar[tuple[str, ...]] = ("limit", "integral_limit")
     p: Float[Array, "..."] = per_member(rank=1, converter=as_float)
     i: Float[Array, "..."] = per_member(rank=1, converter=as_float)
     d: Float[Array, "..."] = per_member(rank=1, converter=as_float)
@@ -175,23 +181,21 @@ class BetaflightPID(RateLoop):
     dt: float = eqx.field(static=True, default=1 / 4000)  # s
 
     def __check_init__(self):
-        limits = {"limit": self.limit, "integral_limit": self.integral_limit}
-        require_gains(self.dt, {**self.gains(), "f": self.f}, limits)
-        require_gyro_rate(self.gyro, self.dt)
         self._chains()  # refuses what lies beyond half of the loop's rate
 
     def _chains(self) -> tuple[FilterChain, FilterChain]:
         """The filters of the rate and of its derivative, at the loop's rate."""
         return FilterChain(self.filters, 1 / self.dt), FilterChain(self.dterm, 1 / self.dt)
 
-    def gyro_chains(self) -> list[FilterChain]:
-        return [self.gyro, FilterChain(self.filters, 1 / self.dt)] if self.filters else [self.gyro]
-
     def derivative_chain(self, axis: int) -> FilterChain:
         return FilterChain(self.dterm, 1 / self.dt)
 
-    def without_gyro_filters(self) -> "BetaflightPID":
-        return dataclasses.replace(self, gyro=FilterChain(), filters=())
+    def levelled(self) -> "BetaflightPID":
+        """Inside of an angle loop, the integral is held from a fifth of the speed on."""
+        if self.relax is None:
+            return self
+        relax = dataclasses.replace(self.relax, threshold=0.2 * self.relax.threshold)
+        return dataclasses.replace(self, relax=relax)
 
     def holds_integral(self, axis: int) -> bool:
         return self.relax is not None and float(np.broadcast_to(self.relax.share, (3,))[axis]) > 0
@@ -202,9 +206,6 @@ class BetaflightPID(RateLoop):
         base, most = (float(np.broadcast_to(x, (3,))[axis]) for x in (self.d, self.d_max.ceiling))
         return max(1.0, most / base) if base > 0 else 1.0
 
-    def gains(self) -> dict[str, Array]:
-        return {"p": self.p, "i": self.i, "d": self.d}
-
     def rest(self, zero: Signal) -> dict[str, PyTree]:
         filters, dterm = self._chains()
         memory = {
@@ -214,16 +215,12 @@ class BetaflightPID(RateLoop):
         if self.relax is not None:
             memory["slow"] = zero
         if self.d_max is not None:
-            memory["d_max"] = tuple(x.init(zero) for x in self.d_max.chains(1 / self.dt))
+            memory["d_max"] = tuple(x.init(zero) for x in self.d_max.chains(self.dt))
         return memory
 
     def advance(
-        self,
-        memory: Mapping[str, PyTree],
-        excess: Signal,
-        reference: Reference,
-        measurement: Signal,
-    ) -> tuple[dict[str, PyTree], Signal, Terms]:
+        self, memory: Memories, excess: Signal, reference: Reference, measurement: Signal
+    ) -> Advance:
         at = lambda gain: broadcast_gain(gain, measurement)
         r, speed = split_reference(reference, memory["reference"], self.dt)
         gyro, (smooth, _) = filter_gyro(self.gyro, self.dt, memory["gyro"], DEGREES * measurement)
@@ -234,47 +231,131 @@ class BetaflightPID(RateLoop):
         pulled = P_SCALE * at(self.p) * at(self.tpa_p) * (DEGREES * r - y)
         share = low_pass_share(self.p_lowpass_hz, self.dt, y)
         next["p"] = memory["p"] + share * (pulled - memory["p"])
-        relaxed, error = self._relaxed(memory, DEGREES * r, y)
+        error = DEGREES * r - y
+        if self.relax is not None:
+            share = low_pass_share(self.relax.cutoff_hz, self.dt, y)
+            next["slow"] = memory["slow"] + share * (DEGREES * r - memory["slow"])
+            error = self.relax.error(next["slow"], DEGREES * r, y, memory["integral"])
         ki = I_SCALE * at(self.i) * at(self.integral_factor) + at(self.accelerator)
         grown = ki * self.dt * at(self.integral_share) * error
         next["integral"] = bounded(memory["integral"] + grown, self.integral_limit)
         boost = 1 + at(self.p_boost) / jnp.maximum(jnp.abs(DEGREES * r) / _BOOSTED, 1.0)
-        delta = (memory["d"] - next["d"]) / self.dt
-        raised, factor = self._raised(memory, delta, DEGREES * speed)
+        delta, factor = (memory["d"] - next["d"]) / self.dt, jnp.ones_like(y)
+        if self.d_max is not None:
+            at_speed = DEGREES * speed
+            next["d_max"], factor = self.d_max.factor(
+                self.dt, memory["d_max"], delta, at_speed, self.d
+            )
         terms = {
             "P": next["p"] * boost, "I": next["integral"],
             "D": D_SCALE * at(self.d) * at(self.tpa) * factor * delta,
             "F": F_SCALE * at(self.f) * at(self.f_share) * DEGREES * speed,
         }  # fmt: skip
-        return {**next, **relaxed, **raised}, bounded(sum_of(terms), self.limit), terms
+        return next, bounded(sum_of(terms), self.limit), terms
 
-    def _relaxed(self, memory, r, y):
-        """What the relaxation remembers, and the error to integrate."""
-        if self.relax is None:
-            return {}, r - y
-        share = low_pass_share(self.relax.cutoff_hz, self.dt, r)
-        slow = memory["slow"] + share * (r - memory["slow"])
-        return {"slow": slow}, self.relax.error(slow, r, y, memory["integral"])
 
-    def _raised(self, memory, delta, speed):
-        """What D_MAX remembers, and its factor."""
-        if self.d_max is None:
-            return {}, jnp.ones_like(delta)
-        chains = self.d_max.chains(1 / self.dt)
-        state, factor = self.d_max.factor(chains, memory["d_max"], delta, speed, self.d)
-        return {"d_max": state}, factor
+class BetaflightADRC(BetaflightRate):
+    """The ADRC proposed for Betaflight (pull request 15400): rates in rad/s in, pidsum units out.
+
+    An observer of y'' = b u + f, y the rate in deg/s, estimates y, y' and f by forward Euler:
+
+        z1 += T (z2 - 3 wo e),  z2 += T (z3 + b u - 3 wo^2 e),  z3 += -T (sigma z3 + wo^3 e)
+        b u = wc^2 (r - z1) - 2 wc z2 - z3,    e = z1 - y before the update
+
+    where u in the observer is the command that reached the mixer. In the air: the gate before
+    liftoff is not modelled. wo is at most 0.5/T. Source: docs/autopilots.md.
+
+    **Arguments:** (each number is a scalar, one value per axis, or `[axes, *ensemble]`)
+
+    - `wc`, `wo`: adrc_wc, adrc_wo in rad/s.
+    - `b0`: adrc_b0 in deg/s^3 per unit of pidsum, see `adrc_b0`.
+    - `f`: feed-forward as in `BetaflightPID`.
+    - `gyro`, `filters`: as in `BetaflightPID`; `lowpass`: adrc_gyro_lpf_hz, a pt2 at 150 Hz.
+    - `setpoint_lowpass_hz`: adrc_td_hz, 0 is off.
+    - `b0_scale`: of b0 by the throttle.
+    - `forgetting`: adrc_sigma_decay / 10 in 1/s.
+    - `limit`: pidsum_limit; `dt`: in s.
+    """
+
+    tuned: ClassVar[tuple[str, ...]] = ("wc", "wo", "b0")
+    limits: ClassVar[tuple[str, ...]] = ("limit",)
+    wc: Float[Array, "..."] = per_member(rank=1, converter=as_float, default=60.0)
+    wo: Float[Array, "..."] = per_member(rank=1, converter=as_float, default=100.0)
+    b0: Float[Array, "..."] = per_member(rank=1, converter=as_float, default=2000.0)
+    f: Float[Array, "..."] = per_member(rank=1, converter=as_float, default=0.0)
+    gyro: FilterChain = FilterChain()
+    filters: tuple[Filter, ...] = ()
+    lowpass: tuple[Filter, ...] | None = None
+    setpoint_lowpass_hz: Float[Array, "..."] = per_member(rank=1, converter=as_float, default=0.0)
+    b0_scale: Float[Array, "..."] = per_member(rank=1, converter=as_float, default=1.0)
+    forgetting: Float[Array, "..."] = per_member(rank=1, converter=as_float, default=0.3)
+    limit: Float[Array, "..."] = per_member(rank=1, converter=as_float, default=500.0)
+    dt: float = eqx.field(static=True, default=1 / 4000)  # s
+
+    def __check_init__(self):
+        for name, gain in self.gains().items():
+            require_positive(name, gain)
+        self._chain()  # refuses what lies beyond half of the loop's rate
+
+    def _chain(self) -> FilterChain:
+        """All filters of the rate at the loop's rate."""
+        lowpass = (PT2(150.0),) if self.lowpass is None else self.lowpass
+        return FilterChain((*self.filters, *lowpass), 1 / self.dt)
+
+    def rest(self, zero: Signal) -> dict[str, PyTree]:
+        return {
+            "gyro": gyro_rest(self.gyro, zero), "filters": self._chain().init(zero),
+            "reference": zero, "slow": zero, "z": (zero, zero, zero), "command": zero,
+        }  # fmt: skip
+
+    def advance(
+        self, memory: Memories, excess: Signal, reference: Reference, measurement: Signal
+    ) -> Advance:
+        at = lambda gain: broadcast_gain(gain, measurement)
+        r, speed = split_reference(reference, memory["reference"], self.dt)
+        gyro, (smooth, _) = filter_gyro(self.gyro, self.dt, memory["gyro"], DEGREES * measurement)
+        filters, y = self._chain().step(memory["filters"], smooth)
+        share = low_pass_share(self.setpoint_lowpass_hz, self.dt, r)
+        slow = memory["slow"] + share * (DEGREES * r - memory["slow"])
+        b, wc = at(self.b0) * at(self.b0_scale), at(self.wc)
+        z, wo, dt = memory["z"], jnp.minimum(at(self.wo), 0.5 / self.dt), self.dt
+        drive, error, most = b * (memory["command"] - excess), z[0] - y, at(self.limit) * b
+        first = z[0] + dt * (z[1] - 3 * wo * error)
+        second = z[1] + dt * (z[2] + drive - 3 * wo**2 * error)
+        third = z[2] - dt * (at(self.forgetting) * z[2] + wo**3 * error)
+        z = (
+            jnp.clip(first, -8000.0, 8000.0), jnp.clip(second, -1e5, 1e5),
+            jnp.clip(third, -most, most),
+        )  # fmt: skip
+        terms = {
+            "P": wc**2 * (slow - z[0]) / b, "I": -z[2] / b, "D": -2 * wc * z[1] / b,
+            "F": F_SCALE * at(self.f) * DEGREES * speed,
+        }  # fmt: skip
+        command = bounded(sum_of(terms), self.limit)
+        next = {"gyro": gyro, "filters": filters, "reference": r, "slow": slow}
+        return {**next, "z": z, "command": command}, command, terms
+
+
+def adrc_b0(gain: Float[ArrayLike, "..."], lag: Float[ArrayLike, "..."]) -> Float[Array, "..."]:
+    """b0 of `BetaflightADRC` in deg/s^3 per pidsum, of an identified plant gain/(s (lag s + 1)).
+
+    Differentiable: `fit.derived` propagates the covariance of gain and lag.
+
+    **Arguments:**
+
+    - `gain`: from the sum that the mixer gets over 1000 to the angular acceleration, in rad/s^2.
+    - `lag`: of the motors in s.
+    """
+    return DEGREES * as_float(gain) / (1000 * as_float(lag))
 
 
 def tpa_factor(
     throttle: Float[ArrayLike, "..."], rate: float = 65.0, breakpoint: float = 0.35
 ) -> Float[Array, "..."]:
-    """Betaflight's throttle PID attenuation: 1 up to the breakpoint, then falling.
+    """Betaflight's throttle PID attenuation at a throttle of 0 to 1.
 
-    **Arguments:**
-
-    - `throttle`: 0 to 1.
-    - `rate`: tpa_rate in percent, at full throttle.
-    - `breakpoint`: (tpa_breakpoint - 1000)/1000.
+    It is 1 up to the `breakpoint`, (tpa_breakpoint - 1000)/1000, then falls by `rate` percent
+    (tpa_rate) at full throttle.
     """
     above = jnp.clip((as_float(throttle) - breakpoint) / (1 - breakpoint), 0.0, 1.0)
     return 1 - rate / 100 * above
@@ -296,9 +377,9 @@ def dynamic_cutoff(
 class BetaflightAngle(AngleLoop):
     """Betaflight's angle mode around a rate loop: angles in rad in, pidsum units out.
 
-    The rate's set-point is level/10 times the error of the angle, through a pt3 at 50 Hz. Feed-
-    forward is off, and the relaxation of the integral begins at 8 deg/s. The rate that the inner
-    loop sees is the difference of the measured angles over a sample. Source: docs/autopilots.md.
+    The rate's set-point is level/10 times the error of the angle, through a pt3 at 50 Hz.
+    Feed-forward is off, and the relaxation of the integral begins at 8 deg/s. Source:
+    docs/autopilots.md.
 
     **Arguments:**
 
@@ -306,11 +387,10 @@ class BetaflightAngle(AngleLoop):
     - `level`: angle_p_gain, 50 is 5 1/s.
     - `smooth`: the filters of the rate's set-point; None is a pt3 at 50 Hz.
 
-    **Raises:**
-
-    - `ValueError`: the level is not above 0.
+    **Raises:** `ValueError`: the level is not above 0.
     """
 
+    outer: ClassVar[tuple[str, ...]] = ("level",)
     rate: BetaflightPID
     level: Float[Array, "..."] = per_member(rank=1, converter=as_float, default=50.0)
     smooth: tuple[Filter, ...] | None = None
@@ -323,21 +403,14 @@ class BetaflightAngle(AngleLoop):
         return FilterChain((PT3(50.0),) if self.smooth is None else self.smooth, 1 / self.dt)
 
     def inner(self) -> BetaflightPID:
-        relax = self.rate.relax
-        if relax is not None:
-            relax = dataclasses.replace(relax, threshold=0.2 * relax.threshold)
-        return dataclasses.replace(self.rate, f=jnp.zeros_like(self.rate.f), relax=relax)
-
-    def outer_gains(self) -> dict[str, Array]:
-        return {"level": self.level}
+        return dataclasses.replace(self.rate.levelled(), f=jnp.zeros_like(self.rate.f))
 
     def outer_rest(self, zero: Signal) -> dict[str, PyTree]:
         return {"smooth": self._smooth.init(zero)}
 
     def wanted_rate(
-        self, memory: Mapping[str, PyTree], reference: Reference, angle: Signal, rate: Signal
+        self, memory: Memories, aim: Setpoint, angle: Signal, rate: Signal
     ) -> tuple[dict[str, PyTree], Signal]:
-        aim, _ = split_reference(reference, angle, self.dt)
         level = broadcast_gain(self.level, angle) / 10
-        smooth, wanted = self._smooth.step(memory["smooth"], level * (aim - angle))
+        smooth, wanted = self._smooth.step(memory["smooth"], level * (aim.angle - angle))
         return {"smooth": smooth}, wanted

@@ -1,7 +1,6 @@
 """Betaflight: PID sum, filtered gyro, set-point, and the chirp mode's debug channels."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 
@@ -35,79 +34,68 @@ def betaflight_setup(log: Log, wanted: Selection) -> Setup:
     """
     prefix, table = _main_table(log)
     signals, axis = flattened(log), wanted.axis
-    rates = {
-        sweep: first_logged(signals, [f"{prefix}gyroADC[{i}]"]) for i, sweep in enumerate(AXES)
-    }
+    rates = {x: first_logged(signals, [f"{prefix}gyroADC[{i}]"]) for i, x in enumerate(AXES)}
     if not any(rates.values()):
         raise RecordError("the log has no gyroADC.")
-    sweeps = [sweep for sweep in chirps(table) if axis in (None, AXES[sweep.axis])]
-    best = max(sweeps, key=lambda sweep: sweep.stop - sweep.start, default=None)
-    axis = axis or (most_active_axis(signals, rates) if best is None else AXES[best.axis])
+    sweeps = [(x, run) for x, run in chirps(table) if axis in (None, x)]
+    best, _ = max(sweeps, key=lambda sweep: sweep[1].stop - sweep[1].start, default=("", None))
+    axis = axis or best or most_active_axis(signals, rates)
     i = AXES.index(axis)
     command = first_logged(signals, [f"{prefix}axisMixed[{i}]", f"{prefix}axisSum[{i}]"])
     if not command or not rates[axis]:
         raise RecordError(f"the log has no PID terms or no gyro for {axis}.")
-    levelled = _levelled(log, prefix)
+    slow = log.tables.get(f"{prefix}slow")
+    modes = None if slow is None else slow.columns.get("flightModeFlags")
+    levelled = None  # where it is not logged; else whether it was on at any time
+    if modes is not None and modes.size and modes.dtype.kind in "iuf":
+        levelled = bool((modes.astype(np.int64) & _SELF_LEVELLING).any())
     remarks = [
         f"{rates[axis]} is measured after the gyro filters, which identify divides out where the "
         "log has their parameters"
     ]
-    if best is not None:
-        others = [sweep for sweep in sweeps if sweep.axis != best.axis]
+    setup = Setup(axis, {command: 1.0}, rates[axis], levelled=bool(levelled))
+    with_reference = lambda channel: setup._replace(reference=channel, remarks=tuple(remarks))
+    if best:
         remarks += [
-            f"another chirp on the set-point of {AXES[sweep.axis]}, "
-            f"t = {sweep.start:.6g} .. {sweep.stop:.6g} s"
-            for sweep in others
-        ]
-        alike = [Injection(*sweep[1:5]) for sweep in sweeps if sweep.axis == best.axis]
-        setup = Setup(
-            axis, {command: 1.0}, rates[axis], f"{prefix}{best.channel}", remarks=tuple(remarks),
-            injected_at="rate", levelled=bool(levelled),
-        )  # fmt: skip
-        return with_injections(setup, alike, "chirp on the rate set-point")
+            f"another chirp on the set-point of {x}, t = {run.start:.6g} .. {run.stop:.6g} s"
+            for x, run in sweeps if x != best
+        ]  # fmt: skip
+        excitation = "chirp" if "chirp" in table.columns else "debug[3]"
+        chirped = with_reference(f"{prefix}{excitation}")._replace(injected_at="rate")
+        alike = [run for x, run in sweeps if x == best]
+        return with_injections(chirped, alike, "chirp on the rate set-point")
     setpoint = first_logged(signals, [f"{prefix}setpoint[{i}]"])
     if setpoint and not moves(signals, setpoint):
         remarks.append(
             f"{setpoint} never moves, so nothing from outside excites {axis}: fly the chirp mode "
             f"(debug_mode = CHIRP), or stick pulses of different widths"
         )
-        return Setup(axis, {command: 1.0}, rates[axis], remarks=tuple(remarks))
+        return with_reference("")._replace(levelled=False)
     if setpoint and levelled is False:
         remarks.append("flown in acro, where the set-point comes from the pilot only")
-        return Setup(axis, {command: 1.0}, rates[axis], setpoint, remarks=tuple(remarks))
+        return with_reference(setpoint)
     if setpoint:
         remarks.append(
             f"self-levelling was on or is unknown: {setpoint} is then computed from the attitude, "
             f"contains feedback and cannot be the external reference"
         )
     stick = first_logged(signals, [f"{prefix}rcCommand[{i}]"])
-    reference = stick if stick and np.ptp(values_of(signals, stick)) else ""
-    return Setup(
-        axis, {command: 1.0}, rates[axis], reference, remarks=tuple(remarks),
-        levelled=bool(levelled),
-    )  # fmt: skip
+    return with_reference(stick if stick and np.ptp(values_of(signals, stick)) else "")
 
 
-def _main_table(log: Log) -> tuple[str, Table]:
-    """The main table of a log, and what precedes its channels."""
-    main = {
-        name: table
+def _main_tables(log: Log) -> dict[str, Table]:
+    """The tables of main frames by what precedes their channels, one for each arming."""
+    return {
+        f"{name}." if name else "": table
         for name, table in log.tables.items()
         if not name.endswith(("slow", "gps")) and table.time is not None and table.time.size
     }
-    if not main:
+
+
+def _main_table(log: Log) -> tuple[str, Table]:
+    if not (tables := _main_tables(log)):
         raise RecordError("the log has no main frames.")
-    name, table = next(iter(main.items()))
-    return f"{name}." if name else "", table
-
-
-def _levelled(log: Log, prefix: str) -> bool | None:
-    """Whether a self-levelling mode was on at any time; None where that is unknown."""
-    flags = log.tables.get(f"{prefix}slow")
-    modes = None if flags is None else flags.columns.get("flightModeFlags")
-    if modes is None or not modes.size or modes.dtype.kind not in "iuf":
-        return None
-    return bool((modes.astype(np.int64) & _SELF_LEVELLING).any())
+    return next(iter(tables.items()))
 
 
 def saturation(log: Log, setup: Setup, spans: Sequence[tuple[float, float]]) -> tuple[str, ...]:
@@ -117,8 +105,7 @@ def saturation(log: Log, setup: Setup, spans: Sequence[tuple[float, float]]) -> 
     prefix, table = _main_table(log)
     if not (text.isdecimal() and len(text) < 9) or table.time is None:
         return ()
-    channel = f"{prefix}axisSum[{AXES.index(setup.axis)}]"
-    command = values_of(flattened(log), channel)
+    command = values_of(flattened(log), f"{prefix}axisSum[{AXES.index(setup.axis)}]")
     used = np.zeros(command.size, bool)
     for start, stop in spans:
         used |= (table.time >= start) & (table.time <= stop)
@@ -127,24 +114,12 @@ def saturation(log: Log, setup: Setup, spans: Sequence[tuple[float, float]]) -> 
     return (f"{share} exceed {name} = {text}, where it saturates",) if beyond else ()
 
 
-class Chirp(NamedTuple):
-    """A sweep that Betaflight's chirp mode injected, on axis 0 (roll), 1 (pitch) or 2 (yaw)."""
-
-    axis: int
-    start: float  # s
-    stop: float
-    low: float  # Hz
-    high: float
-    channel: str = "debug[3]"  # of the excitation
-
-
-_AXES = (0, 1, 2)
 _SHORTEST = 1.0  # s
 _MOST_EDGES = 10_000
 
 
-def chirps(table: Table) -> list[Chirp]:
-    """The sweeps in a log whose debug channels are those of debug mode CHIRP.
+def chirps(table: Table) -> list[tuple[str, Injection]]:
+    """The sweeps in a log whose debug channels are those of debug mode CHIRP, and their axes.
 
     There, debug[1] is the axis (-1 when idle), debug[2] the frequency in 0.1 Hz and debug[3] the
     excitation (betaflight pull request 15113). The number of that mode depends on the version, so
@@ -161,27 +136,28 @@ def chirps(table: Table) -> list[Chirp]:
     _, axis, tenths, excitation = (np.asarray(x, np.float64) for x in debug)
     active = np.where(tenths > 0, axis, -1)
     edges = np.flatnonzero(np.diff(active)) + 1
-    if not np.isin(axis, (-1, *_AXES)).all() or edges.size > _MOST_EDGES:
+    if not np.isin(axis, (-1, 0, 1, 2)).all() or edges.size > _MOST_EDGES:
         return []
     sweeps = []
     for first, end in zip([0, *edges], [*edges, axis.size], strict=True):
         frequency, time = tenths[first:end] / 10, table.time[first:end]
         rises = (np.diff(frequency) >= 0).all() and frequency[-1] > frequency[0]
         moves = rises and np.ptp(excitation[first:end]) > 0
-        if active[first] in _AXES and moves and time[-1] - time[0] >= _SHORTEST:
-            ends = (float(time[0]), float(time[-1]), float(frequency[0]), float(frequency[-1]))
-            sweeps.append(Chirp(int(active[first]), *ends))
+        if active[first] >= 0 and moves and time[-1] - time[0] >= _SHORTEST:
+            ends = (*time[[0, -1]].tolist(), *frequency[[0, -1]].tolist())
+            sweeps.append((AXES[int(active[first])], Injection(*ends)))
     return sweeps
 
 
 _PAUSE = 0.2  # s of a phase of 0: another sweep; within one, single samples pass through 0
 _DRIVEN = 0.1  # of its variance that a sweep explains, at least, in the set-point of its axis
+_EDGE = 20  # of the samples of a sweep, one part: its begin and its end
 
 
-def _chirps_of_phase(table: Table, time: np.ndarray) -> list[Chirp]:
+def _chirps_of_phase(table: Table, time: np.ndarray) -> list[tuple[str, Injection]]:
     """The sweeps of a log that has their phase alone (debug[0], 5000 a radian).
 
-    The axis is the one whose set-point holds the sweep.
+    The axis is the one whose set-point is most coherent with the sweep, whatever its lead or lag.
     """
     phase = np.asarray(table.columns["debug[0]"], np.float64) / 5e3
     rows = np.flatnonzero(phase > 0)
@@ -191,45 +167,24 @@ def _chirps_of_phase(table: Table, time: np.ndarray) -> list[Chirp]:
         if not part.size or time[part[-1]] - time[part[0]] < _SHORTEST:
             continue
         inside = slice(part[0], part[-1] + 1)
-        axis = _driven_axis(table, inside)
-        if axis is not None:
-            band = _band(phase[inside], time[inside])
-            sweeps.append(Chirp(axis, float(time[part[0]]), float(time[part[-1]]), *band, "chirp"))
+        wave, shares = np.exp(1j * phase[inside]) * (phase[inside] > 0), {}
+        for i, axis in enumerate(AXES):
+            if (setpoint := table.columns.get(f"setpoint[{i}]")) is not None:
+                values = np.asarray(setpoint[inside], np.float64)
+                values = np.nan_to_num(values - np.nanmean(values))
+                if (power := float(np.mean(values**2))) > 0:
+                    shares[axis] = 2 * abs(np.mean(values * wave.conj())) ** 2 / power
+        axis = max(shares, key=lambda axis: shares[axis], default=None)
+        if axis is None or not shares[axis] > _DRIVEN:
+            continue
+        # The phase is known modulo 2 pi; single steps are rounded, and those through 0 are wrong.
+        speed = np.mod(np.diff(phase[inside]), 2 * np.pi) / np.diff(time[inside]) / (2 * np.pi)
+        ends = max(1, speed.size // _EDGE)
+        pieces = np.array_split(speed[:ends], max(1, ends // 50))
+        low, high = np.min([np.median(x) for x in pieces]), np.median(speed[-ends:])
+        start, stop = float(time[part[0]]), float(time[part[-1]])
+        sweeps.append((axis, Injection(start, stop, max(float(low), 0.1), float(high))))
     return sweeps
-
-
-def _driven_axis(table: Table, inside: slice) -> int | None:
-    """The axis whose set-point is most coherent with the sweep, whatever its lead or lag."""
-    phase = np.asarray(table.columns["debug[0]"][inside], np.float64) / 5e3
-    wave = np.exp(1j * phase) * (phase > 0)
-    shares = {}
-    for axis in _AXES:
-        name = f"setpoint[{axis}]"
-        if name in table.columns:
-            values = np.asarray(table.columns[name][inside], np.float64)
-            values = np.nan_to_num(values - np.nanmean(values))
-            power = float(np.mean(values**2))
-            if power > 0:
-                shares[axis] = 2 * abs(np.mean(values * wave.conj())) ** 2 / power
-    best = max(shares, key=lambda axis: shares[axis], default=None)
-    return best if best is not None and shares[best] > _DRIVEN else None
-
-
-_EDGE = 20  # of the samples of a sweep, one part: its begin and its end
-
-
-def _band(phase: np.ndarray, time: np.ndarray) -> tuple[float, float]:
-    """The lowest and highest frequency in Hz; the phase, in rad, is known modulo 2 pi."""
-    speed = np.mod(np.diff(phase), 2 * np.pi) / np.diff(time) / (2 * np.pi)
-    part = max(1, speed.size // _EDGE)
-    low, high = float(np.min(_medians(speed[:part]))), float(np.median(speed[-part:]))
-    return max(low, 0.1), high
-
-
-def _medians(speed: np.ndarray) -> np.ndarray:
-    """Of short pieces: single steps are rounded, and those through 0 are wrong."""
-    pieces = np.array_split(speed, max(1, speed.size // 50))
-    return np.array([np.median(piece) for piece in pieces])
 
 
 _TOLERANCE = 0.05  # between the header's period and that of the stamps
@@ -244,7 +199,16 @@ def command_hold(log: Log) -> tuple[float | None, tuple[str, ...]]:
     """
     # us, and loops of the gyro for one of the PID
     period = 1e-6 * number_of(log, "looptime") * number_of(log, "pid_process_denom", 1.0)
-    stated, stamped = plausible_hold(period), plausible_hold(_period_of_stamps(log))
+    stated, stamped = plausible_hold(period), None
+    for table in log.tables.values():
+        counter, time = table.columns.get("loopIteration"), table.time
+        if counter is not None and time is not None:
+            stride, loops = min(_STRIDE, time.size - 1), np.asarray(counter, np.float64)
+            loops, time = (x[stride:] - x[:-stride] for x in (loops, time))
+            good = (loops > 0) & (time > 0)
+            if good.any():
+                stamped = plausible_hold(float(np.median(time[good] / loops[good])))
+            break
     if stated is None or stamped is None or abs(stamped / stated - 1) < _TOLERANCE:
         return stated, ()
     remark = (
@@ -255,66 +219,33 @@ def command_hold(log: Log) -> tuple[float | None, tuple[str, ...]]:
     return float(f"{stamped:.6g}"), (remark,)
 
 
-def _period_of_stamps(log: Log) -> float:
-    """The median time for one loopIteration in s; 0 where the log does not count them."""
-    for table in log.tables.values():
-        counter = table.columns.get("loopIteration")
-        if counter is not None and table.time is not None:
-            stride = min(_STRIDE, table.time.size - 1)
-            loops = np.asarray(counter, np.float64)
-            loops, time = (
-                loops[stride:] - loops[:-stride],
-                table.time[stride:] - table.time[:-stride],
-            )
-            good = (loops > 0) & (time > 0)
-            return float(np.median(time[good] / loops[good])) if good.any() else 0.0
-    return 0.0
-
-
 _FULL = 500.0  # of rcCommand
 
 
 def flights_of(log: Log) -> tuple[Flight, ...]:
     """One for each arming that has enough samples for a record."""
-    tables = {
-        name: table
-        for name, table in log.tables.items()
-        if not name.endswith(("slow", "gps")) and table.time is not None
-    }
-    return tuple(
-        _flight(name, table, table.time)
-        for name, table in tables.items()
-        if table.time is not None and table.time.size >= FEWEST
-    )
+    flights = []
+    for prefix, table in _main_tables(log).items():
+        if table.time is None or table.time.size < FEWEST:
+            continue
+        throttle, lasting = _scaled(table, "setpoint[3]"), {}
+        for axis, run in chirps(table):
+            lasting[axis] = lasting.get(axis, 0.0) + run.stop - run.start
+        sticks = {axis: _scaled(table, f"rcCommand[{i}]") for i, axis in enumerate(AXES)}
+        name = prefix.rstrip(".")
+        flights.append(Flight(
+            int(name.removeprefix("log")) if name else 1, name, float(table.time[0]),
+            float(table.time[-1]),
+            (float(throttle.min() / 1e3), float(throttle.max() / 1e3)) if throttle.size else None,
+            lasting, {axis: float(np.std(x) / _FULL) for axis, x in sticks.items() if x.size},
+        ))  # fmt: skip
+    return tuple(flights)
 
 
-def _flight(name: str, table: Table, time: np.ndarray) -> Flight:
-    number = int(name.removeprefix("log")) if name else 1
-    throttle = _scaled(table, "setpoint[3]")
-    ends = None if throttle is None else (throttle.min() / 1e3, throttle.max() / 1e3)
-    sticks = {axis: _scaled(table, f"rcCommand[{i}]") for i, axis in enumerate(AXES)}
-    return Flight(
-        number, name, float(time[0]), float(time[-1]),
-        None if ends is None else (float(ends[0]), float(ends[1])), _durations(chirps(table)),
-        {axis: float(np.std(x) / _FULL) for axis, x in sticks.items() if x is not None},
-    )  # fmt: skip
-
-
-def _durations(sweeps: Sequence[Chirp]) -> dict[str, float]:
-    lasting: dict[str, float] = {}
-    for sweep in sweeps:
-        axis = AXES[sweep.axis]
-        lasting[axis] = lasting.get(axis, 0.0) + sweep.stop - sweep.start
-    return lasting
-
-
-def _scaled(table: Table, name: str) -> np.ndarray | None:
-    values = table.columns.get(name)
-    if values is None:
-        return None
-    finite = np.asarray(values, np.float64)
-    finite = finite[np.isfinite(finite)] * table.scales.get(name, 1.0)
-    return finite if finite.size else None
+def _scaled(table: Table, name: str) -> np.ndarray:
+    """The finite values of a column; none where it is not logged."""
+    finite = np.asarray(table.columns.get(name, ()), np.float64)
+    return finite[np.isfinite(finite)] * table.scales.get(name, 1.0)
 
 
 LOG = FirmwareLog(

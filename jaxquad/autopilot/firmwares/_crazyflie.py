@@ -1,6 +1,5 @@
 """The Crazyflie: its rate and attitude PID, parameters and files."""
 
-from collections.abc import Mapping, Sequence
 from typing import ClassVar
 
 import equinox as eqx
@@ -8,7 +7,7 @@ import numpy as np
 from jaxtyping import Array, Float, PyTree
 
 from jaxquad._core import as_float, as_float_or_none, broadcast_gain, per_member, require_positive
-from jaxquad.control import Reference
+from jaxquad.control import Reference, Setpoint
 from jaxquad.records import AXES
 
 from .._filters import Butterworth, FilterChain
@@ -20,23 +19,20 @@ from .._firmware import (
     Parameter,
     Range,
     rows_of_axes,
-    Values,
-    Words,
 )
 from .._law import (
+    Advance,
     AngleLoop,
     bounded,
     DEGREES,
     filter_gyro,
-    FlownLoop,
     gyro_rest,
+    Memories,
     RateLoop,
     require_gains,
-    require_gyro_rate,
     Signal,
     split_reference,
     sum_of,
-    Terms,
 )
 from ._crazyflie_log import LOG
 
@@ -64,15 +60,12 @@ class CrazyflieRate(RateLoop):
         is off.
     - `integral_limit`: in deg, 33.3 for roll and pitch, 166.7 for yaw.
     - `limit`: of |u|; `dt`: in s.
-
-    **Raises:**
-
-    - `ValueError`: a gain is not finite, the gyro's rate is no multiple of 1/dt, or a filter lies
-        beyond half of its rate.
     """
 
     firmware: ClassVar[str] = "crazyflie"
+    tuned: ClassVar[tuple[str, ...]] = ("kp", "ki", "kd")
     feed_forward: ClassVar[tuple[str, ...]] = ("kff",)
+    limits: ClassVar[tuple[str, ...]] = ("integral_limit", "limit")
     kp: Float[Array, "..."] = per_member(rank=1, converter=as_float)
     ki: Float[Array, "..."] = per_member(rank=1, converter=as_float)
     kd: Float[Array, "..."] = per_member(rank=1, converter=as_float)
@@ -86,13 +79,7 @@ class CrazyflieRate(RateLoop):
     dt: float = eqx.field(static=True, default=0.002)  # s
 
     def __check_init__(self):
-        limits = {"integral_limit": self.integral_limit, "limit": self.limit}
-        require_gains(self.dt, {**self.gains(), "kff": self.kff}, limits)
-        require_gyro_rate(self.gyro, self.dt)
         self._slope()  # refuses what lies beyond half of the loop's rate
-
-    def gains(self) -> dict[str, Array]:
-        return {"kp": self.kp, "ki": self.ki, "kd": self.kd}
 
     def _slope(self) -> FilterChain:
         """The low-pass of the derivative."""
@@ -104,12 +91,8 @@ class CrazyflieRate(RateLoop):
         return {"gyro": gyro_rest(self.gyro, zero), "slope": slope, "y": zero, "integral": zero}
 
     def advance(
-        self,
-        memory: Mapping[str, PyTree],
-        excess: Signal,
-        reference: Reference,
-        measurement: Signal,
-    ) -> tuple[dict[str, PyTree], Signal, Terms]:
+        self, memory: Memories, excess: Signal, reference: Reference, measurement: Signal
+    ) -> Advance:
         r, _ = split_reference(reference, measurement, self.dt)
         gyro, (y, _) = filter_gyro(self.gyro, self.dt, memory["gyro"], DEGREES * measurement)
         error = DEGREES * r - y
@@ -127,7 +110,6 @@ class CrazyflieRate(RateLoop):
 class CrazyflieAttitude(AngleLoop):
     """The Crazyflie's angle PID around its rate loop: angles in rad in, the int16 command out.
 
-    The rate that the inner loop sees is the difference of the measured angles over a sample.
     Source: docs/autopilots.md.
 
     **Arguments:** (each number is a scalar, one value per axis, or `[axes, *ensemble]`)
@@ -136,11 +118,10 @@ class CrazyflieAttitude(AngleLoop):
     - `kp`, `ki`, `kd`: pid_attitude.roll_kp and so on, from deg to deg/s.
     - `integral_limit`: of the integral of the error, in deg s.
 
-    **Raises:**
-
-    - `ValueError`: `kp` is not above 0.
+    **Raises:** `ValueError`: `kp` is not above 0.
     """
 
+    outer: ClassVar[tuple[str, ...]] = ("kp", "ki", "kd")
     rate: CrazyflieRate
     kp: Float[Array, "..."] = per_member(rank=1, converter=as_float, default=6.0)
     ki: Float[Array, "..."] = per_member(rank=1, converter=as_float, default=3.0)
@@ -152,55 +133,44 @@ class CrazyflieAttitude(AngleLoop):
         limits = {"integral_limit": self.integral_limit}
         require_gains(self.dt, {"ki": self.ki, "kd": self.kd}, limits)
 
-    def outer_gains(self) -> dict[str, Array]:
-        return {"kp": self.kp, "ki": self.ki, "kd": self.kd}
-
-    def inner(self) -> RateLoop:
-        return self.rate
-
     def outer_rest(self, zero: Signal) -> dict[str, PyTree]:
         return {"integral": zero}
 
     def wanted_rate(
-        self, memory: Mapping[str, PyTree], reference: Reference, angle: Signal, rate: Signal
+        self, memory: Memories, aim: Setpoint, angle: Signal, rate: Signal
     ) -> tuple[dict[str, PyTree], Signal]:
         at = lambda gain: broadcast_gain(gain, angle)
-        aim, _ = split_reference(reference, angle, self.dt)
-        error = DEGREES * (aim - angle)
+        error = DEGREES * (aim.angle - angle)
         integral = bounded(memory["integral"] + error * self.dt, self.integral_limit)
         wanted = at(self.kp) * error + at(self.ki) * integral - at(self.kd) * DEGREES * rate
         return {"integral": integral}, wanted / DEGREES
 
 
-def _table() -> list[Parameter]:
-    of = lambda end, group="pid_rate": [f"{group}.{axis}_{end}" for axis in AXES]
-    free: Range = (-np.inf, np.inf)
-    return [
-        *rows_of_axes(of("kp"), "1/(deg/s)", (250, 250, 120), free, "kp"),
-        *rows_of_axes(of("ki"), "1/deg", (500, 500, 16.7), free, "ki"),
-        *rows_of_axes(of("kd"), "1/(deg/s^2)", (2.5, 2.5, 0), free, "kd"),
-        *rows_of_axes(of("kff"), "1/(deg/s)", (0, 0, 0), free, "kff"),
-        *rows_of_axes(of("kp", "pid_attitude"), "1/s", (6, 6, 6), free, "angle.kp"),
-        *rows_of_axes(of("ki", "pid_attitude"), "1/s^2", (3, 3, 1), free, "angle.ki"),
-        *rows_of_axes(of("kd", "pid_attitude"), "", (0, 0, 0.35), free, "angle.kd"),
-        Parameter("pid_rate.rateFiltEn", "", 0, 0, 1, True),
-        *rows_of_axes([f"pid_rate.om{x}FiltCut" for x in "xyz"], "Hz", (30,) * 3, (0, 250), ""),
-    ]
+_of = lambda end, group="pid_rate": [f"{group}.{axis}_{end}" for axis in AXES]
+_FREE: Range = (-np.inf, np.inf)
+_ROWS = [
+    *rows_of_axes(_of("kp"), "1/(deg/s)", (250, 250, 120), _FREE, "kp"),
+    *rows_of_axes(_of("ki"), "1/deg", (500, 500, 16.7), _FREE, "ki"),
+    *rows_of_axes(_of("kd"), "1/(deg/s^2)", (2.5, 2.5, 0), _FREE, "kd"),
+    *rows_of_axes(_of("kff"), "1/(deg/s)", (0, 0, 0), _FREE, "kff"),
+    *rows_of_axes(_of("kp", "pid_attitude"), "1/s", (6, 6, 6), _FREE, "angle.kp"),
+    *rows_of_axes(_of("ki", "pid_attitude"), "1/s^2", (3, 3, 1), _FREE, "angle.ki"),
+    *rows_of_axes(_of("kd", "pid_attitude"), "", (0, 0, 0.35), _FREE, "angle.kd"),
+    Parameter("pid_rate.rateFiltEn", "", 0, 0, 1, True),
+    *rows_of_axes([f"pid_rate.om{x}FiltCut" for x in "xyz"], "Hz", (30,) * 3, (0, 250), ""),
+]
 
 
 class Crazyflie(Firmware):
     """The firmware of the Crazyflie, whose logs hold no parameters."""
 
     log = LOG
-    parameters = {row.name: row for row in _table()}
+    parameters = {row.name: row for row in _ROWS}
     fields = ("kp", "ki", "kd")
     suffix = "yaml"
     motor_shares = (0.5, 0.5, 1.0)
 
-    def flown_loop(
-        self, values: Mapping[str, str], version: Sequence[int], *, throttle: float,
-        tracked_hz: Mapping[int, Sequence[float]],
-    ) -> FlownLoop:  # fmt: skip
+    def flown_loop(self, values, version, *, throttle, tracked_hz):
         raise ValueError("logs of the Crazyflie hold no parameters, so they do not tell its loop")
 
     def channels(self, prefix: str, axis: int) -> Channels:
@@ -215,10 +185,7 @@ class Crazyflie(Firmware):
     def angle_parameters(self, axis: str, p: float) -> dict[str, float]:
         return {f"pid_attitude.{axis}_kp": p, f"pid_attitude.{axis}_ki": 0.0}
 
-    def parameter_file(
-        self, values: Values, title: str, *, version: tuple[int, ...], profile: int | None,
-        raised: Sequence[str], words: Words,
-    ) -> str:  # fmt: skip
+    def parameter_file(self, values, title, *, version, profile, raised, words):
         rows = ["params:"]
         for row, value, _ in values:
             rows += [

@@ -11,12 +11,13 @@ from jaxquad.records.firmware import (
     moves,
     Selection,
     Setup,
-    Signals,
 )
 
 
 _MOTORS = {"roll": (-1, -1, 1, 1), "pitch": (-1, 1, 1, -1), "yaw": (-1, 1, -1, 1)}
-_GYRO: dict[str, str] = dict(zip(AXES, "xyz", strict=True))
+_SLOW_STAMPS = 85 / 84  # by which rates of the micro-SD deck's stamps are too high
+_NOMINAL = (50, 100, 125, 200, 250, 333.333, 400, 500, 800, 1000)  # Hz
+_NEAR = 0.004  # events come late or are lost
 
 
 def crazyflie_setup(log: Log, wanted: Selection) -> Setup:
@@ -24,13 +25,24 @@ def crazyflie_setup(log: Log, wanted: Selection) -> Setup:
     signals = flattened(log)
     prefixes = [f"{name}." if name else "" for name in log.tables]
     rates = {
-        x: next(filter(None, (_rate(signals, prefix, x) for prefix in prefixes)), "") for x in AXES
+        x: first_logged(
+            signals, [f"{p}{name}" for p in prefixes for name in (f"gyro.{k}", f"controller.r_{x}")]
+        )
+        for x, k in zip(AXES, "xyz", strict=True)
     }
     if not any(rates.values()):
         raise RecordError("the log has no gyro.x, gyro.y, gyro.z or controller.r_roll, ...")
     axis = wanted.axis or most_active_axis(signals, rates)
-    command = next(filter(None, (_command(signals, prefix, axis) for prefix in prefixes)), None)
-    if not rates[axis] or command is None:
+    command: dict[str, float] = {}
+    for prefix in prefixes:
+        motors = [f"{prefix}motor.m{i}" for i in range(1, 5)]
+        if moves(signals, name := f"{prefix}controller.cmd_{axis}"):
+            command = {name: 1.0}
+        elif all(moves(signals, motor) for motor in motors):
+            command = dict(zip(motors, map(float, _MOTORS[axis]), strict=True))
+        if command:
+            break
+    if not rates[axis] or not command:
         raise RecordError(
             f"the log has no command (controller.cmd_{axis}, or motor.m1 .. m4) or no rate for "
             f"{axis}."
@@ -41,11 +53,17 @@ def crazyflie_setup(log: Log, wanted: Selection) -> Setup:
         "for an external reference, log a signal that your own code injects, and name it with "
         "--reference",
     ]
-    remarks += _slow_stamps(signals, rates[axis])
-    target = next(
-        (f"{p}ctrltarget.{axis}" for p in prefixes if moves(signals, f"{p}ctrltarget.{axis}")), ""
-    )
-    if target:
+    hertz = channel_rate(signals, rates[axis])
+    nominal = next((x for x in _NOMINAL if abs(hertz / x / _SLOW_STAMPS - 1) < _NEAR), None)
+    if nominal is not None:
+        remarks.append(
+            f"the time stamps say {hertz:.5g} Hz, 85/84 of {nominal:.6g} Hz: firmware before "
+            f"August 2026 wrote them that much slow, so that the gain to a rate is 1.2 % too high, "
+            f"lag and delay 1.2 % too short. Where the log is of such firmware, --time-factor "
+            f"1.0119 corrects it"
+        )
+    targets = (f"{prefix}ctrltarget.{axis}" for prefix in prefixes)
+    if target := next((x for x in targets if moves(signals, x)), ""):
         remarks.append(
             f"in manual flight the pilot's {target} is not affected by feedback: use --reference "
             f"{target}"
@@ -56,40 +74,6 @@ def crazyflie_setup(log: Log, wanted: Selection) -> Setup:
             "powers (--input 'NAME=0.1*a^2')"
         )
     return Setup(axis, command, rates[axis], remarks=tuple(remarks))
-
-
-_SLOW_STAMPS = 85 / 84  # by which rates of the micro-SD deck's stamps are too high
-_NOMINAL = (50, 100, 125, 200, 250, 333.333, 400, 500, 800, 1000)  # Hz
-_NEAR = 0.004  # events come late or are lost
-
-
-def _slow_stamps(signals: Signals, rate: str) -> list[str]:
-    """A remark where the rate of the log is that of stamps which run 84/85 slow."""
-    hertz = channel_rate(signals, rate)
-    nominal = next((x for x in _NOMINAL if abs(hertz / x / _SLOW_STAMPS - 1) < _NEAR), None)
-    if nominal is None:
-        return []
-    return [
-        f"the time stamps say {hertz:.5g} Hz, 85/84 of {nominal:.6g} Hz: firmware before August "
-        f"2026 wrote them that much slow, so that the gain to a rate is 1.2 % too high, lag and "
-        f"delay 1.2 % too short. Where the log is of such firmware, --time-factor 1.0119 corrects "
-        f"it"
-    ]
-
-
-def _rate(signals: Signals, prefix: str, axis: str) -> str:
-    names = [f"{prefix}gyro.{_GYRO[axis]}", f"{prefix}controller.r_{axis}"]
-    return first_logged(signals, names)
-
-
-def _command(signals: Signals, prefix: str, axis: str) -> dict[str, float] | None:
-    name = f"{prefix}controller.cmd_{axis}"
-    if moves(signals, name):
-        return {name: 1.0}
-    motors = [f"{prefix}motor.m{i}" for i in range(1, 5)]
-    if not all(moves(signals, motor) for motor in motors):
-        return None
-    return dict(zip(motors, map(float, _MOTORS[axis]), strict=True))
 
 
 LOG = FirmwareLog(

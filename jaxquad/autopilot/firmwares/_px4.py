@@ -1,7 +1,7 @@
 """PX4: its rate and attitude loops, parameters, channels and files."""
 
 import dataclasses
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping
 from typing import ClassVar
 
 import equinox as eqx
@@ -11,7 +11,6 @@ from jaxtyping import Array, Float, PyTree
 
 from jaxquad._core import as_float, broadcast_gain, Message, per_member, require_positive
 from jaxquad.control import Reference, Setpoint
-from jaxquad.identify import CurveFirmware
 from jaxquad.records import AXES
 
 from .._filters import BandwidthNotch, Butterworth, Filter, FilterChain, PT1, Section
@@ -19,30 +18,26 @@ from .._firmware import (
     Channels,
     Firmware,
     joined_lines,
-    LowPass,
     number_text,
     Numbers,
     OuterLoop,
     Parameter,
     Range,
     rows_of_axes,
-    Values,
-    Words,
 )
 from .._law import (
+    Advance,
     AngleLoop,
     bounded,
     filter_gyro,
     FlownLoop,
     gyro_rest,
     low_pass_share,
+    Memories,
     RateLoop,
-    require_gains,
-    require_gyro_rate,
     Signal,
     split_reference,
     sum_of,
-    Terms,
 )
 from ._px4_log import LOG
 
@@ -73,15 +68,12 @@ class PX4Rate(RateLoop):
     - `torque_hz`: MC_YAW_TQ_CUTOFF on yaw (2 Hz), 0 is off and belongs on roll and pitch.
     - `integral_limit`: MC_xR_INT_LIM.
     - `dt`: of the rate loop in s, 1/IMU_GYRO_RATEMAX.
-
-    **Raises:**
-
-    - `ValueError`: a gain is not finite, the gyro's rate is no multiple of 1/dt, or a filter lies
-        beyond half of its rate.
     """
 
     firmware: ClassVar[str] = "px4"
+    factors: ClassVar[tuple[str, ...]] = ("k",)
     feed_forward: ClassVar[tuple[str, ...]] = ("ff",)
+    limits: ClassVar[tuple[str, ...]] = ("integral_limit", "derivative_hz", "torque_hz")
     p: Float[Array, "..."] = per_member(rank=1, converter=as_float)
     i: Float[Array, "..."] = per_member(rank=1, converter=as_float)
     d: Float[Array, "..."] = per_member(rank=1, converter=as_float)
@@ -93,59 +85,34 @@ class PX4Rate(RateLoop):
     integral_limit: Float[Array, "..."] = per_member(rank=1, converter=as_float, default=0.3)
     dt: float = eqx.field(static=True, default=1 / 400)  # s
 
-    def __check_init__(self):
-        limits = {
-            "integral_limit": self.integral_limit,
-            "derivative_hz": self.derivative_hz,
-            "torque_hz": self.torque_hz,
-        }
-        require_gains(self.dt, {**self.gains(), "k": self.k, "ff": self.ff}, limits)
-        require_gyro_rate(self.gyro, self.dt)
-
     def derivative_chain(self, axis: int) -> FilterChain:
         cutoff = float(np.broadcast_to(self.derivative_hz, (3,))[axis])
         return FilterChain((PT1(cutoff),) if cutoff > 0 else (), self.gyro.rate_hz)
 
     def without_gyro_filters(self) -> "PX4Rate":
-        if not self.gyro.filters:
-            return dataclasses.replace(self, gyro=FilterChain())
-        open = FilterChain((PT1(0.0),), self.gyro.rate_hz)  # the derivative is at the gyro's rate
+        # The derivative stays at the gyro's rate.
+        open = FilterChain((PT1(0.0),), self.gyro.rate_hz) if self.gyro.filters else FilterChain()
         return dataclasses.replace(self, gyro=open)
 
-    def gains(self) -> dict[str, Array]:
-        return {"p": self.p, "i": self.i, "d": self.d}
-
     @property
-    def _derivative(self) -> tuple[Section, ...]:
-        """The difference at the gyro's rate and its low-pass."""
-        rate_hz = self.gyro.rate_hz if self.gyro.filters else 1 / self.dt
-        slope = jnp.full((), rate_hz, self.p.dtype)
-        return (
-            Section(slope, -slope, jnp.zeros_like(slope)),
-            *PT1(self.derivative_hz).sections(rate_hz),
-        )
-
-    @property
-    def _gyro(self) -> FilterChain:
-        return self.gyro if self.gyro.filters else FilterChain((), 1 / self.dt)
+    def _sections(self) -> tuple[FilterChain, tuple[Section, ...]]:
+        """The gyro's filters, and the difference at their rate with its low-pass."""
+        gyro = self.gyro if self.gyro.filters else FilterChain((), 1 / self.dt)
+        slope = jnp.full((), gyro.rate_hz, self.p.dtype)
+        difference = Section(slope, -slope, jnp.zeros_like(slope))
+        return gyro, (difference, *PT1(self.derivative_hz).sections(gyro.rate_hz))
 
     def rest(self, zero: Signal) -> dict[str, PyTree]:
-        gyro = gyro_rest(self._gyro, zero, *self._derivative)
-        return {"gyro": gyro, "integral": zero, "torque": zero}
+        gyro, derivative = self._sections
+        return {"gyro": gyro_rest(gyro, zero, *derivative), "integral": zero, "torque": zero}
 
     def advance(
-        self,
-        memory: Mapping[str, PyTree],
-        excess: Signal,
-        reference: Reference,
-        measurement: Signal,
-    ) -> tuple[dict[str, PyTree], Signal, Terms]:
+        self, memory: Memories, excess: Signal, reference: Reference, measurement: Signal
+    ) -> Advance:
         at = lambda gain: broadcast_gain(gain, measurement)
         r, _ = split_reference(reference, measurement, self.dt)
-        derivative = self._derivative
-        gyro, (y, slope) = filter_gyro(
-            self._gyro, self.dt, memory["gyro"], measurement, *derivative
-        )
+        chain, derivative = self._sections
+        gyro, (y, slope) = filter_gyro(chain, self.dt, memory["gyro"], measurement, *derivative)
         error, k, integral = r - y, at(self.k), memory["integral"]
         terms = {
             "P": k * at(self.p) * error, "I": integral,
@@ -157,10 +124,8 @@ class PX4Rate(RateLoop):
         grown = integral + fade * k * at(self.i) * open * self.dt
         share = low_pass_share(self.torque_hz, self.dt, measurement)
         torque = memory["torque"] + share * (sum_of(terms) - memory["torque"])
-        next = {
-            "gyro": gyro, "integral": bounded(grown, self.integral_limit), "torque": torque,
-        }  # fmt: skip
-        return next, torque, terms
+        integral = bounded(grown, self.integral_limit)
+        return {"gyro": gyro, "integral": integral, "torque": torque}, torque, terms
 
 
 _UNALLOCATED = 1e-6  # of the normalised torque, above which the axis counts as saturated
@@ -170,8 +135,7 @@ class PX4Attitude(AngleLoop):
     """PX4's attitude loop around a rate loop: angles in rad in, normalised torque out.
 
     The rate's set-point is `p` times the error of the angle, plus a `Setpoint`'s rate, within
-    `rate_limit`. There is no integral and no derivative of the angle. The rate that the inner loop
-    sees is the difference of the measured angles over a sample. Source: docs/autopilots.md.
+    `rate_limit`. There is no integral and no derivative of the angle. Source: docs/autopilots.md.
 
     **Arguments:** (each number is a scalar, one value per axis, or `[axes, *ensemble]`)
 
@@ -179,9 +143,7 @@ class PX4Attitude(AngleLoop):
     - `p`: MC_ROLL_P, MC_PITCH_P, MC_YAW_P in 1/s.
     - `rate_limit`: MC_xRATE_MAX in rad/s, 220 deg/s by default.
 
-    **Raises:**
-
-    - `ValueError`: `p` or the limit is not above 0.
+    **Raises:** `ValueError`: `p` or the limit is not above 0.
     """
 
     rate: PX4Rate
@@ -194,23 +156,14 @@ class PX4Attitude(AngleLoop):
         require_positive("p", self.p, "give 1/s")
         require_positive("rate_limit", self.rate_limit, "give rad/s")
 
-    def outer_gains(self) -> dict[str, Array]:
-        return {"p": self.p}
-
-    def inner(self) -> RateLoop:
-        return self.rate
-
-    def outer_rest(self, zero: Signal) -> dict[str, PyTree]:
-        return {}
-
     def wanted_rate(
-        self, memory: Mapping[str, PyTree], reference: Reference, angle: Signal, rate: Signal
+        self, memory: Memories, aim: Setpoint, angle: Signal, rate: Signal
     ) -> tuple[dict[str, PyTree], Signal]:
-        aim = reference.angle if isinstance(reference, Setpoint) else reference
-        wanted = broadcast_gain(self.p, angle) * (aim - angle)
-        if isinstance(reference, Setpoint):
-            wanted = wanted + reference.rate
+        wanted = broadcast_gain(self.p, angle) * (aim.angle - angle) + aim.rate
         return {}, bounded(wanted, self.rate_limit)
+
+
+_of = lambda end: [f"MC_{axis.upper()}RATE_{end}" for axis in AXES]
 
 
 def px4_loop(values: Mapping[str, str], *, gyro_rate_hz: float = 8000.0) -> FlownLoop[PX4Rate]:
@@ -222,75 +175,68 @@ def px4_loop(values: Mapping[str, str], *, gyro_rate_hz: float = 8000.0) -> Flow
     - `gyro_rate_hz`: at which the gyro's filters run, which no parameter says; it is rounded to a
         multiple of the loop's.
 
-    **Raises:**
-
-    - `ValueError`: a gain is missing.
+    **Raises:** `ValueError`: a gain is missing.
     """
     read = Numbers(values)
     rate = read.number("IMU_GYRO_RATEMAX", 400.0) or 400.0
-    chain: list[Filter] = []
-    for k in (0, 1):
-        centre = read.number(f"IMU_GYRO_NF{k}_FRQ", 0.0)
-        if centre > 0:
-            chain.append(BandwidthNotch(centre, read.number(f"IMU_GYRO_NF{k}_BW", 20.0)))
+    chain: list[Filter] = [
+        BandwidthNotch(centre, read.number(f"IMU_GYRO_NF{k}_BW", 20.0))
+        for k in (0, 1) if (centre := read.number(f"IMU_GYRO_NF{k}_FRQ", 0.0)) > 0
+    ]  # fmt: skip
     cutoff = read.number("IMU_GYRO_CUTOFF", 40.0)
     chain += [Butterworth(cutoff)] if cutoff > 0 else []
-    per_axis = lambda end: [read.number(f"MC_{x}RATE_{end}") for x in ("ROLL", "PITCH", "YAW")]
+    per_axis = lambda end, default=None: [read.number(name, default) for name in _of(end)]
     law = PX4Rate(
-        p=per_axis("P"), i=per_axis("I"), d=per_axis("D"),
-        k=[read.number(f"MC_{x}RATE_K", 1.0) for x in ("ROLL", "PITCH", "YAW")],
-        ff=[read.number(f"MC_{x}RATE_FF", 0.0) for x in ("ROLL", "PITCH", "YAW")],
+        p=per_axis("P"), i=per_axis("I"), d=per_axis("D"), k=per_axis("K", 1.0),
+        ff=per_axis("FF", 0.0),
         gyro=FilterChain(tuple(chain), rate * max(1, round(gyro_rate_hz / rate))),
         derivative_hz=read.number("IMU_DGYRO_CUTOFF", 20.0),
         torque_hz=[0.0, 0.0, read.number("MC_YAW_TQ_CUTOFF", 0.0)],
         integral_limit=[read.number(f"MC_{x}R_INT_LIM", 0.3) for x in "RPY"], dt=1 / rate,
     )  # fmt: skip
-    unmodelled = []
-    if read.number("IMU_GYRO_DNF_EN", 0.0) > 0:
-        text = "IMU_GYRO_DNF_EN: dynamic notches follow motors or spectrum"
-        unmodelled.append(Message(text, "notch"))
-    if read.number("MC_BAT_SCALE_EN", 0.0) > 0:
-        text = "MC_BAT_SCALE_EN: the torque is scaled by the battery's voltage"
-        unmodelled.append(Message(text))
-    return FlownLoop(law, tuple(unmodelled))
-
-
-def _table() -> list[Parameter]:
-    of = lambda end: [f"MC_{axis.upper()}RATE_{end}" for axis in AXES]
-    above: Range = (0, np.inf)
-    return [
-        *rows_of_axes(of("P"), "", (0.15, 0.15, 0.2), ((0.01, 0.5), (0.01, 0.6), (0, 0.6)), "p"),
-        *rows_of_axes(of("I"), "1/s", (0.2, 0.2, 0.1), above, "i"),
-        *rows_of_axes(of("D"), "s", (0.003, 0.003, 0), ((0, 0.01), above, above), "d"),
-        *rows_of_axes(of("K"), "", (1, 1, 1), (0.01, 5), "k"),
-        *rows_of_axes(of("FF"), "", (0, 0, 0), above, "ff"),
-        *rows_of_axes([f"MC_{x}R_INT_LIM" for x in "RPY"], "", (0.3,) * 3, above, "integral_limit"),
-        *rows_of_axes(
-            [f"MC_{axis.upper()}_P" for axis in AXES], "1/s", (4, 4, 2.8),
-            ((0, 12), (0, 12), (0, 5)), "angle.p",
-        ),
-        *rows_of_axes(
-            [f"MC_{axis.upper()}RATE_MAX" for axis in AXES], "deg/s", (220, 220, 200), (0, 1800), ""
-        ),
-        Parameter("MC_YAW_TQ_CUTOFF", "Hz", 2, 0, np.inf, False, "torque_hz", 2),
-        Parameter("IMU_GYRO_CUTOFF", "Hz", 40, 0, 1000, False, "gyro"),
-        Parameter("IMU_DGYRO_CUTOFF", "Hz", 20, 0, 1000, False, "derivative_hz"),
-        *(Parameter(f"IMU_GYRO_NF{k}_FRQ", "Hz", 0, 0, np.inf) for k in (0, 1)),
-        *(Parameter(f"IMU_GYRO_NF{k}_BW", "Hz", 20, 0, np.inf) for k in (0, 1)),
-        Parameter("IMU_GYRO_RATEMAX", "Hz", 400, 100, 2000, True),
-        Parameter("THR_MDL_FAC", "", 0, 0, 1),
-        Parameter("MC_AIRMODE", "", 0, 0, 2, True),
-    ]  # fmt: skip
+    left_out = {
+        "IMU_GYRO_DNF_EN": ("dynamic notches follow motors or spectrum", "notch"),
+        "MC_BAT_SCALE_EN": ("the torque is scaled by the battery's voltage", ""),
+    }
+    return FlownLoop(law, tuple(
+        Message(f"{name}: {what}", kind)
+        for name, (what, kind) in left_out.items() if read.number(name, 0.0) > 0
+    ))  # fmt: skip
 
 
 _ESTIMATE = 0.004  # s, from one attitude estimate to the next
+
+
+_ESTIMATE = 0.004  # s, from one attitude estimate to the next
+_ABOVE: Range = (0, np.inf)
+_ROWS = [
+    *rows_of_axes(_of("P"), "", (0.15, 0.15, 0.2), ((0.01, 0.5), (0.01, 0.6), (0, 0.6)), "p"),
+    *rows_of_axes(_of("I"), "1/s", (0.2, 0.2, 0.1), _ABOVE, "i"),
+    *rows_of_axes(_of("D"), "s", (0.003, 0.003, 0), ((0, 0.01), _ABOVE, _ABOVE), "d"),
+    *rows_of_axes(_of("K"), "", (1, 1, 1), (0.01, 5), "k"),
+    *rows_of_axes(_of("FF"), "", (0, 0, 0), _ABOVE, "ff"),
+    *rows_of_axes([f"MC_{x}R_INT_LIM" for x in "RPY"], "", (0.3,) * 3, _ABOVE, "integral_limit"),
+    *rows_of_axes(
+        [f"MC_{axis.upper()}_P" for axis in AXES], "1/s", (4, 4, 2.8),
+        ((0, 12), (0, 12), (0, 5)), "angle.p",
+    ),
+    *rows_of_axes(_of("MAX"), "deg/s", (220, 220, 200), (0, 1800), ""),
+    Parameter("MC_YAW_TQ_CUTOFF", "Hz", 2, 0, np.inf, False, "torque_hz", 2),
+    Parameter("IMU_GYRO_CUTOFF", "Hz", 40, 0, 1000, False, "gyro"),
+    Parameter("IMU_DGYRO_CUTOFF", "Hz", 20, 0, 1000, False, "derivative_hz"),
+    *(Parameter(f"IMU_GYRO_NF{k}_FRQ", "Hz", 0, 0, np.inf) for k in (0, 1)),
+    *(Parameter(f"IMU_GYRO_NF{k}_BW", "Hz", 20, 0, np.inf) for k in (0, 1)),
+    Parameter("IMU_GYRO_RATEMAX", "Hz", 400, 100, 2000, True),
+    Parameter("THR_MDL_FAC", "", 0, 0, 1),
+    Parameter("MC_AIRMODE", "", 0, 0, 2, True),
+]  # fmt: skip
 
 
 class PX4(Firmware):
     """PX4, multicopters."""
 
     log = LOG
-    parameters = {row.name: row for row in _table()}
+    parameters = {row.name: row for row in _ROWS}
     unit = "torque set-point"
     suffix = "params"
     motor_shares = (np.sqrt(0.5), np.sqrt(0.5), 1.0)
@@ -299,10 +245,7 @@ class PX4(Firmware):
     weighs_setpoint = True
     notches = tuple((f"IMU_GYRO_NF{k}_FRQ", f"IMU_GYRO_NF{k}_BW") for k in (0, 1))
 
-    def flown_loop(
-        self, values: Mapping[str, str], version: Sequence[int], *, throttle: float,
-        tracked_hz: Mapping[int, Sequence[float]],
-    ) -> FlownLoop:  # fmt: skip
+    def flown_loop(self, values, version, *, throttle, tracked_hz):
         return px4_loop(values)
 
     def channels(self, prefix: str, axis: int) -> Channels:
@@ -319,25 +262,9 @@ class PX4(Firmware):
             "axis"
         )
 
-    def angle_loop(
-        self, values: Mapping[str, str], axis: int, dt: float, *, levelled: bool
-    ) -> OuterLoop | None:
+    def angle_loop(self, values, axis, dt, *, levelled):
         name = f"MC_{AXES[axis].upper()}_P"
         return OuterLoop.of(values, name, 1.0, 0.5 * _ESTIMATE + dt, closed=True)
-
-    def low_passes(
-        self, loop: FlownLoop, values: Mapping[str, str], version: Sequence[int], axis: int,
-        throttle: float,
-    ) -> Iterator[LowPass]:  # fmt: skip
-        law = loop.law
-        for x in law.gyro.filters:
-            if isinstance(x, Butterworth):
-                flown = {"IMU_GYRO_CUTOFF": float(x.cutoff_hz)}
-                yield LowPass("gyro", flown, x, law.gyro.rate_hz)
-        slope = float(law.derivative_hz)
-        if slope > 0 and np.any(np.asarray(law.d) > 0):
-            flown = {"IMU_DGYRO_CUTOFF": slope}
-            yield LowPass("derivative", flown, PT1(slope), law.gyro.rate_hz)
 
     def notch(self, centre_hz: float, second: float) -> Filter:
         return BandwidthNotch(centre_hz, second)
@@ -345,16 +272,7 @@ class PX4(Firmware):
     def notch_width(self, centre_hz: float, half_width: float) -> float:
         return float(np.rint(2 * half_width * centre_hz))
 
-    def curve_kind(self, version: Sequence[int]) -> CurveFirmware:
-        return "px4"
-
-    def angle_parameters(self, axis: str, p: float) -> dict[str, float]:
-        return {f"MC_{axis.upper()}_P": p}
-
-    def parameter_file(
-        self, values: Values, title: str, *, version: tuple[int, ...], profile: int | None,
-        raised: Sequence[str], words: Words,
-    ) -> str:  # fmt: skip
+    def parameter_file(self, values, title, *, version, profile, raised, words):
         rows = [f"# {title}"] if title else []
         rows += ["#", "# Vehicle-Id Component-Id Name Value Type"]
         for row, value, other in values:

@@ -14,7 +14,6 @@ from jaxquad.records.firmware import (
     moves,
     Selection,
     Setup,
-    Signals,
     with_injections,
 )
 
@@ -34,12 +33,25 @@ _STICKS = {
 def px4_setup(log: Log, wanted: Selection) -> Setup:
     """The set-up for autotune's excitation; without it, with the set-point if flown in acro."""
     signals, axis = flattened(log), wanted.axis
-    rates = {x: _rate(signals, i) for i, x in enumerate(AXES)}
+    names = ("vehicle_angular_velocity.xyz", "sensor_combined.gyro_rad")
+    rates = {
+        x: first_logged(signals, [f"{name}[{i}]" for name in names]) for i, x in enumerate(AXES)
+    }
     if not any(rates.values()):
         raise RecordError(
             "the log has no vehicle_angular_velocity. Choose a logging profile that has it."
         )
-    tuned = {x: span for x, span in _autotuned(log).items() if axis in (None, x)}
+    tuned: dict[str, list[Injection]] = {}  # of each axis, all runs of it
+    table = log.tables.get(_AUTOTUNE)
+    if table is not None and table.time is not None and {"state", "rate_sp"} <= set(table.columns):
+        state = table.columns["state"]
+        for number, x in _STATES.items() if state.ndim == 1 else ():
+            rows = np.flatnonzero(state == number)
+            cuts = np.flatnonzero((np.diff(rows) > 1) & (np.diff(table.time[rows]) > _BREAK)) + 1
+            parts = [part for part in np.split(rows, cuts) if part.size > 1]
+            if parts and axis in (None, x):
+                ends = (table.time[part[[0, -1]]].tolist() for part in parts)
+                tuned[x] = [Injection(start, stop) for start, stop in ends]
     if tuned:
         axis = max(tuned, key=lambda x: max(run.stop - run.start for run in tuned[x]))
     axis = axis or most_active_axis(signals, rates)
@@ -55,38 +67,12 @@ def px4_setup(log: Log, wanted: Selection) -> Setup:
         reference = f"{_AUTOTUNE}.rate_sp[{i}]"
         setup = Setup(axis, {command: 1.0}, rates[axis], reference, injected_at="rate")
         return with_injections(setup, tuned[axis], "autotune's steps on the rate set-point")
-    return _untuned(log, signals, axis, command, rates[axis])
-
-
-def _rate(signals: Signals, i: int) -> str:
-    return first_logged(
-        signals, [f"vehicle_angular_velocity.xyz[{i}]", f"sensor_combined.gyro_rad[{i}]"]
-    )
-
-
-def _autotuned(log: Log) -> dict[str, list[Injection]]:
-    """When autotune excited each axis; more than one run of it may be in a log."""
-    table = log.tables.get(_AUTOTUNE)
-    if table is None or table.time is None or not {"state", "rate_sp"} <= set(table.columns):
-        return {}
-    if table.columns["state"].ndim != 1:
-        return {}
-    runs = {}
-    for state, axis in _STATES.items():
-        rows = np.flatnonzero(table.columns["state"] == state)
-        cuts = np.flatnonzero((np.diff(rows) > 1) & (np.diff(table.time[rows]) > _BREAK)) + 1
-        parts = [part for part in np.split(rows, cuts) if part.size > 1]
-        if parts:
-            ends = (table.time[part[[0, -1]]].tolist() for part in parts)
-            runs[axis] = [Injection(start, stop) for start, stop in ends]
-    return runs
-
-
-def _untuned(log: Log, signals: Signals, axis: str, command: str, rate: str) -> Setup:
-    setpoint = f"{_RATE_SETPOINT}.{axis}"
-    if _always_acro(log) and moves(signals, setpoint):
+    setpoint, status = f"{_RATE_SETPOINT}.{axis}", log.tables.get("vehicle_status")
+    states = None if status is None else status.columns.get("nav_state")
+    always_acro = states is not None and states.size > 0 and bool((states == _ACRO).all())
+    if always_acro and moves(signals, setpoint):
         remark = "flown in acro throughout, where the rate set-point comes from the pilot only"
-        return Setup(axis, {command: 1.0}, rate, setpoint, remarks=(remark,))
+        return Setup(axis, {command: 1.0}, rates[axis], setpoint, remarks=(remark,))
     remarks = [
         f"{setpoint} is computed by the attitude loop: it contains feedback and cannot be the "
         f"external reference",
@@ -98,13 +84,7 @@ def _untuned(log: Log, signals: Signals, axis: str, command: str, rate: str) -> 
             f"in manual flight the stick is not affected by feedback: use --reference {stick} if "
             f"it moved enough"
         )
-    return Setup(axis, {command: 1.0}, rate, remarks=tuple(remarks))
-
-
-def _always_acro(log: Log) -> bool:
-    table = log.tables.get("vehicle_status")
-    states = table.columns.get("nav_state") if table is not None else None
-    return states is not None and states.size > 0 and bool((states == _ACRO).all())
+    return Setup(axis, {command: 1.0}, rates[axis], remarks=tuple(remarks))
 
 
 LOG = FirmwareLog(

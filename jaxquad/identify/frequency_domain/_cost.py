@@ -12,9 +12,10 @@ would follow any bias. So each point has a share of doubt, noise that it shares 
 as that of all the points that it shares noise with.
 """
 
+import dataclasses
 import functools as ft
 import itertools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple, Protocol, runtime_checkable
 
 import equinox as eqx
@@ -94,10 +95,7 @@ class Cost(Protocol):
     def weights(self, points: Points, ratio: Ratio) -> Weights:
         """Weights of `ln|T/T^|` and of `angle(T/T^)` in rad, on a last axis of two.
 
-        **Arguments:**
-
-        - `points`: the measured response T^, and which of its points count.
-        - `ratio`: |model / measurement|, 1 before there is a model.
+        `ratio` is |model / measurement|, 1 before there is a model.
         """
         ...
 
@@ -143,15 +141,13 @@ class MaximumLikelihood:
 
 
 def least_coherence(wanted: float | None, cost: Cost, frf: FrequencyResponse) -> float:
-    """The least coherence of a point that counts: as `wanted`, or what is best for the cost.
-
-    A cost that knows the noise weighs poor points as they deserve; others have to do without them.
-    So has the joint estimate, a ratio, whose error is no longer small where coherence is; and so
-    have the direct estimate of a closed loop and a response that is coherent nowhere: what little
-    they show may be noise that is fed back.
-    """
+    """The least coherence of a point that counts: as `wanted`, or what is best for the cost."""
     if wanted is not None:
         return wanted
+    # A cost that knows the noise weighs poor points as they deserve; others do without. So does the
+    # joint estimate, a ratio, whose error is no longer small where coherence is; and so do the
+    # direct estimate of a closed loop and a response that is coherent nowhere: what little they
+    # show may be noise that is fed back.
     if not (isinstance(cost, MaximumLikelihood) and frf.method == "direct" and not frf.fed_back):
         return _COHERENT
     return _POOR if np.count_nonzero(usable(frf, None, _COHERENT)) >= _ENOUGH else _COHERENT
@@ -162,18 +158,10 @@ Band = Range | Mapping[tuple[str, str], Range | None] | None
 
 
 def usable(frf: FrequencyResponse, band: Band, least: float) -> Mask:
-    """Which points of a response a fit uses.
+    """Which points of a response a fit uses, with `band` as in `jq.fit`.
 
-    **Arguments:**
-
-    - `frf`: a measured response.
-    - `band`: as in `jq.fit`.
-    - `least`: the least coherence, averaged over a third of an octave.
-
-    **Returns:**
-
-    True for known points within the band of their pair that are coherent enough, and whose random
-    error, averaged likewise, is below 30 %.
+    Those within the band of their pair whose coherence, averaged over a third of an octave, is at
+    `least` this, and whose random error, averaged likewise, is below 30 %.
     """
     omega, error = np.asarray(frf.omega), np.asarray(frf.random_error)
     kernel = _third_of_an_octave(omega.tobytes())
@@ -262,38 +250,14 @@ def precise_points(frf: FrequencyResponse) -> Mask:
 
 
 def points_of(frfs: Sequence[FrequencyResponse], used: Sequence[Mask]) -> list[Points]:
-    """The points of several responses, with a floor of 0."""
-    points = []
-    for frf, mask in zip(frfs, used, strict=True):
-        shared, correlations = _shared_noise(frf, mask)
-        between = _between_pairs(frf, mask)
-        points.append(Points(frf, mask, shared, np.zeros(mask.shape), correlations, between))
-    return points
+    """The points of several responses, with a floor of 0.
+
+    Correlations are those of the errors relative to the response.
+    """
+    return [_points(frf, mask) for frf, mask in zip(frfs, used, strict=True)]
 
 
-def _between_pairs(
-    frf: FrequencyResponse, used: Mask
-) -> Complex[np.ndarray, "frequencies pairs pairs"] | None:
-    """As in `Points`: correlations of the errors relative to the response."""
-    if used[0].size == 1:
-        return None
-    errors = frf.errors
-    covariance = type(errors).at_each_frequency(errors)
-    mine, count = used.reshape(len(used), -1), used[0].size
-    size = np.sqrt(np.maximum(np.real(np.diagonal(covariance, axis1=1, axis2=2)), 1e-300))
-    response = np.where(used, np.asarray(frf.response), 1.0).reshape(len(used), -1)
-    turn = np.exp(-1j * np.angle(response)) / size
-    both = mine[:, :, None] & mine[:, None, :] & ~np.eye(count, dtype=bool)
-    relative = turn[:, :, None] * covariance * np.conj(turn)[:, None, :]
-    correlation = np.where(both, relative, np.eye(count, dtype=complex))
-    shared = np.sum(np.real(correlation) ** 2 + np.imag(correlation) ** 2, axis=2)
-    return correlation if np.any(shared > _ALONE) else None
-
-
-def _shared_noise(
-    frf: FrequencyResponse, used: Mask
-) -> tuple[Ratio, dict[tuple[int, int], Complex[np.ndarray, "used used"]]]:
-    """As in `Points`; correlations are those of the errors relative to the response."""
+def _points(frf: FrequencyResponse, used: Mask) -> Points:
     shared, correlations, errors = np.ones(used.shape), {}, frf.errors
     for o, i in np.ndindex(used.shape[1:]):
         mine = np.flatnonzero(used[:, o, i])
@@ -308,7 +272,19 @@ def _shared_noise(
         shared[mine, o, i] = np.maximum(sums, 1.0)
         if np.any(sums > _ALONE):
             correlations[o, i] = correlation
-    return shared, correlations
+    points = Points(frf, used, shared, np.zeros(used.shape), correlations)
+    if used[0].size == 1:
+        return points
+    covariance = type(errors).at_each_frequency(errors)
+    mine, count = used.reshape(len(used), -1), used[0].size
+    size = np.sqrt(np.maximum(np.real(np.diagonal(covariance, axis1=1, axis2=2)), 1e-300))
+    response = np.where(used, np.asarray(frf.response), 1.0).reshape(len(used), -1)
+    turn = np.exp(-1j * np.angle(response)) / size
+    both = mine[:, :, None] & mine[:, None, :] & ~np.eye(count, dtype=bool)
+    relative = turn[:, :, None] * covariance * np.conj(turn)[:, None, :]
+    between = np.where(both, relative, np.eye(count, dtype=complex))
+    sums = np.sum(np.real(between) ** 2 + np.imag(between) ** 2, axis=2)
+    return dataclasses.replace(points, between=between) if np.any(sums > _ALONE) else points
 
 
 _DOUBT = 0.3  # of the variance of a point's share in the noise of all points
@@ -379,42 +355,32 @@ def mix(
     mixing: Mixing | None, weighted: Float[np.ndarray, "frequencies outputs inputs 2 *columns"]
 ) -> Float[np.ndarray, "frequencies outputs inputs 2 *columns"]:
     """Weighted misfits, or their slopes, taken together."""
-    return weighted if mixing is None else _through(weighted, lambda x: mix_complex(mixing, x))
+    return weighted if mixing is None else _mixed(mixing, weighted, twice=False)
 
 
 def mix_twice(
     mixing: Mixing | None, weighted: Float[np.ndarray, "frequencies outputs inputs 2 *columns"]
 ) -> Float[np.ndarray, "frequencies outputs inputs 2 *columns"]:
     """The same by the factors and then by their adjoints."""
-    if mixing is None:
-        return weighted
-
-    def twice(x: Complex[np.ndarray, "outputs inputs frequencies columns"]) -> np.ndarray:
-        mixed = mix_complex(mixing, x)
-        if mixing.across is not None:
-            mixed = _apply_across(np.conj(np.swapaxes(mixing.across, 1, 2)), mixed)
-        return np.conj(np.swapaxes(mixing.factor, 2, 3)) @ mixed
-
-    return _through(weighted, twice)
+    return weighted if mixing is None else _mixed(mixing, weighted, twice=True)
 
 
-def mix_complex(
-    mixing: Mixing, x: Complex[np.ndarray, "outputs inputs frequencies columns"]
-) -> Complex[np.ndarray, "outputs inputs frequencies columns"]:
-    """As `mix`, of magnitude and phase in one number."""
-    mixed = mixing.factor @ x
-    return mixed if mixing.across is None else _apply_across(mixing.across, mixed)
-
-
-def _apply_across(across: Across, x: np.ndarray) -> np.ndarray:
-    outputs, inputs, count, columns = x.shape
-    pairs = np.moveaxis(x.reshape(outputs * inputs, count, columns), 0, 1)
-    return np.moveaxis(across @ pairs, 1, 0).reshape(x.shape)
-
-
-def _through(weighted: np.ndarray, apply: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+def _mixed(mixing: Mixing, weighted: np.ndarray, twice: bool) -> np.ndarray:
     joined = np.moveaxis(weighted[:, :, :, 0] + 1j * weighted[:, :, :, 1], 0, 2)
-    flat = apply(joined.reshape(*joined.shape[:3], -1))
+    flat = joined.reshape(*joined.shape[:3], -1)
+    outputs, inputs, count, columns = flat.shape
+
+    def apply_across(across: Across, x: np.ndarray) -> np.ndarray:
+        pairs = np.moveaxis(x.reshape(outputs * inputs, count, columns), 0, 1)
+        return np.moveaxis(across @ pairs, 1, 0).reshape(x.shape)
+
+    flat = mixing.factor @ flat
+    if mixing.across is not None:
+        flat = apply_across(mixing.across, flat)
+    if twice and mixing.across is not None:
+        flat = apply_across(np.conj(np.swapaxes(mixing.across, 1, 2)), flat)
+    if twice:
+        flat = np.conj(np.swapaxes(mixing.factor, 2, 3)) @ flat
     turned = np.moveaxis(flat.reshape(joined.shape), 2, 0)
     return np.stack([np.real(turned), np.imag(turned)], axis=3)
 
@@ -449,24 +415,20 @@ def mix_parts(
     if mixing is None:
         return real, imag
 
+    def times(matrix, indices: str, real: Array, imag: Array) -> tuple[Array, Array]:
+        c, s = jnp.real(matrix), jnp.imag(matrix)
+        turn = lambda matrix, part: jnp.einsum(indices, matrix, part)
+        return turn(c, real) - turn(s, imag), turn(s, real) + turn(c, imag)
+
     def turned(real: Array, imag: Array) -> tuple[Array, Array]:
-        turn = lambda matrix, part: jnp.einsum("oifg,...oig->...oif", matrix, part)
-        along = _turn_parts(turn, mixing.factor, real, imag)
+        along = times(mixing.factor, "oifg,...oig->...oif", real, imag)
         if mixing.across is None:
             return along
         shape = real.shape
         flat = (part.reshape(*shape[:-3], -1, shape[-1]) for part in along)
-        turn = lambda matrix, part: jnp.einsum("fpq,...qf->...pf", matrix, part)
-        real, imag = _turn_parts(turn, mixing.across, *flat)
+        real, imag = times(mixing.across, "fpq,...qf->...pf", *flat)
         return real.reshape(shape), imag.reshape(shape)
 
     if mixing.idle is None:
         return turned(real, imag)
     return jax.lax.cond(mixing.idle, lambda *same: same, turned, real, imag)
-
-
-def _turn_parts(
-    turn: Callable[[Array, Array], Array], matrix: np.ndarray | Array, real: Array, imag: Array
-) -> tuple[Array, Array]:
-    c, s = jnp.real(matrix), jnp.imag(matrix)
-    return turn(c, real) - turn(s, imag), turn(s, real) + turn(c, imag)

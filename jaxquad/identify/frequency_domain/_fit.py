@@ -12,29 +12,25 @@ from jaxquad._core import Message, one_blas_thread, require_x64
 from jaxquad.models import LaggedIntegrator, with_arrays
 from jaxquad.spectra import FrequencyResponse
 
-from ..uncertainty._assess import assess, unfitted
-from ..uncertainty._error_budget import Weighting, weighting_at
-from ..uncertainty._fit_remarks import DOUBT
-from ..uncertainty._verdict import Verdict, without_numbers
-from ._bounds import settle_at_bounds, solve_within_bounds
+from ..uncertainty._assess import assess, DOUBT, unfitted
+from ..uncertainty._error_budget import weighting_at
+from ..uncertainty._verdict import without_numbers
+from ..uncertainty._zero_bounds import settle_at_bounds, solve_within_bounds
 from ._cost import (
     Band,
     Cost,
     describe_usable,
     least_coherence,
-    Mask,
     MaximumLikelihood,
-    Mixing,
     mixings_of,
     Points,
     points_of,
     precise_points,
-    Ratio,
     usable,
     Weights,
     widen_band,
 )
-from ._parameters import Condition, Free, Parameters, select_parameters, Tie
+from ._parameters import Condition, Free, select_parameters, Tie
 from ._problem import (
     make_problem,
     Prior,
@@ -46,7 +42,7 @@ from ._problem import (
 from ._refits import Options, Origin
 from ._result import Fit
 from ._solve import Solution
-from ._starts import Minimum, solve_from_many, spread_starts
+from ._starts import solve_from_many, spread_starts
 
 
 _SMALL = 256  # frequencies, up to which a second thread of BLAS waits longer than it works
@@ -160,45 +156,96 @@ def fit_with(
 ) -> Fit:
     """Fit as `jq.fit` does.
 
-    **Arguments:**
-
-    - `model`, `frfs`, `options`: as in `jq.fit`.
-    - `rounds`: how often to solve again with what the model leaves unexplained as a floor on the
-        random error; 0 for estimates under the noise alone, whose costs compare structures.
+    `rounds` is how often to solve again with what the model leaves unexplained as a floor on the
+    random error; 0 for estimates under the noise alone, whose costs compare structures.
     """
     small = all(np.size(frf.omega) <= _SMALL for frf in frfs)
     with one_blas_thread() if small else contextlib.nullcontext():
-        model, cost, band = with_arrays(model), options.cost, options.band
-        parameters = select_parameters(model, options.free, options.tied)
-        least = [least_coherence(options.min_coherence, cost, frf) for frf in frfs]
-        usable_points = [usable(frf, band, limit) for frf, limit in zip(frfs, least, strict=True)]
-        require_priors(model, options.priors)
-        if options.priors and not isinstance(cost, MaximumLikelihood):
-            raise ValueError(
-                Message(
-                    "a prior needs a cost that knows the noise, and that of Eq. (14) does not: "
-                    "leave «cost=» at its default, jq.identify.MaximumLikelihood()"
-                )
+        return _fit(with_arrays(model), frfs, options, rounds)
+
+
+def _fit(model: PyTree, frfs: Sequence[FrequencyResponse], options: Options, rounds: int) -> Fit:
+    # The problem: points, parameters, priors.
+    cost, band, solver, max_steps = options.cost, options.band, options.solver, options.max_steps
+    parameters = select_parameters(model, options.free, options.tied)
+    least = [least_coherence(options.min_coherence, cost, frf) for frf in frfs]
+    usable_points = [usable(frf, band, limit) for frf, limit in zip(frfs, least, strict=True)]
+    require_priors(model, options.priors)
+    is_likelihood = isinstance(cost, MaximumLikelihood)
+    if options.priors and not is_likelihood:
+        raise ValueError(
+            Message(
+                "a prior needs a cost that knows the noise, and that of Eq. (14) does not: "
+                "leave «cost=» at its default, jq.identify.MaximumLikelihood()"
             )
-        too_few = _too_few_points(frfs, usable_points, parameters, max(least), band)
-        if too_few is not None:
-            remarks = dict.fromkeys(remark for frf in frfs for remark in frf.remarks)
-            return unfitted(model, parameters, too_few, tuple(remarks))
-        problem = make_problem(model, parameters, frfs, options.conditions, options.priors)
-        pairs = zip(usable_points, problem.silences, strict=True)
-        points = points_of(frfs, [mask & ~silent for mask, silent in pairs])
-        problem, solution, minima = _solve_reweighted(problem, points, options)
-        check_priors(problem, solution)
-        problem, solution, weighting = _solve_with_floor(problem, points, solution, options, rounds)
-        further = _remarks_on_silence(frfs, usable_points, problem)
-        origin = Origin(fit_with, tuple(points), options)
-        return assess(problem, weighting, solution, minima, further=further, origin=origin)
+        )
+    count, needed = sum(int(mask.sum()) for mask in usable_points), parameters.count + 2
+    if count < needed:
+        reason = (
+            f"{describe_usable(frfs, count, max(least))}{f' (band {band} rad/s)' if band else ''}, "
+            f"and {parameters.count} parameters need at least {needed}"
+        )
+        wider = widen_band(frfs, [precise_points(frf) for frf in frfs]) if band is None else None
+        remedies = ("excite the axis («jq.sweep»), record longer, or use a longer window",)
+        if wider:
+            fewer = "fit fewer parameters (free=): a delay, say, known from another source"
+            remedies = (wider, fewer)
+        verdict = without_numbers("too few points", parameters.names, reason, *remedies)
+        remarks = dict.fromkeys(remark for frf in frfs for remark in frf.remarks)
+        return unfitted(model, parameters, verdict, tuple(remarks))
+    problem = make_problem(model, parameters, frfs, options.conditions, options.priors)
+    pairs = zip(usable_points, problem.silences, strict=True)
+    points = points_of(frfs, [mask & ~silent for mask, silent in pairs])
 
+    def weigh(points: Sequence[Points], solution: Solution | None) -> list[Weights]:
+        """By the ratio of model to measurement at a solution; 1 before there is one."""
+        ratios = [np.ones(one.used.shape) for one in points]
+        if solution is not None:
+            ratios = [np.exp(part[..., 0]) for part in solution.sensitivity.misfits]
+        weights = type(cost).weights  # a bound method of an `eqx.Module` is made like a model
+        return [weights(cost, *pair) for pair in zip(points, ratios, strict=True)]
 
-def _remarks_on_silence(
-    frfs: Sequence[FrequencyResponse], usable_points: Sequence[Mask], problem: Problem
-) -> list[Message]:
-    """Remark on responses that were measured, and that the model has none of."""
+    def weighted(points: Sequence[Points], weights: Sequence[Weights]) -> Problem:
+        """Only a likelihood knows what it would mean that points share noise."""
+        return problem.weighted(weights, mixings_of(points, weights) if is_likelihood else None)
+
+    def are_close(old: Sequence[Weights], new: Sequence[Weights], share: float) -> bool:
+        both = zip(map(np.asarray, old), new, strict=True)
+        return all(np.all(np.abs(one - other) <= share * np.abs(other)) for one, other in both)
+
+    # Starts and descent; where the weights depend on the model, again under those of the solution.
+    weights, minima = weigh(points, None), ()
+    problem = weighted(points, weights)
+    if options.starts == 1:
+        z = np.asarray(parameters.start)[: parameters.count]
+        solution = solve_within_bounds(problem, z, solver, max_steps)
+    else:
+        fastest = max(float(one.frf.omega[-1]) for one in points)
+        starts = spread_starts(parameters, options.starts, fastest=fastest)
+        solution, minima = solve_from_many(problem, starts, solver, max_steps)
+        solution = settle_at_bounds(problem, solution, solver, max_steps)
+    again = weigh(points, solution)
+    if not are_close(weights, again, 1e-4):
+        problem = weighted(points, again)
+        solution = solve_within_bounds(problem, solution.z, solver, max_steps)
+    _check_finite(solution)
+    check_priors(problem, solution)
+    # Again with what the model leaves unexplained as a floor on the random error, where it does
+    # leave something: for a right model a floor costs efficiency.
+    weighting, lifted = weighting_at(problem, points, solution), False
+    for _ in range(rounds if weighting.budget.mixtures[0].none < DOUBT else 0):
+        floor = weighting.budget.mixtures[0].amplitude
+        raised = [replace(one, floor=np.full(one.used.shape, floor)) for one in points]
+        weights = weigh(raised, solution)
+        if are_close(problem.weights, weights, _SETTLED):
+            break
+        problem, lifted = weighted(raised, weights), True
+        solution = solve_within_bounds(problem, solution.z, solver, max_steps)
+        _check_finite(solution)
+        weighting = weighting_at(problem, points, solution)
+    if lifted:
+        weighting = weighting._replace(by_noise=weighted(points, weigh(points, solution)))
+    # Responses that were measured, and that the model has none of.
     remarks = []
     for frf, mask, pairs in zip(frfs, usable_points, problem.silent, strict=True):
         for o, i in pairs:
@@ -212,109 +259,8 @@ def _remarks_on_silence(
                 f"left out; free what joins the two, or say band={{{pair}: None}}"
             )
             remarks.append(Message(text, "no response"))
-    return remarks
-
-
-def _too_few_points(
-    frfs: Sequence[FrequencyResponse],
-    usable_points: Sequence[Mask],
-    parameters: Parameters,
-    least: float,
-    band: Band,
-) -> Verdict | None:
-    points, needed = sum(int(mask.sum()) for mask in usable_points), parameters.count + 2
-    if points >= needed:
-        return None
-    reason = (
-        f"{describe_usable(frfs, points, least)}{f' (band {band} rad/s)' if band else ''}, and "
-        f"{parameters.count} parameters need at least {needed}"
-    )
-    wider = widen_band(frfs, [precise_points(frf) for frf in frfs]) if band is None else None
-    remedies = ("excite the axis («jq.sweep»), record longer, or use a longer window",)
-    if wider:
-        remedies = (wider, "fit fewer parameters (free=): a delay, say, known from another source")
-    return without_numbers("too few points", parameters.names, reason, *remedies)
-
-
-def _solve_reweighted(
-    problem: Problem, points: Sequence[Points], options: Options
-) -> tuple[Problem, Solution, tuple[Minimum, ...]]:
-    """Solve; where the weights depend on the model, solve again under those of the solution."""
-    solver, max_steps, cost, minima = options.solver, options.max_steps, options.cost, ()
-    weights = _weights(cost, points, [np.ones(one.used.shape) for one in points])
-    problem = _weighted(problem, cost, points, weights)
-    if options.starts == 1:
-        z = np.asarray(problem.parameters.start)[: problem.parameters.count]
-        solution = solve_within_bounds(problem, z, solver, max_steps)
-    else:
-        fastest = max(float(one.frf.omega[-1]) for one in points)
-        starts = spread_starts(problem.parameters, options.starts, fastest=fastest)
-        solution, minima = solve_from_many(problem, starts, solver, max_steps)
-        solution = settle_at_bounds(problem, solution, solver, max_steps)
-    again = _weights(cost, points, _ratios(solution))
-    if not _are_close(weights, again, 1e-4):
-        problem = _weighted(problem, cost, points, again)
-        solution = solve_within_bounds(problem, solution.z, solver, max_steps)
-    _check_finite(solution)
-    return problem, solution, minima
-
-
-def _solve_with_floor(
-    problem: Problem,
-    points: Sequence[Points],
-    solution: Solution,
-    options: Options,
-    rounds: int,
-) -> tuple[Problem, Solution, Weighting]:
-    """Solve again with what the model leaves unexplained as a floor on the random error.
-
-    Only where it does leave something: for a right model a floor costs efficiency.
-    """
-    cost, lifted = options.cost, False
-    weighting = weighting_at(problem, points, solution)
-    for _ in range(rounds if weighting.mixtures[0].none < DOUBT else 0):
-        floor = weighting.mixtures[0].amplitude
-        raised = [replace(one, floor=np.full(one.used.shape, floor)) for one in points]
-        weights = _weights(cost, raised, _ratios(solution))
-        if _are_close([np.asarray(old) for old in problem.weights], weights, _SETTLED):
-            break
-        problem, lifted = _weighted(problem, cost, raised, weights), True
-        solution = solve_within_bounds(problem, solution.z, options.solver, options.max_steps)
-        _check_finite(solution)
-        weighting = weighting_at(problem, points, solution)
-    if lifted:
-        plain = _weights(cost, points, _ratios(solution))
-        mixings = _mixings(cost, points, plain)
-        weighting = weighting._replace(weights=plain, mixings=mixings)
-    return problem, solution, weighting
-
-
-def _are_close(old: Sequence[Weights], new: Sequence[Weights], share: float) -> bool:
-    pairs = zip(old, new, strict=True)
-    return all(np.all(np.abs(one - other) <= share * np.abs(other)) for one, other in pairs)
-
-
-def _weighted(
-    problem: Problem, cost: Cost, points: Sequence[Points], weights: Sequence[Weights]
-) -> Problem:
-    return problem.weighted(weights, _mixings(cost, points, weights))
-
-
-def _mixings(
-    cost: Cost, points: Sequence[Points], weights: Sequence[Weights]
-) -> tuple[Mixing | None, ...] | None:
-    """Only a likelihood knows what it would mean that points share noise."""
-    return mixings_of(points, weights) if isinstance(cost, MaximumLikelihood) else None
-
-
-def _weights(cost: Cost, points: Sequence[Points], ratios: Sequence[Ratio]) -> list[Weights]:
-    weigh = type(cost).weights  # a bound method of an `eqx.Module` is made like a model
-    return [weigh(cost, *pair) for pair in zip(points, ratios, strict=True)]
-
-
-def _ratios(solution: Solution) -> list[Ratio]:
-    """|model / measurement| at a solution."""
-    return [np.exp(part[..., 0]) for part in solution.sensitivity.misfits]
+    origin = Origin(fit_with, tuple(points), options)
+    return assess(problem, weighting, solution, minima, further=remarks, origin=origin)
 
 
 def require_responses(frf: object) -> list[FrequencyResponse]:

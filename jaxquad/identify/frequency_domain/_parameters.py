@@ -196,15 +196,8 @@ def select_parameters(
 ) -> Parameters:
     """The free and tied parameters of a model, as `jq.fit` takes them.
 
-    **Arguments:**
-
-    - `model`: any `eqx.Module`.
-    - `free`, `tied`: as in `jq.fit`.
-
-    **Raises:**
-
-    - `ValueError`: a name that the model does not have, is given twice, or starts at 0 or inf;
-        a tie that follows itself or a later one.
+    **Raises:** ValueError for a name that the model does not have, is given twice, or starts at 0
+    or inf; for a tie that follows itself or a later one.
     """
     places = name_places(model)
     values, by_name = _numbers(model, places), _by_name(places)
@@ -377,10 +370,7 @@ class Changed:
 def require_conditions(
     model: PyTree, conditions: Sequence[Condition | None] | None, count: int
 ) -> list[Condition]:
-    """One for each of `count` responses, all of them pytrees.
-
-    ValueError for another number, and for what is no condition.
-    """
+    """One for each of `count` responses, all of them pytrees."""
     changes = [None] * count if conditions is None else list(conditions)
     if len(changes) != count:
         raise ValueError(

@@ -20,6 +20,12 @@ from ._parameters import Condition, find_place, Numbers, Parameters, require_con
 from ._sampled import Aliases, evaluate_sampled, hold_of, plan_aliases
 
 
+_FEW = 5  # frequencies of the trial of a model
+_OURS = (LaggedIntegrator, StateSpace, TransferFunction)
+
+Part = Float[Array, "outputs inputs frequencies"]
+
+
 class Prior(eqx.Module):
     """A known value of a parameter, or of a function of the model, with its standard error.
 
@@ -49,19 +55,6 @@ class Prior(eqx.Module):
                 f"a prior of {self.value} with standard error {self.standard_error}: give a finite "
                 "value and a positive standard error"
             )
-
-
-def require_priors(model: PyTree, priors: Sequence[Prior]) -> None:
-    """Raise ValueError for what is no list of priors, and for parameters that do not exist."""
-    listed = isinstance(priors, Sequence) and not isinstance(priors, str)
-    if not (listed and all(isinstance(prior, Prior) for prior in priors)):
-        raise ValueError(
-            f"priors is {priors!r}: give a list, "
-            "priors=[jq.identify.Prior(name or function, value, standard error)]"
-        )
-    for prior in priors:
-        if isinstance(prior.quantity, str):
-            find_place(model, prior.quantity, "for a prior")
 
 
 @pytree_node
@@ -133,14 +126,7 @@ def make_problem(
 ) -> Problem:
     """The least-squares problem of a fit, under weights of zero: see `Problem.weighted`.
 
-    **Arguments:**
-
-    - `model`, `frfs`, `conditions`, `priors`: as in `jq.fit`.
-    - `parameters`: of `jq.identify.select_parameters`.
-
-    **Raises:**
-
-    - `ValueError`: another number of conditions than of responses, or what is no condition.
+    **Raises:** ValueError for another number of conditions than of responses, or no condition.
     """
     changes = require_conditions(model, conditions, len(frfs))
     numbers = [[prior.value, prior.standard_error] for prior in priors]
@@ -292,13 +278,7 @@ class _Named(NamedTuple):
         return leaves[place.leaf].reshape(-1)[place.index]
 
 
-_FEW = 5  # frequencies of the trial
-_OURS = (LaggedIntegrator, StateSpace, TransferFunction)
-_sound: set[tuple] = set()  # what was tried before
-
-
 def require_model(function: str, model: object) -> None:
-    """Raise ValueError for what is no model to start from."""
     if isinstance(model, type):
         raise ValueError(
             f"{function} needs a model with the values to start from, not the class "
@@ -309,6 +289,9 @@ def require_model(function: str, model: object) -> None:
             f"{function} needs a model to start from, such as jq.LaggedIntegrator(gain, lag, "
             f"delay), not a {type(model).__name__}; it comes first: jq.{function}(model, data)"
         )
+
+
+_sound: set[tuple] = set()  # what was tried before
 
 
 def require_model_response(model: PyTree, frf: FrequencyResponse) -> None:
@@ -341,3 +324,16 @@ def require_model_response(model: PyTree, frf: FrequencyResponse) -> None:
     if not np.issubdtype(result.dtype, np.complexfloating):
         raise ValueError(f"{name} is real: return complex numbers, with magnitude and phase")
     _sound.add(kind)
+
+
+def require_priors(model: PyTree, priors: Sequence[Prior]) -> None:
+    """Raise ValueError for what is no list of priors, and for parameters that do not exist."""
+    listed = isinstance(priors, Sequence) and not isinstance(priors, str)
+    if not (listed and all(isinstance(prior, Prior) for prior in priors)):
+        raise ValueError(
+            f"priors is {priors!r}: give a list, "
+            "priors=[jq.identify.Prior(name or function, value, standard error)]"
+        )
+    for prior in priors:
+        if isinstance(prior.quantity, str):
+            find_place(model, prior.quantity, "for a prior")

@@ -1,5 +1,6 @@
 """An identified model with its doubts: values, errors, covariance, verdict."""
 
+import functools as ft
 from collections.abc import Callable
 
 import equinox as eqx
@@ -14,17 +15,18 @@ from jaxquad.records import Record
 from ..output_error._noise import NoiseModel
 from ..output_error._simulated import linear_model
 from ..output_error._verify import Verification, verify
-from ..uncertainty._accuracy import Matrix
-from ..uncertainty._curves import (
+from ..uncertainty._derived import (
+    derive,
+    draw_models,
     fitted_response,
     fitted_step_response,
     pole_reach,
     ResponseBand,
     StepBand,
+    Tied,
+    tied_parameters,
 )
-from ..uncertainty._derived import derive, Tied, tied_parameters
-from ..uncertainty._draw_models import draw_models, known_covariance
-from ..uncertainty._error_budget import Discrepancy
+from ..uncertainty._error_budget import Discrepancy, SHARES
 from ..uncertainty._verdict import (
     Combination,
     pooled_freedom,
@@ -33,10 +35,19 @@ from ..uncertainty._verdict import (
     USUAL,
     Verdict,
 )
-from ._fit_content import fit_content, fit_table
 from ._parameters import Parameters
 from ._refits import Bands, explain_misfit, Explanation, fit_bands, Origin
 from ._starts import Minimum
+
+
+_SHOWN = 6  # optima of several starts
+_MARK = " *"  # behind the name of a parameter that is not determined
+_NO_PERCENTS = f"{'-':>7} {'-':>9}"
+_BY_NOISE = f"{'by noise alone':>23} {'width':>6}"
+_NOT_DETERMINED = {
+    "no minimum": "not determined, because the fit found no minimum",
+    "no model": "not determined, because no model of this structure holds",
+}
 
 
 @pytree_node
@@ -131,21 +142,9 @@ class Fit:
         return self.names.index(name)
 
     def __call__(
-        self,
-        record: Record,
-        *,
-        band: tuple[float, float] | None = None,
-        hold: str | None = None,
+        self, record: Record, *, band: tuple[float, float] | None = None, hold: str | None = None
     ) -> Verification:
-        """Simulate the model on a record and compare: `jq.verify(fit, record)`.
-
-        **Arguments:**
-
-        - `record`: one that was not fitted.
-        - `band`: (low, high) in rad/s, to compare within; by default `used_band`.
-        - `hold`: as in `jq.verify`.
-
-        **Returns:** a `jq.identify.Verification`, with the simulated output.
+        """`jq.verify(fit, record)`, by default within `used_band`.
 
         **Raises:** what `jq.verify` raises; UndeterminedError where nothing was fitted.
         """
@@ -180,44 +179,30 @@ class Fit:
         By first order, model error included; as the real and the imaginary part of the result.
         """
         self._require_model("an interval of the poles")
-        return pole_reach(self, self._covariance_of_curves())
+        return pole_reach(self)
 
     def step_response(self, time: Float[ArrayLike, " samples"]) -> StepBand:
         """The answer to a unit step of each input, with its 95 % band, model error included.
 
-        **Arguments:**
-
-        - `time`: equally spaced, from 0, in s.
-
-        **Returns:** a `jq.identify.StepBand`: `time`, `value`, `low`, `high`.
+        `time` is equally spaced, from 0, in s.
 
         **Raises:** ValueError for other times, for a model that cannot be simulated, and where
         nothing was fitted.
         """
         self._require_model("a step response")
-        return fitted_step_response(self, time, self._covariance_of_curves())
+        return fitted_step_response(self, time)
 
     def response_band(self, omega: Float[ArrayLike, " frequencies"]) -> ResponseBand:
-        """The frequency response with its 95 % band, model error included, by first order.
-
-        **Arguments:**
-
-        - `omega`: in rad/s.
-
-        **Returns:** a `jq.identify.ResponseBand`.
+        """The response at `omega` (rad/s) with its 95 % band, model error included, to first order.
 
         **Raises:** ValueError where nothing was fitted.
         """
         self._require_model("a response")
-        return fitted_response(self, omega, self._covariance_of_curves())
-
-    def _covariance_of_curves(self) -> Matrix:
-        """Of relative changes. Directions along which no response changes are left out."""
-        return self.relative_covariance if self.identifiable else known_covariance(self)
+        return fitted_response(self, omega)
 
     def to_dict(self) -> dict[str, object]:
         """All numbers as JSON holds them, as in `result.json`: None for what is not finite."""
-        return plain_content(fit_content(self))
+        return plain_content(_content(self))
 
     def interval(
         self, name: str, *, level: float | int = USUAL, model_error: bool = True
@@ -350,4 +335,146 @@ class Fit:
         return draw_models(self, scores, hold_undetermined=hold_undetermined)
 
     def __str__(self) -> str:
-        return fit_table(self)
+        lines = [] if self.identifiable else [str(self.verdict)]
+        if self.verdict.fitted:
+            lines += [*_parameter_lines(self), *_quality_lines(self)]
+        return "\n".join(lines + [f"! {remark}" for remark in self.remarks])
+
+
+def counted(number: int, one: str, many: str = "") -> str:
+    """`1 start`, `2 starts`."""
+    return f"{number} {one if number == 1 else many or one + 's'}"
+
+
+def _parameter_lines(fit: Fit) -> list[str]:
+    rows, discrepancy = [], fit.discrepancy
+    for k, name in enumerate(fit.names):
+        percents = _NO_PERCENTS
+        if np.isfinite(fit.insensitivity[k]):
+            percents = f"{fit.cramer_rao[k]:7.2f} {fit.insensitivity[k]:9.2f}"
+        unit = fit.parameter_units[k] if fit.parameter_units else ""
+        width = "" if discrepancy is None else discrepancy.widths[k]
+        numbers = fit.values[k], fit.standard_errors[k], ft.partial(fit.interval, name)
+        rows.append((name, unit, *numbers, width, percents, bool(fit.determined[k])))
+    for tied in fit.tied:
+        numbers = tied.value, tied.standard_error, tied.interval
+        rows.append((tied.name, "", *numbers, "tied", _NO_PERCENTS, tied.determined))
+    labels = [row[0] if row[-1] else f"{row[0]}{_MARK}" for row in rows]
+    width, wide = max(9, *map(len, labels)), max(len(row[1]) for row in rows)
+    pad = lambda text: [f"{text:<{max(4, wide)}}"] if wide else []
+    heads = [f"{'parameter':<{width}}", *pad("unit"), f"{'value':>11}", f"{'std. error':>10}"]
+    heads += [f"{'95 % interval':>23}", *([_BY_NOISE] if discrepancy is not None else [])]
+    heads += [f"{'CR %':>7}", f"{'insens. %':>9}"]
+    lines = [" ".join([*heads, *([] if fit.identifiable else [f"{'stopped at':>11}"])])]
+    between = lambda ends: f"{ends[0]:.5g} .. {ends[1]:.5g}"
+    for label, (_, unit, value, error, interval, source, percents, determined) in zip(
+        labels, rows, strict=True
+    ):
+        shown, ends, stopped = f"{value:.5g}", between(interval()), ""
+        by_noise = f"{between(interval(model_error=False)):>23} {source:>6}"
+        if not determined:
+            shown, ends, stopped = "-", "not determined", shown
+            by_noise = " " * len(_BY_NOISE)
+        cells = [f"{label:<{width}}", *pad(unit), f"{shown:>11}", f"{error:10.2g}"]
+        cells += [f"{ends:>23}", *([by_noise] if discrepancy is not None else [])]
+        lines.append(" ".join([*cells, percents, f"{stopped:>11}"]).rstrip())
+    if fit.tied:
+        ties = (f"{t.name} to {', '.join(t.follows) or 'fixed numbers'}" for t in fit.tied)
+        lines.append(f"tied: {'; '.join(ties)}")
+    if discrepancy is not None:
+        size, degrees = 100 * SHARES[0] * discrepancy.amplitude, np.degrees(discrepancy.amplitude)
+        none = f" (probability of none: {100 * discrepancy.none:.0f} %)"
+        lines.append(
+            f"95 % intervals count model error: {size:.2g} % of magnitude, {degrees:.2g} deg of "
+            f"phase{none if discrepancy.none > 0.05 else ''}"
+        )
+        if "prior" in discrepancy.widths:
+            lines.append(
+                "width prior: the record cannot show this error; it is that of usual models"
+            )
+    if not fit.identifiable:
+        individually = "this record does not determine it individually"
+        why = _NOT_DETERMINED.get(fit.verdict.kind, individually)
+        lines.append(f"* {why}: where the solver stopped is for comparison alone")
+    return lines
+
+
+def _quality_lines(fit: Fit) -> list[str]:
+    """How good the fit is, and the optima at which the starts ended, if there were several."""
+    condition = f"{fit.condition:.3g}" if fit.condition < 1e6 else "singular"
+    lines = [
+        f"cost {fit.cost:.4g} (average {fit.average_cost:.4g}), misfit / random error "
+        f"{np.sqrt(fit.chi_squared):.2f}, {fit.points} points, condition {condition}, "
+        f"Newton decrement {fit.newton_decrement:.1e}, {counted(fit.steps, 'step')}"
+    ]
+    if fit.minima:
+        starts = counted(sum(len(point.starts) for point in fit.minima), "start")
+        lines.append(f"{starts}, {counted(len(fit.minima), 'optimum', 'optima')}:")
+    for point in fit.minima[:_SHOWN]:
+        values = ", ".join(f"{value:.4g}" for value in point.values)
+        lines.append(f"  cost {point.cost:9.4g} from {len(point.starts)}: {point.kind}; {values}")
+    rest = len(fit.minima) - _SHOWN
+    return lines + ([f"  and {rest} more of higher cost"] if rest > 0 else [])
+
+
+def _content(fit: Fit) -> dict[str, object]:
+    """The verdict of a fit, and the numbers where something was fitted."""
+    verdict, discrepancy = fit.verdict, fit.discrepancy
+    words = ("kind", "summary", "undetermined", "reasons", "remedies")
+    bounds = [bound._asdict() for bound in verdict.bounds]
+    content: dict[str, object] = {
+        "identifiable": fit.identifiable,
+        "verdict": {**{name: getattr(verdict, name) for name in words}, "bounds": bounds},
+        "remarks": fit.remarks,
+    }
+    if not verdict.fitted:
+        return content
+
+    def numbers(value, error, determined, noise_error, interval) -> dict[str, object]:
+        return {
+            "value": value,
+            "standard_error": error,
+            "determined": bool(determined),
+            "interval_95": interval(),
+            "noise_standard_error": noise_error,
+            "noise_interval_95": interval(model_error=False),
+        }
+
+    parameters, per_parameter = [], (fit.values, fit.standard_errors, fit.determined)
+    for k, name in enumerate(fit.names):
+        facts = (*(part[k] for part in per_parameter), fit.noise_standard_errors[k])
+        parameters.append(
+            {
+                "name": name,
+                "unit": fit.parameter_units[k] if fit.parameter_units else None,
+                **numbers(*facts, ft.partial(fit.interval, name)),
+                "width": None if discrepancy is None else discrepancy.widths[k],
+                "cramer_rao_percent": fit.cramer_rao[k],
+                "insensitivity_percent": fit.insensitivity[k],
+            }
+        )
+    ties = []
+    for tied in fit.tied:
+        facts = tied.value, tied.standard_error, tied.determined, tied.noise_standard_error
+        entry = {"name": tied.name, "tied_to": tied.follows}
+        ties.append(entry | numbers(*facts, tied.interval))
+    size = None
+    if discrepancy is not None:
+        size = {
+            "amplitude_rad": discrepancy.amplitude,
+            "length_ln_omega": discrepancy.length,
+            "probability_of_none": discrepancy.none,
+        }
+    combinations = [one.content() | {"interval_95": one.interval} for one in fit.combinations]
+    quality = ("cost", "average_cost", "chi_squared", "condition", "newton_decrement", "points")
+    return {
+        **content,
+        "parameters": parameters,
+        "tied": ties,
+        "combinations": combinations,
+        "null_directions": verdict.null_directions,
+        "covariance": fit.covariance,
+        "noise_covariance": fit.noise_covariance,
+        "discrepancy": size,
+        **{name: getattr(fit, name) for name in (*quality, "steps")},
+    }

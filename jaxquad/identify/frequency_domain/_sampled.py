@@ -11,6 +11,8 @@ from jaxquad._core import Message, pytree_node
 from jaxquad.models import evaluate_response, imaginary
 from jaxquad.spectra import FrequencyResponse
 
+from ._parameters import namespace_of, Numbers
+
 
 _COUNTS = (16, 64)  # aliases to either side
 _NODES = (6, 12)  # frequencies between which the sum over the aliases is interpolated
@@ -18,9 +20,6 @@ _TRIED = 32  # frequencies at which the two are chosen
 _TOLERANCE = 1e-8  # of the response, to which they are chosen
 _FLAT = 0.3  # of the sum, over which its window stays at 1
 _SECOND = 0.7  # length of a second window over that of the first
-
-
-Numbers = Array | np.ndarray
 
 
 @pytree_node
@@ -43,8 +42,8 @@ class Aliases:
     @property
     def omega(self) -> Float[Numbers, " others"]:
         """All frequencies at which the model is needed beside those of the response, in rad/s."""
-        joined = self.upper.reshape(-1), self.lower.reshape(-1)
-        return np.concatenate(joined) if _is_numpy(self.upper) else jnp.concatenate(joined)
+        both = [self.upper.reshape(-1), self.lower.reshape(-1)]
+        return namespace_of(self.upper).concatenate(both)
 
     def total(
         self,
@@ -63,93 +62,44 @@ class Aliases:
         return direct + aliased.reshape(direct.shape)
 
 
-def evaluate_sampled(
-    model: PyTree, omega: Float[Numbers, " frequencies"], aliases: Aliases | None
-) -> Complex[Array, "frequencies outputs inputs"]:
-    """A model's response as a sampled record shows it; without aliases its own."""
-    omega = jnp.asarray(omega)
-    if aliases is None:
-        return evaluate_response(model, omega)
-    both = evaluate_response(model, jnp.concatenate([omega, aliases.omega]))
-    return jnp.asarray(aliases.total(both[: omega.size], both[omega.size :]))
+def _imaginary(omega: Float[Numbers, "..."]) -> Complex[Numbers, "..."]:
+    return 1j * omega if isinstance(omega, np.ndarray) else imaginary(omega)
 
 
-class SampledModel(eqx.Module):
-    """A model as samples of it show it while its input is held, at any frequencies."""
+def _aliases_at(omega, hold: float, count: int, nodes: np.ndarray | None = None) -> Aliases:
+    """The aliases of all frequencies, or of the nodes between which they are interpolated."""
+    at = (omega if nodes is None else nodes)[:, None]
+    steps = 2 * np.pi / hold * np.arange(1, count + 1)[None]
+    turn = (1 - namespace_of(omega).exp(-hold * _imaginary(omega))) / hold
+    across = np.eye(len(omega))
+    if nodes is not None:  # from values at the nodes to the polynomial through them
+        middle, half = 0.5 * (nodes[-1] + nodes[0]), 0.5 * (nodes[-1] - nodes[0])
+        basis = lambda x: np.polynomial.chebyshev.chebvander((x - middle) / half, nodes.size - 1)
+        across = np.linalg.solve(basis(nodes).T, basis(np.asarray(omega)).T).T
 
-    model: PyTree
-    hold: float = eqx.field(static=True)  # s
+    def window(place: Float[np.ndarray, " aliases"]) -> Float[np.ndarray, " aliases"]:
+        """From 1 to 0 at 1, with all derivatives."""
+        x = np.clip((place - _FLAT) / (1 - _FLAT), 0, 1)
+        with np.errstate(divide="ignore", over="ignore"):
+            rise, fall = np.exp(-1 / x), np.exp(-1 / (1 - x))
+        return fall / (rise + fall)
 
-    def frequency_response(
-        self, omega: Float[Array, " frequencies"]
-    ) -> Complex[Array, "frequencies outputs inputs"]:
-        """At frequencies below half the sample rate."""
-        omega = jnp.asarray(omega)
-        return evaluate_sampled(self.model, omega, _aliases_at(omega, self.hold, _COUNTS[0]))
-
-
-def as_sampled(model: PyTree, frf: FrequencyResponse) -> PyTree:
-    """The model whose frequency response is to be compared with a measured one.
-
-    **Arguments:**
-
-    - `model`: with `frequency_response(omega)`.
-    - `frf`: a measured response, which knows how its input was held.
-
-    **Returns:** the model itself, or one whose response has the hold and its aliases.
-    """
-    return behind_hold(model, hold_of(frf))
-
-
-def behind_hold(model: PyTree, hold: float) -> PyTree:
-    """The model behind an input that is held for `hold` s; itself for 0."""
-    return SampledModel(model, hold) if hold else model
+    # A smooth end makes the rest of a sum that turns with a delay vanish faster than any power; of
+    # one that does not turn it is a series in 1 / count, of which two lengths cancel the first term
+    # (Richardson's extrapolation).
+    place = np.arange(1, count + 1) / (count + 1)
+    weights = (window(place) - _SECOND * window(place / _SECOND)) / (1 - _SECOND)
+    spread = turn[:, None] * across.astype(turn.dtype)
+    return Aliases(turn / _imaginary(omega), spread, at + steps, steps - at, weights)
 
 
-def hold_of(frf: FrequencyResponse) -> float:
-    """The hold in s that a model has to allow for; 0: none.
-
-    What is held for several samples is held for each of them: the record shows the steps.
-    """
-    return min(frf.hold or 0.0, frf.dt)
-
-
-def remarks_on_hold(
-    frfs: Sequence[FrequencyResponse], used: Sequence[Bool[np.ndarray, "..."]]
-) -> list[Message]:
-    """Remark on inputs of which nobody said how they are held, where it would show.
-
-    What is held for a sample loses (w dt)^2 / 24 of its magnitude, beside a delay of half a sample.
-    """
-    for frf, mine in zip(frfs, used, strict=True):
-        if frf.hold is not None or not frf.dt or not np.any(mine):
-            continue
-        lost = np.broadcast_to(
-            (np.asarray(frf.omega) * frf.dt)[:, None, None] ** 2 / 24, mine.shape
-        )
-        over = np.where(mine, lost / np.maximum(np.asarray(frf.random_error), 1e-7), 0.0)
-        k = np.unravel_index(np.argmax(over), over.shape)
-        if over[k] > 1:
-            omega = np.asarray(frf.omega)[k[0]]
-            text = (
-                "it is not known how long the input keeps each value: if it is held for a sample "
-                f"({1e3 * frf.dt:.3g} ms), the gain is {100 * lost[k]:.2g} % too low at "
-                f"{omega:.3g} rad/s ({omega / (2 * np.pi):.3g} Hz), {over[k]:.2g} times the random "
-                "error, and the delay half a sample too long; give «hold=» in s, the loop's period "
-                "for a command, 0 for a quantity that was measured« (jq.Record, jq.read)»"
-            )
-            return [Message(text, "hold")]
-    return []
+@eqx.filter_jit
+def _evaluate(model, omega, others):
+    return evaluate_response(model, jnp.concatenate([omega, others]))
 
 
 def plan_aliases(model: PyTree, frf: FrequencyResponse) -> Aliases:
-    """As many aliases and as few nodes as a model's response needs, whose input was held.
-
-    **Arguments:**
-
-    - `model`: near the ones that are to be evaluated.
-    - `frf`: the measured response that they are compared with.
-    """
+    """As many aliases and as few nodes as the response of this model needs, and ones near it."""
     hold, omega = hold_of(frf), np.asarray(frf.omega)
     tried = omega[np.unique(np.linspace(0, omega.size - 1, _TRIED).round().astype(int))]
     aliases = _aliases_at(tried, hold, _COUNTS[-1])
@@ -187,48 +137,72 @@ def plan_aliases(model: PyTree, frf: FrequencyResponse) -> Aliases:
     return _aliases_at(omega, hold, count)
 
 
-def _is_numpy(x: Numbers) -> bool:
-    """Whether to plan in NumPy: one-off arithmetic that JAX would compile piece by piece."""
-    return isinstance(x, np.ndarray)
+def evaluate_sampled(
+    model: PyTree, omega: Float[Numbers, " frequencies"], aliases: Aliases | None
+) -> Complex[Array, "frequencies outputs inputs"]:
+    """A model's response as a sampled record shows it; without aliases its own."""
+    omega = jnp.asarray(omega)
+    if aliases is None:
+        return evaluate_response(model, omega)
+    both = evaluate_response(model, jnp.concatenate([omega, aliases.omega]))
+    return jnp.asarray(aliases.total(both[: omega.size], both[omega.size :]))
 
 
-def _imaginary(omega: Float[Numbers, "..."]) -> Complex[Numbers, "..."]:
-    return 1j * omega if _is_numpy(omega) else imaginary(omega)
+class SampledModel(eqx.Module):
+    """A model as samples of it show it while its input is held, at any frequencies."""
+
+    model: PyTree
+    hold: float = eqx.field(static=True)  # s
+
+    def frequency_response(
+        self, omega: Float[Array, " frequencies"]
+    ) -> Complex[Array, "frequencies outputs inputs"]:
+        """At frequencies below half the sample rate."""
+        omega = jnp.asarray(omega)
+        return evaluate_sampled(self.model, omega, _aliases_at(omega, self.hold, _COUNTS[0]))
 
 
-@eqx.filter_jit
-def _evaluate(model, omega, others):
-    return evaluate_response(model, jnp.concatenate([omega, others]))
+def as_sampled(model: PyTree, frf: FrequencyResponse) -> PyTree:
+    """The model whose frequency response is to be compared with a measured one.
+
+    It is the model itself, or one whose response has the hold of the input and its aliases.
+    """
+    return behind_hold(model, hold_of(frf))
 
 
-def _aliases_at(omega, hold: float, count: int, nodes: np.ndarray | None = None) -> Aliases:
-    """The aliases of all frequencies, or of the nodes between which they are interpolated."""
-    at = (omega if nodes is None else nodes)[:, None]
-    steps = 2 * np.pi / hold * np.arange(1, count + 1)[None]
-    exp = np.exp if _is_numpy(omega) else jnp.exp
-    turn = (1 - exp(-hold * _imaginary(omega))) / hold
-    across = np.eye(len(omega))
-    if nodes is not None:  # from values at the nodes to the polynomial through them
-        middle, half = 0.5 * (nodes[-1] + nodes[0]), 0.5 * (nodes[-1] - nodes[0])
-        basis = lambda x: np.polynomial.chebyshev.chebvander((x - middle) / half, nodes.size - 1)
-        across = np.linalg.solve(basis(nodes).T, basis(np.asarray(omega)).T).T
-    # A smooth end makes the rest of a sum that turns with a delay vanish faster than any power; of
-    # one that does not turn it is a series in 1 / count, of which two lengths cancel the first term
-    # (Richardson's extrapolation).
-    place = np.arange(1, count + 1) / (count + 1)
-    weights = (_step(place) - _SECOND * _step(place / _SECOND)) / (1 - _SECOND)
-    return Aliases(
-        direct=turn / _imaginary(omega),
-        spread=turn[:, None] * across.astype(turn.dtype),
-        upper=at + steps,
-        lower=steps - at,
-        weights=weights,
-    )
+def behind_hold(model: PyTree, hold: float) -> PyTree:
+    """The model behind an input that is held for `hold` s; itself for 0."""
+    return SampledModel(model, hold) if hold else model
 
 
-def _step(place: Float[np.ndarray, " aliases"]) -> Float[np.ndarray, " aliases"]:
-    """From 1 to 0 at 1, with all derivatives."""
-    x = np.clip((place - _FLAT) / (1 - _FLAT), 0, 1)
-    with np.errstate(divide="ignore", over="ignore"):
-        rise, fall = np.exp(-1 / x), np.exp(-1 / (1 - x))
-    return fall / (rise + fall)
+def hold_of(frf: FrequencyResponse) -> float:
+    """The hold in s that a model has to allow for; 0: none.
+
+    What is held for several samples is held for each of them: the record shows the steps.
+    """
+    return min(frf.hold or 0.0, frf.dt)
+
+
+def remarks_on_hold(
+    frfs: Sequence[FrequencyResponse], used: Sequence[Bool[np.ndarray, "..."]]
+) -> list[Message]:
+    """Remark on inputs of which nobody said how they are held, where it would show."""
+    for frf, mine in zip(frfs, used, strict=True):
+        if frf.hold is not None or not frf.dt or not np.any(mine):
+            continue
+        # What a hold takes off the magnitude, beside a delay of half a sample.
+        lost = (np.asarray(frf.omega) * frf.dt)[:, None, None] ** 2 / 24
+        lost = np.broadcast_to(lost, mine.shape)
+        over = np.where(mine, lost / np.maximum(np.asarray(frf.random_error), 1e-7), 0.0)
+        k = np.unravel_index(np.argmax(over), over.shape)
+        if over[k] > 1:
+            omega = np.asarray(frf.omega)[k[0]]
+            text = (
+                "it is not known how long the input keeps each value: if it is held for a sample "
+                f"({1e3 * frf.dt:.3g} ms), the gain is {100 * lost[k]:.2g} % too low at "
+                f"{omega:.3g} rad/s ({omega / (2 * np.pi):.3g} Hz), {over[k]:.2g} times the random "
+                "error, and the delay half a sample too long; give «hold=» in s, the loop's period "
+                "for a command, 0 for a quantity that was measured« (jq.Record, jq.read)»"
+            )
+            return [Message(text, "hold")]
+    return []

@@ -1,4 +1,4 @@
-"""Local minima: many starting points, solved side by side, and where each of them ended."""
+"""Many starting points, solved side by side, and where each of them ended."""
 
 from typing import NamedTuple
 
@@ -8,19 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from jaxquad._core import (
-    CONVERGED,
-    decrement,
-    Descent,
-    Message,
-    minimise,
-    Normal,
-    RUNNING,
-    STALLED,
-    TOLERANCE,
-)
+from jaxquad._core import CONVERGED, decrement, minimise, RUNNING, STALLED, TOLERANCE
 
-from ._parameters import Numbers, Parameters
+from ._parameters import Parameters
 from ._problem import Problem, problem_normal, residuals
 from ._solve import least_squares, Solution, solution_at, stopped_early
 
@@ -51,12 +41,7 @@ class Minimum(NamedTuple):
 
 
 def spread_starts(
-    parameters: Parameters,
-    count: int,
-    *,
-    fastest: float,
-    factor: float = 5.0,
-    seed: int = 0,
+    parameters: Parameters, count: int, *, fastest: float, factor: float = 5.0, seed: int = 0
 ) -> Float[np.ndarray, "starts parameters"]:
     """Starting vectors `z`: the given start, then a Latin hypercube around it.
 
@@ -66,15 +51,10 @@ def spread_starts(
 
     **Arguments:**
 
-    - `parameters`: of `jq.identify.select_parameters`.
-    - `count`: how many starts.
     - `fastest`: the highest frequency in rad/s.
     - `factor`: how far to spread to both sides, above 1.
-    - `seed`: of the random numbers.
 
-    **Raises:**
-
-    - `ValueError`: no starts, or a factor that spreads nothing.
+    **Raises:** ValueError for no starts, or a factor that spreads nothing.
     """
     if count < 1:
         raise ValueError(f"starts is {count}: give 1 for the given start alone, or more")
@@ -108,58 +88,68 @@ def solve_from_many(
     Starts of the default solver run side by side, those of an optimistix solver one by one, since
     its LAPACK calls can hang under `vmap`.
 
-    **Arguments:**
+    **Returns:** the best solution, a minimum before a lower point that is none; and all distinct
+    points, sorted by cost.
 
-    - `problem`: of `jq.identify.make_problem`.
-    - `starts`: vectors `z`, of `spread_starts`.
-    - `solver`: `None` for the default, or an optimistix least-squares solver.
-    - `max_steps`: of the solver.
-
-    **Returns:**
-
-    The best solution, a minimum before a lower point that is none; and all distinct points, sorted
-    by cost.
-
-    **Raises:**
-
-    - `ValueError`: no start has a finite response.
+    **Raises:** ValueError where no start has a finite response.
     """
-    stops: _Stops = jax.tree.map(
-        np.asarray, _solve_all(problem, np.asarray(starts), solver, max_steps)
-    )
-    minima = _distinct(problem.parameters, stops)
-    if not any(np.isfinite(point.cost) for point in minima):
+    stops = jax.tree.map(np.asarray, _solve_all(problem, np.asarray(starts), solver, max_steps))
+    z, status, steps, normal, left, bent = stops
+    costs, groups = normal.cost, list[list[int]]()
+
+    def same(one: int, other: int) -> bool:
+        """Those within a millionth of the cost are one."""
+        floor, difference = 1e-6 * (costs[one] + 1e-6), np.asarray(z[one] - z[other])
+        if abs(costs[other] - costs[one]) > floor:
+            return False
+        near = bool(np.max(np.abs(difference)) <= 1e-4)
+        return near or bool(0.5 * difference @ normal.hessian[one] @ difference <= floor)
+
+    for k in (int(k) for k in np.argsort(costs) if np.isfinite(costs[k])):
+        group = next((group for group in groups if same(group[0], k)), None)
+        groups.append([k]) if group is None else group.append(k)
+    if not groups:
         raise ValueError(
             f"the model's response is not finite at any of {len(starts)} starts: check the model "
             "at its starting values with model.frequency_response(omega)"
         )
+    minima = []
+    for k, *others in groups:
+        curvature, cost = -np.inf, float(costs[k])
+        if np.all(np.isfinite(bent[k])):
+            size = np.sqrt(np.maximum(np.abs(np.diagonal(bent[k])), 1e-300))
+            curvature = float(np.linalg.eigvalsh(bent[k] / np.outer(size, size))[0])
+        # Noise-free data leave a cost of rounding errors, of which no share means anything.
+        if left[k] > 1e-6 * cost + 1e-12:
+            kind = UNFINISHED if status[k] == RUNNING else WALL
+        elif curvature < -1e-6:
+            kind = SADDLE
+        else:
+            kind = MINIMUM if curvature > 1e-9 else FLAT
+        values, led = np.asarray(problem.parameters.values(z[k])), tuple(sorted([k, *others]))
+        minima.append(Minimum(2 * cost, z[k], values, led, float(left[k]), curvature, kind))
     best = min(minima, key=lambda point: (not point.is_minimum, point.cost))
-    status, steps = (int(part[best.starts[0]]) for part in (stops.status, stops.steps))
+    if lost := tuple(k for k in range(len(z)) if not np.isfinite(costs[k])):
+        values = np.asarray(problem.parameters.values(z[lost[0]]))
+        minima.append(Minimum(np.inf, z[lost[0]], values, lost, np.inf, -np.inf, NOT_FINITE))
+    reason, count = (int(part[best.starts[0]]) for part in (status, steps))
     message = "" if best.is_minimum else best.kind
-    if message and status in (RUNNING, STALLED):
-        message = stopped_early(status, steps)
-    return solution_at(problem, best.z, message, steps), minima
-
-
-class _Stops(NamedTuple):
-    """Where every start ended; the first axis is that of the starts."""
-
-    z: Numbers
-    status: Numbers
-    steps: Numbers
-    normal: Normal
-    decrement: Numbers
-    bent: Numbers  # second derivatives of half the cost
+    if message and reason in (RUNNING, STALLED):
+        message = stopped_early(reason, count)
+    return solution_at(problem, best.z, message, count), tuple(minima)
 
 
 @eqx.filter_jit
-def _solve_all(problem, starts, solver, max_steps) -> _Stops:
+def _solve_all(problem, starts, solver, max_steps) -> tuple:
+    """Of every start: `z`, status and steps of its stop; there the normal equations, the Newton
+    decrement, and second derivatives of half the cost."""
+
     def normal_at(z):
         return problem_normal(z, problem)
 
     if solver is None:
         side_by_side = jax.vmap(normal_at, in_axes=-1, out_axes=-1)
-        state: Descent = minimise(side_by_side, starts.T, max_steps, TOLERANCE)
+        state = minimise(side_by_side, starts.T, max_steps, TOLERANCE)
         z, status, steps = state.z.T, state.status, state.steps
     else:
         solve = lambda z0: least_squares(residuals, z0, problem, solver=solver, max_steps=max_steps)
@@ -169,72 +159,4 @@ def _solve_all(problem, starts, solver, max_steps) -> _Stops:
     normal = jax.vmap(normal_at)(z)
     # Forward over forward: a model need not support reverse differentiation.
     bent = jax.vmap(jax.jacfwd(lambda z: normal_at(z).gradient))(z)
-    return _Stops(z, status, steps, normal, jax.vmap(decrement)(normal), bent)
-
-
-def _distinct(parameters: Parameters, stops: _Stops) -> tuple[Minimum, ...]:
-    """The distinct stops: those within a millionth of the cost are one."""
-    z, costs, groups = stops.z, stops.normal.cost, []
-
-    def same(one: int, other: int) -> bool:
-        floor, difference = 1e-6 * (costs[one] + 1e-6), np.asarray(z[one] - z[other])
-        if abs(costs[other] - costs[one]) > floor:
-            return False
-        near = bool(np.max(np.abs(difference)) <= 1e-4)
-        return near or bool(0.5 * difference @ stops.normal.hessian[one] @ difference <= floor)
-
-    for k in (int(k) for k in np.argsort(costs) if np.isfinite(costs[k])):
-        group = next((group for group in groups if same(group[0], k)), None)
-        groups.append([k]) if group is None else group.append(k)
-    points = [_point(parameters, stops, group) for group in groups]
-    lost = tuple(k for k in range(len(z)) if not np.isfinite(costs[k]))
-    if lost:
-        first = np.asarray(z[lost[0]])
-        values = np.asarray(parameters.values(first))
-        points.append(Minimum(np.inf, first, values, lost, np.inf, -np.inf, NOT_FINITE))
-    return tuple(points)
-
-
-def _point(parameters: Parameters, stops: _Stops, group: list[int]) -> Minimum:
-    k, curvature = group[0], -np.inf
-    z, left, cost = np.asarray(stops.z[k]), float(stops.decrement[k]), float(stops.normal.cost[k])
-    hessian = stops.bent[k]
-    if np.all(np.isfinite(hessian)):
-        size = np.sqrt(np.maximum(np.abs(np.diagonal(hessian)), 1e-300))
-        curvature = float(np.linalg.eigvalsh(hessian / np.outer(size, size))[0])
-    # Noise-free data leave a cost of rounding errors, of which no share means anything.
-    if left > 1e-6 * cost + 1e-12:
-        kind = UNFINISHED if int(stops.status[k]) == RUNNING else WALL
-    elif curvature < -1e-6:
-        kind = SADDLE
-    else:
-        kind = MINIMUM if curvature > 1e-9 else FLAT
-    values = np.asarray(parameters.values(z))
-    return Minimum(2 * cost, z, values, tuple(sorted(group)), left, curvature, kind)
-
-
-_NEAR = 1.5  # ratio of costs within which another minimum is a rival
-
-
-def remarks_on_minima(
-    problem: Problem, is_saddle: bool, minima: tuple[Minimum, ...]
-) -> list[Message]:
-    """Remarks on a saddle instead of a minimum, and on other minima of nearly the best cost."""
-    remarks = []
-    if is_saddle:
-        text = (
-            "stationary, but no minimum: the cost falls to one side; «start from other values»"
-            "«, or give starts=20»"
-        )
-        remarks.append(Message(text, "saddle"))
-    true = [point for point in minima if point.is_minimum]
-    rivals = [point for point in true[1:] if point.cost <= _NEAR * true[0].cost]
-    if rivals:
-        values = ", ".join(f"{x:.4g}" for x in rivals[0].values)
-        text = (
-            f"{len(rivals)} other minima cost less than {_NEAR:g} times the best; the next costs "
-            f"{rivals[0].cost:.4g} at {', '.join(problem.parameters.names)} = {values}: record "
-            "more, or over a wider band, to know which is right"
-        )
-        remarks.append(Message(text, "other minima"))
-    return remarks
+    return z, status, steps, normal, jax.vmap(decrement)(normal), bent

@@ -15,10 +15,9 @@ from jaxquad.spectra import FrequencyResponse
 from ..uncertainty._error_budget import FOLLOWS
 from ._cost import Band, Cost, MaximumLikelihood
 from ._fit import check_options, fit_with, require_responses
-from ._fit_content import counted
 from ._parameters import Free, Parameters, Positive, select_parameters, Tie
 from ._refits import free_again, model_to_start_from, Options, Origin, require_origin
-from ._result import Fit
+from ._result import counted, Fit
 
 
 class Step(NamedTuple):
@@ -119,8 +118,17 @@ def reduce_structure(
     first = best = fit_free(model, parameters.names)
     steps: list[Step] = []
     while len(best.names) > 1 and best.verdict.fitted:
-        tried = {step.parameter for step in steps}
-        worst = _least_needed(best, tried, insensitivity, cramer_rao)
+        # The parameter to try without, and why: insensitivity comes first.
+        tried, worst = {step.parameter for step in steps}, None
+        left = [k for k, name in enumerate(best.names) if name not in tried]
+        bounds = np.where(best.determined, best.cramer_rao, np.inf)
+        for label, values, limit in (
+            ("I", best.insensitivity, insensitivity),
+            ("CR", bounds, cramer_rao),
+        ):
+            if worst is None and left and values[k := max(left, key=lambda k: values[k])] > limit:
+                shown = f"{values[k]:.3g} %" if np.isfinite(values[k]) else "unbounded"
+                worst = best.names[k], f"{label} {shown}"
         if worst is None:
             break
         name, reason = worst
@@ -131,38 +139,21 @@ def reduce_structure(
             trial = fit_free(without, [other for other in best.names if other != name])
         except ValueError:  # the model has no response then
             trial = None
-        steps.append(_decide(best, trial, name, reason, rise))
-        best = trial if steps[-1].dropped and trial is not None else best
+        if trial is None or not np.isfinite(trial.cost):
+            numbers = (np.inf,) * 4
+            steps.append(Step(name, reason, *numbers, False, "kept: no fit without it"))
+            continue
+        higher = trial.average_cost - best.average_cost
+        change = trial.information - best.information
+        dropped = change <= 0 if rise is None else higher <= rise
+        numbers = trial.average_cost, higher, trial.information, change
+        steps.append(
+            Step(name, reason, *numbers, dropped, "dropped" if dropped else "kept: needed")
+        )
+        best = trial if dropped else best
     if best.verdict.fitted:
         best = fit_free(model_to_start_from(best), best.names, rounds=3)
     return Reduction(best, first, tuple(steps))
-
-
-def _least_needed(
-    best: Fit, tried: set[str], insensitivity: float, cramer_rao: float
-) -> tuple[str, str] | None:
-    """The parameter to try without, and why: insensitivity comes first."""
-    for label, values, limit in (
-        ("I", best.insensitivity, insensitivity),
-        ("CR", np.where(best.determined, best.cramer_rao, np.inf), cramer_rao),
-    ):
-        left = [k for k, name in enumerate(best.names) if name not in tried]
-        if left and values[k := max(left, key=lambda k: values[k])] > limit:
-            shown = f"{values[k]:.3g} %" if np.isfinite(values[k]) else "unbounded"
-            return best.names[k], f"{label} {shown}"
-    return None
-
-
-def _decide(best: Fit, trial: Fit | None, name: str, reason: str, rise: float | None) -> Step:
-    if trial is None or not np.isfinite(trial.cost):
-        return Step(name, reason, np.inf, np.inf, np.inf, np.inf, False, "kept: no fit without it")
-    higher = trial.average_cost - best.average_cost
-    change = trial.information - best.information
-    dropped = change <= 0 if rise is None else higher <= rise
-    verdict = "dropped" if dropped else "kept: needed"
-    return Step(
-        name, reason, trial.average_cost, higher, trial.information, change, dropped, verdict
-    )
 
 
 # One-sided tests of 5 %: a damping too many only widens the intervals of the others, while one

@@ -1,4 +1,4 @@
-"""From a solver's stop to a result that states what it is worth."""
+"""From a solver's stop to a result that states what it is worth, in numbers and in remarks."""
 
 import dataclasses
 import functools as ft
@@ -7,67 +7,54 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float, PyTree
 
-from jaxquad._core import as_messages
+from jaxquad._core import as_messages, Message
 from jaxquad.models import LaggedIntegrator, StateSpace, TransferFunction
-from jaxquad.spectra import FrequencyResponse
 
 from ..frequency_domain._cost import widen_band
-from ..frequency_domain._parameters import Parameters, Place
+from ..frequency_domain._parameters import Parameters
 from ..frequency_domain._problem import on_device, Problem
 from ..frequency_domain._refits import Origin
 from ..frequency_domain._result import Fit
 from ..frequency_domain._sampled import remarks_on_hold
-from ..frequency_domain._solve import is_saddle, same_responses, Solution
-from ..frequency_domain._starts import Minimum, remarks_on_minima
+from ..frequency_domain._solve import is_saddle, same_responses, Solution, solution_at
+from ..frequency_domain._starts import Minimum
 from ..output_error._noise import NoiseModel
 from ..output_error._simulated import HasStateSpace, HasTransferFunction, linear_model
-from ._accuracy import (
-    Block,
-    blocks_of,
-    condition_number,
-    cramer_rao,
-    degrees_of_freedom,
-    fitted_noise,
-    gauss_newton,
-    information_root,
-    insensitivity,
-    Matrix,
-    misfit_ratio,
-    noise_effect,
-    PriorRows,
-    scaled_inverse,
-)
 from ._error_budget import (
     Discrepancy,
     error_budget,
     ErrorBudget,
-    records_of,
+    Matrix,
+    scaled_inverse,
     Units,
     units_of,
     Weighting,
 )
-from ._fit_remarks import (
-    DOUBT,
-    fed_back,
-    is_fed_back,
-    is_unfinished,
-    MISFIT,
-    no_minimum,
-    NO_MODEL,
-    no_model,
-    remarks_on_bounds,
-    remarks_on_discrepancy,
-    remarks_on_fit,
-    remarks_on_growth,
-    remarks_on_priors,
-    runaways,
+from ._verdict import (
+    identifiability_of,
+    Information,
+    LIMIT,
+    NO_MINIMUM,
+    pooled_freedom,
+    Verdict,
+    without_numbers,
 )
-from ._identifiability import assess_identifiability, Information, LIMIT
-from ._verdict import Bound, pooled_freedom, Verdict
-from ._zero_bounds import bounds_among, near_zeros, one_sided_covariance, pulled_beyond
+from ._zero_bounds import bounds_among, near_zeros, one_sided, without_bounds
 
 
+MISFIT = 1.5  # ratio of misfit to random error from which the model's structure is in doubt
+DOUBT = 0.05  # probability that the model is right, below which a misfit is remarked
 _NO_MINIMUM = 1e-2  # Newton decrement over cost, above which no number counts as determined
+_NO_MODEL = 0.5  # discrepancy in rad, above which nothing counts as determined
+_STILL = 0.25  # standard errors: a bias of that size leaves a 95 % interval at 94.3 %
+_ROUNDING = 1e-4  # relative change that nobody looks for, where there is no noise
+_LARGE = 0.3  # discrepancy in neper, above which intervals by small changes are rough
+_POOR = 10.0  # ratio above which a local minimum is likely
+_EXACT = 1e-9  # cost of a response without noise: no step lowers what rounding has left
+_FAR = 7.0  # in ln: a parameter that moved by a factor of 1000 ran for zero or infinity
+_BEYOND = 4.0  # random errors that a parameter at zero is pulled beyond it
+_RIVAL = 1.5  # ratio of costs within which another minimum is a rival
+_FEEDBACK = "feedback"  # kind of a reason
 
 Vector = Float[np.ndarray, " parameters"]
 
@@ -85,63 +72,82 @@ def assess(
 
     The fit gets the `further` remarks and its `origin`.
     """
-    names, count = problem.parameters.names, problem.parameters.count
-    frfs = [points.frf for points in weighting.points]
-    start = units = units_of(solution)
-    budget = error_budget(weighting.records, weighting.mixtures, solution, units)
-    bread, bounds = budget.bread, ()  # by the slopes at the solution itself
+    parameters, budget, bounds = problem.parameters, weighting.budget, ()
+    names, count, start = parameters.names, parameters.count, units_of(solution)
+    bread, gradient, units = budget.bread, budget.gradient, start  # by slopes at the solution
     near = near_zeros(problem, solution, budget)
-    still = [one.k for one in near if one.changes is not None and one.bound.value]
-    step = newton_step(bread, budget.gradient, solution.at_zero, still)
-    decrement = 0.5 * float(budget.gradient @ step)
+    changes = {one.k: one.changes for one in near if one.changes is not None}
+    # The next Gauss-Newton step, downhill: parameters at zero do not become negative, and those so
+    # near it that slopes there say nothing about a step stand still.
+    still = [one.k for one in near if one.k in changes and one.bound.value]
+    free = np.setdiff1d(
+        np.arange(count), [*(k for k in solution.at_zero if gradient[k] > 0), *still]
+    )
+    step, some = np.zeros(count), bread[np.ix_(free, free)] if free.size < count else bread
+    step[free] = scaled_inverse(some) @ gradient[free]
+    decrement = 0.5 * float(gradient @ step)
 
-    def budget_up_to_limits() -> ErrorBudget:
+    def up_to_limits(units: Units) -> ErrorBudget:
         """With slopes that hold up to the limits of parameters near zero."""
-        records = records_of(problem, frfs, solution, units)
-        for number, record in enumerate(records):
-            slopes = record.slopes.copy()
-            for one in near:
-                if one.changes is not None:
-                    slopes[..., one.k] = units[one.k] * one.changes[number]
-            records[number] = dataclasses.replace(record, slopes=slopes)
-        return error_budget(records, weighting.mixtures, solution, units)
+        again = error_budget(problem, weighting.points, solution, units, changes)
+        return dataclasses.replace(again, mixtures=weighting.budget.mixtures)
 
     if near:
-        budget = budget_up_to_limits()
+        budget = up_to_limits(units)
         bounds, mixed = bounds_among(near, budget, solution, units)
         if not np.array_equal(mixed, units):
-            units = mixed
-            budget = budget_up_to_limits()
-    step = step * (start / units)[: step.size]
-    cost, average, information, misfit = _costs_by_noise(
-        problem, weighting, solution, budget, units
-    )
-    cut = ft.partial(one_sided_covariance, budget=budget, names=names, bounds=bounds)
+            units, budget = mixed, up_to_limits(mixed)
+    step = step * (start / units)[:count]
+    # What compares fits of other structures is under weights by the noise alone.
+    alone = budget
+    if weighting.by_noise is not None:
+        alone = error_budget(weighting.by_noise, weighting.points, solution, units)
+    cost, misfit = alone.cost, alone.misfit_ratio
+    # A misfit beyond the noise is in no covariance of the noise.
+    inflation = misfit if misfit > MISFIT**2 else 1.0
+    zeros = [names.index(bound.name) for bound in bounds if not bound.value]
+
+    def cut(covariance: Matrix) -> Matrix:
+        """Without what the bounds of parameters at zero cut off."""
+        covariance, steps = without_bounds(covariance, budget, zeros)
+        for k, optimum in steps.items():
+            covariance = one_sided(covariance, k, optimum)
+        return covariance
+
     by_noise, covariance = cut(budget.by_noise), cut(budget.covariance)
-    places = problem.parameters.places
-    facts = Information(
-        root=information_root(budget.blocks),
-        covariance=covariance,
-        by_noise=by_noise,
-        names=tuple(place.name for place in places),
-        values=np.asarray(solution.values),
-        units=units,
-        order=ranks_of(places),
-        same=ft.partial(same_responses, problem, solution),
-    )
-    used = [np.asarray(weights)[..., 0] > 0 for weights in problem.weights]
+    frfs, used = zip(*((record.frf, record.used) for record in budget.records), strict=True)
     controller = [mine & frf.of_controller for frf, mine in zip(frfs, used, strict=True)]
     dominated, points = (int(sum(map(np.count_nonzero, masks))) for masks in (controller, used))
+    amplitude = budget.discrepancy.amplitude
     unfinished = decrement > _NO_MINIMUM * max(cost, 1e-9)
-    if 2 * dominated > points:
-        verdict = by_data = fed_back(names, dominated, points)
+    fed_back = 2 * dominated > points
+    if fed_back:
+        reason = Message(
+            f"feedback dominates {dominated} of the {points} points in use: they show -1/C, the "
+            "inverse of the controller, and not the plant",
+            _FEEDBACK,
+        )
+        remedies = (
+            "name the external reference («references=»)",
+            "excite the axis («jq.sweep»), and record what excites it as the reference",
+        )
+        verdict = by_data = without_numbers("no model", names, reason, *remedies)
     elif unfinished or is_unfinished(solution, step, budget.by_noise):
         remedies = ("«start from other values»", "try many starts at once (starts=20)")
         verdict = by_data = no_minimum(names, decrement, cost, *remedies, message=solution.message)
-    elif budget.discrepancy.amplitude > NO_MODEL:
-        verdict = by_data = no_model(names, budget.discrepancy.amplitude)
+    elif amplitude > _NO_MODEL:
+        verdict = by_data = no_model(names, amplitude)
     else:
-        verdict, by_data = identifiability_of(facts, budget.prior, bounds)
+        information = Information(
+            root=budget.root,
+            covariance=covariance,
+            by_noise=by_noise,
+            places=parameters.places,
+            values=np.asarray(solution.values),
+            units=units,
+            same=ft.partial(same_responses, problem, solution),
+        )
+        verdict, by_data = identifiability_of(information, budget.prior, bounds)
         indefinite = not verdict.identifiable and not len(verdict.exact)
         if indefinite and (wider := widen_band(frfs, used)):  # may tell parameters apart
             verdict = dataclasses.replace(verdict, remedies=(wider, *verdict.remedies))
@@ -149,20 +155,75 @@ def assess(
     parts = [frf.remarks_about(mine) for frf, mine in zip(frfs, used, strict=True) if frf.remarks]
     remarks = list(dict.fromkeys(remark for part in parts for remark in part))
     remarks += remarks_on_hold(frfs, used)
-    if not is_fed_back(verdict):
-        here = total_cost(budget.blocks, budget.prior)
-        saddle = solution.converged and is_saddle(problem, solution, here, bread)
-        # Few points of independent noise reach a large misfit by chance: the discrepancy has to
-        # say so, too.
-        doubted = misfit if budget.discrepancy.none < DOUBT else min(misfit, 1.0)
-        remarks += [
-            *remarks_on_fit(problem, solution, cost, decrement, doubted, verdict),
-            *remarks_on_bounds(pulled_beyond(budget, names, bounds), verdict),
-            *_remarks_on_growth(solution.model, frfs, used),
-            *remarks_on_minima(problem, saddle, minima),
-            *remarks_on_priors(budget.prior.misfit, verdict, by_data, chi_squared=doubted),
-            *remarks_on_discrepancy(budget.discrepancy),
-        ]
+    # Few points of independent noise reach a large misfit by chance: the discrepancy has to say so,
+    # too.
+    doubted = misfit if budget.discrepancy.none < DOUBT else min(misfit, 1.0)
+
+    def remark(kind: str, text: str) -> None:
+        remarks.append(Message(text, kind))
+
+    if not fed_back:
+        ran = runaways(problem, solution, verdict)
+        remarks += ran
+        stopped = decrement > 1e-3 * max(cost, _EXACT)
+        if not solution.converged and (stopped or not (ran or cost < _EXACT)):
+            remark("stopped early", f"the solver stopped early: {solution.message}")
+        if stopped:
+            more = "take more steps (max_steps=), or " if solution.message else ""
+            turned = "; the phase is off by about 180 deg: try the other sign of the gain"
+            remark(
+                NO_MINIMUM,
+                f"no minimum: one more Gauss-Newton step would lower the cost, {cost:.4g}, by "
+                f"{2 * decrement:.3g}; {more}«try other starting values»"
+                f"{turned if _is_opposite(problem, solution) else ''}",
+            )
+        if doubted > MISFIT**2:
+            ratio = np.sqrt(doubted)
+            local = ", or this is a local minimum: «try other starting values»"
+            remark(
+                "misfit",
+                f"the misfit is {ratio:.1f} times the random error: the model's structure does not "
+                f"explain the whole response{local if ratio > _POOR else ''}",
+            )
+        # Parameters at zero that the data want to have the other sign, by random errors.
+        unbounded, steps = without_bounds(budget.by_noise, budget, zeros)
+        pulls = {k: -x / float(np.sqrt(max(unbounded[k, k], 1e-300))) for k, x in steps.items()}
+        lost = verdict.undetermined
+        far = {names[k]: x for k, x in pulls.items() if names[k] not in lost and x > _BEYOND}
+        if far:
+            both, real = " and ".join(far), ", ".join(f"jq.identify.Real({name!r})" for name in far)
+            remark(
+                "sign",
+                f"{both} came out as 0, and the data pull {'it' if len(far) == 1 else 'them'} "
+                f"beyond by {max(far.values()):.0f} random errors«other sign|: start with the "
+                f"other sign, or let the sign change with {real}; where that cannot be, the model» "
+                "lacks something, or the time stamps of input and output are shifted",
+            )
+        remarks += _remarks_on_model(solution.model, budget)
+        if solution.converged and is_saddle(problem, solution, budget.cost, bread):
+            remark(
+                "saddle",
+                "stationary, but no minimum: the cost falls to one side; «start from other values»"
+                "«, or give starts=20»",
+            )
+        true = [point for point in minima if point.is_minimum]
+        rivals = [point for point in true[1:] if point.cost <= _RIVAL * true[0].cost]
+        if rivals:
+            values = ", ".join(f"{x:.4g}" for x in rivals[0].values)
+            remark(
+                "other minima",
+                f"{len(rivals)} other minima cost less than {_RIVAL:g} times the best; the next "
+                f"costs {rivals[0].cost:.4g} at {', '.join(names)} = {values}: record more, or "
+                "over a wider band, to know which is right",
+            )
+        remarks += remarks_on_priors(budget.prior.misfit, verdict, by_data, chi_squared=doubted)
+        if _LARGE < amplitude <= _NO_MODEL:
+            remark(
+                "discrepancy",
+                f"the model leaves {100 * amplitude:.0f} % of the response unexplained: the "
+                "intervals are rough; fit the part of the band where it holds («band=»), or a "
+                "model that explains more («Fit.explain()» names terms)",
+            )
     return make_fit(
         problem,
         solution,
@@ -173,11 +234,11 @@ def assess(
         verdict=verdict,
         decrement=decrement,
         cost=cost,
-        average_cost=average,
-        information=information,
+        average_cost=cost / sum(len(record.pairs) for record in budget.records),
+        information=cost + 2 * inflation * alone.fitted_noise,
         chi_squared=misfit,
-        points=sum(int(np.sum(block.weights[:, 0] > 0)) for block in budget.blocks),
-        freedom=degrees_of_freedom(budget.records, budget.bread, budget.noise, count),
+        points=points,
+        freedom=budget.degrees_of_freedom,
         remarks=(*remarks, *further),
         minima=minima,
         discrepancy=budget.discrepancy,
@@ -185,85 +246,118 @@ def assess(
     )
 
 
-def newton_step(
-    bread: Matrix, gradient: Vector, at_zero: Sequence[int], still: Sequence[int] = ()
-) -> Vector:
-    """The next Gauss-Newton step, downhill; parameters at zero do not become negative.
+def is_unfinished(solution: Solution, step: Vector, covariance: Matrix) -> bool:
+    """Whether the solver stopped early, where the next `step` still moves an estimate.
 
-    Others stand `still`: those so near zero that slopes there say nothing about a step.
+    Step and covariance, that of the noise, are those of relative changes.
     """
-    fixed = [*(k for k in at_zero if gradient[k] > 0), *still]
-    if not fixed:
-        return scaled_inverse(bread) @ gradient
-    free, step = np.setdiff1d(np.arange(gradient.size), fixed), np.zeros(gradient.size)
-    step[free] = scaled_inverse(bread[np.ix_(free, free)]) @ gradient[free]
-    return step
+    limit = _STILL * np.sqrt(np.maximum(np.diagonal(covariance), 0.0)) + _ROUNDING
+    return not solution.converged and bool(np.any(np.abs(step) > limit))
 
 
-def total_cost(blocks: list[Block], prior: PriorRows | None = None) -> float:
-    """The sum of squares of the data, and of the priors."""
-    data = sum(float(np.sum(block.residual**2)) for block in blocks)
-    return data if prior is None else data + float(np.sum(prior.misfit**2))
+def no_minimum(
+    names: tuple[str, ...], decrement: float, cost: float, *remedies: str, message: str = ""
+) -> Verdict:
+    """The verdict on a stop from which a step would still lower the cost.
 
-
-def _costs_by_noise(
-    problem: Problem, weighting: Weighting, solution: Solution, budget: ErrorBudget, units: Units
-) -> tuple[float, float, float, float]:
-    """Cost, average, information and misfit under weights by the noise alone.
-
-    They compare fits of other structures.
+    The `message` says why the solver stopped early, and is empty where it did not.
     """
-    blocks, prior, bread, noise = budget.blocks, budget.prior, budget.bread, budget.noise
-    if weighting.weights is not None:
-        count = problem.parameters.count
-        alone = problem.weighted(weighting.weights, weighting.mixings)
-        frfs = [points.frf for points in weighting.points]
-        records = records_of(alone, frfs, solution, units)
-        blocks = blocks_of(records)
-        bread, _ = gauss_newton(blocks, prior, count)
-        noise = noise_effect(records, blocks, prior, count)
-    cost = total_cost(blocks, prior)
-    misfit = misfit_ratio(total_cost(blocks), bread, noise)
-    # A misfit beyond the noise is in no covariance of the noise.
-    inflation = misfit if misfit > MISFIT**2 else 1.0
-    information = cost + 2 * inflation * fitted_noise(bread, noise)
-    return cost, cost / len(blocks), information, misfit
+    reason = f"one more Gauss-Newton step would lower the cost, {cost:.4g}, by {2 * decrement:.3g}"
+    if message:
+        reason = f"the fit has not converged: {message[:1].lower()}{message[1:]}; {reason}"
+        remedies = ("take more steps (max_steps=)", *remedies)
+    return without_numbers("no minimum", names, reason, *remedies)
 
 
-def _remarks_on_growth(
-    model: PyTree, frfs: Sequence[FrequencyResponse], used: Sequence[np.ndarray]
-) -> Sequence[str]:
+def no_model(names: tuple[str, ...], unexplained: float) -> Verdict:
+    """The verdict on a fit that leaves more than half of the response `unexplained`."""
+    reason = f"it leaves {100 * min(unexplained, 1.0):.0f} % of the response unexplained"
+    remedies = (
+        "fit the part of the band where it holds («band=»)",
+        "fit a model that explains more («Fit.explain()» names terms)",
+        "«start from other values»: this may be a local minimum",
+    )
+    return without_numbers("no model", names, reason, *remedies)
+
+
+def runaways(problem: Problem, solution: Solution, verdict: Verdict) -> list[Message]:
+    """Remarks on parameters that ran to zero or to infinity, as far as nothing bounds them."""
+    names, lost = problem.parameters.names, verdict.undetermined
+    start = np.asarray(problem.parameters.start)[: solution.z.size]
+    if verdict.kind == "no model" and _is_opposite(problem, solution_at(problem, start)):
+        text = "the phase at the start is off by about 180 deg: start with the other sign of the "
+        return [Message(f"{text}gain", "sign")]
+    texts = [
+        f"{names[k]} ran to zero: leave it out«sign|, or let its sign change with "
+        f"jq.identify.Real({names[k]!r})»"
+        for k in solution.at_zero
+        if names[k] in lost
+    ]
+    for k in np.flatnonzero(np.asarray(solution.z) - start > 2 * _FAR):
+        if problem.parameters.logarithmic[k] and names[k] in lost:
+            texts.append(f"{names[k]} ran to infinity: «start from other values», or leave it out")
+    return [Message(text, "runaway") for text in texts]
+
+
+def _is_opposite(problem: Problem, solution: Solution) -> bool:
+    """Whether the model turns the wrong way at the lowest frequencies."""
+    for weights, misfit in zip(problem.weights, solution.sensitivity.misfits, strict=True):
+        used = np.asarray(weights)[..., 0] > 0
+        phases = np.abs(np.asarray(misfit)[..., 1][used])
+        if phases.size and np.median(phases[: max(phases.size // 4, 1)]) > 2.5:
+            return True
+    return False
+
+
+def _remarks_on_model(model: PyTree, budget: ErrorBudget) -> list[Message]:
     """Remark on a model that grows within the band of a direct estimate: no open loop does."""
     lags = isinstance(model, LaggedIntegrator) and not np.asarray(model.lag) < 0
-    if lags or not any(frf.method == "direct" for frf in frfs):
+    if lags or not any(record.frf.method == "direct" for record in budget.records):
         return []
     if not isinstance(model, StateSpace | TransferFunction | HasStateSpace | HasTransferFunction):
         return []
-    pairs = zip(frfs, used, strict=True)
-    omega = np.concatenate([np.asarray(f.omega)[np.any(m, axis=(1, 2))] for f, m in pairs])
+    pairs = ((np.asarray(record.frf.omega), record.used) for record in budget.records)
+    omega = np.concatenate([omega[np.any(used, axis=(1, 2))] for omega, used in pairs])
     lowest, highest = float(np.min(omega)), float(np.max(omega))
     poles = linear_model(on_device(model)).poles
     growth = float(np.max(np.real(poles[np.abs(poles) < highest]), initial=0.0))
-    return remarks_on_growth(growth) if growth > lowest else []
+    if not growth > lowest:
+        return []
+    text = (
+        f"the model grows by e in {1 / growth:.2g} s (a pole at +{growth:.3g} rad/s), which no "
+        "record in open loop can do: a controller flew, and the direct estimate is biased towards "
+        "its -1/C; name an external reference («references=»)"
+    )
+    return [Message(text, "growth")]
 
 
-def identifiability_of(
-    facts: Information, prior: PriorRows, bounds: tuple[Bound, ...] = ()
-) -> tuple[Verdict, Verdict]:
-    """What data and priors determine together, and what the data determine alone."""
-    by_data = assess_identifiability(facts, bounds)
-    if not len(prior.misfit):
-        return by_data, by_data
-    # Rows come in pairs of magnitude and phase; a prior's row counts once.
-    priors = np.repeat(prior.slopes, 2, axis=0) / np.sqrt(2)
-    together = facts._replace(root=np.concatenate([facts.root, priors]))
-    return assess_identifiability(together, bounds), by_data
-
-
-def ranks_of(places: Sequence[Place]) -> tuple[int, ...]:
-    """Each parameter's place in the model's own order."""
-    ordered = sorted(places, key=lambda place: (place.leaf, place.index))
-    return tuple(ordered.index(place) for place in places)
+def remarks_on_priors(
+    pulls: Float[np.ndarray, " priors"],
+    verdict: Verdict,
+    by_data: Verdict,
+    *,
+    chi_squared: float = 1.0,
+) -> list[Message]:
+    """Parameters that only a prior determines, and priors that the data contradict."""
+    texts = [
+        f"prior {k + 1} is {abs(pull):.1f} of its standard errors away from the fit: data and "
+        "prior contradict each other; check both"
+        for k, pull in enumerate(pulls)
+        if abs(pull) > 3
+    ]
+    if pulls.size and not texts and chi_squared > MISFIT**2:
+        texts.append(
+            "the misfit may be that of a prior which the record contradicts: compare the fit "
+            "without priors="
+        )
+    resolved = [name for name in by_data.undetermined if name not in verdict.undetermined]
+    if resolved:
+        alone = ", ".join(combination.name for combination in by_data.combinations)
+        texts.append(
+            f"{' and '.join(resolved)}: determined by the prior alone; the record by itself "
+            f"determines {'only ' + alone if alone else 'none of them'}"
+        )
+    return [Message(text, "prior") for text in texts]
 
 
 def make_fit(
@@ -297,7 +391,8 @@ def make_fit(
     pooled = pooled_freedom(freedom, np.ones(units.size))
     combinations = (one._replace(degrees_of_freedom=pooled) for one in verdict.combinations)
     verdict = dataclasses.replace(verdict, combinations=tuple(combinations))
-    if runaways(problem, solution, verdict) and not is_fed_back(verdict):
+    fed_back = any(reason.kind == _FEEDBACK for reason in verdict.reasons)
+    if runaways(problem, solution, verdict) and not fed_back:
         verdict = dataclasses.replace(verdict, remedies=())  # the remarks say what to do
     unbounded = np.zeros(len(names), dtype=bool)
     if verdict.undetermined:
@@ -317,6 +412,11 @@ def make_fit(
     physical = in_units(covariance)
     with np.errstate(divide="ignore"):
         percent = np.where(values == 0, np.nan, 100 * np.abs(units / values))
+    # CIFER's, with H = d2J/dz2 = 2 J'J: Cramer-Rao bounds 2 sqrt((H^-1)_ii), and 1 / sqrt(H_ii).
+    bounds = np.sqrt(2 * np.diagonal(scaled_inverse(bread)))
+    insensitivity = 1 / np.sqrt(np.maximum(2 * np.diagonal(bread), 1e-300))
+    scale = np.sqrt(np.maximum(np.diagonal(bread), 1e-300))
+    spread = np.linalg.eigvalsh(bread / np.outer(scale, scale))
     return Fit(
         model=on_device(solution.model),
         names=names,
@@ -324,14 +424,14 @@ def make_fit(
         standard_errors=np.where(unbounded, np.inf, np.sqrt(np.diagonal(physical))),
         covariance=physical,
         noise_covariance=in_units(by_noise),
-        cramer_rao=np.where(unbounded, np.inf, cramer_rao(bread) * percent),
-        insensitivity=insensitivity(bread) * percent,
+        cramer_rao=np.where(unbounded, np.inf, bounds * percent),
+        insensitivity=insensitivity * percent,
         cost=cost,
         average_cost=average_cost,
         information=information,
         chi_squared=chi_squared,
         newton_decrement=decrement,
-        condition=condition_number(bread),
+        condition=float(np.sqrt(spread[-1] / max(spread[0], 1e-30 * spread[-1], 1e-300))),
         points=points,
         steps=solution.steps,
         verdict=verdict,
@@ -354,21 +454,16 @@ def unfitted(
     """What a fit returns where there is nothing to fit: the starting values, all marked."""
     count = parameters.count
     infinite, unknown = np.full(count, np.inf), np.full((count, count), np.nan)
+    numbers = ("cost", "average_cost", "information", "chi_squared", "newton_decrement")
+    matrices = ("covariance", "noise_covariance", "relative_covariance")
     return Fit(
         model=model,
         names=parameters.names,
         values=np.asarray(parameters.values(parameters.start[:count])),
         standard_errors=infinite,
-        covariance=unknown,
-        noise_covariance=unknown,
         cramer_rao=infinite,
         insensitivity=infinite,
         degrees_of_freedom=infinite,
-        cost=np.nan,
-        average_cost=np.nan,
-        information=np.nan,
-        chi_squared=np.nan,
-        newton_decrement=np.nan,
         condition=np.inf,
         points=0,
         steps=0,
@@ -376,6 +471,6 @@ def unfitted(
         remarks=as_messages(remarks),
         parameters=parameters,
         units=np.asarray(parameters.slopes(parameters.start[:count])),
-        relative_covariance=unknown,
-        relative_noise_covariance=unknown,
+        **dict.fromkeys(numbers, np.nan),
+        **dict.fromkeys((*matrices, "relative_noise_covariance"), unknown),
     )

@@ -1,5 +1,6 @@
-"""Functions of a fitted model with their errors: any quantity, tied parameters, zeros and poles."""
+"""What follows from a fitted model, with its error: quantities, factors, curves, drawn models."""
 
+import functools as ft
 from collections.abc import Callable
 from typing import NamedTuple, TYPE_CHECKING
 
@@ -7,13 +8,16 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Complex, Float, PyTree
+from jaxtyping import Array, ArrayLike, Bool, Complex, Float, Inexact, PyTree
 
-from jaxquad.models import TransferFunction
+from jaxquad._compile import hasty_options, Jit
+from jaxquad._core import as_array
+from jaxquad.models import evaluate_response, simulate_linear, TransferFunction
 
 from ..frequency_domain._parameters import number_at, Parameters
-from ._identifiability import LIMIT
-from ._verdict import Combination, reach_of_interval, UndeterminedError, USUAL
+from ..output_error._simulated import linear_model
+from ._error_budget import Matrix
+from ._verdict import Combination, LIMIT, NO_MINIMUM, reach_of_interval, UndeterminedError, USUAL
 
 
 if TYPE_CHECKING:
@@ -22,8 +26,11 @@ if TYPE_CHECKING:
 
 _ROUNDING = 1e-12  # of a variance, to those that cancel in it
 _CLOSE = 3.0  # standard errors between two roots, within which they count as repeated
+_CHANGE = 1e-5  # of a parameter: central differences are then exact to about 1e-10
+_AT_ONCE = 512  # frequencies of a program, so that all curves of a model share it
 
 Quantity = Callable[[PyTree], Float[Array, ""]]  # of a model
+Vector = Float[np.ndarray, " parameters"]
 
 
 class Tied(NamedTuple):
@@ -46,17 +53,9 @@ class Tied(NamedTuple):
         return self.value - reach, self.value + reach
 
 
-class Propagated(NamedTuple):
-    """A function of the model at the solution, to first order."""
-
-    value: float
-    slope: Float[np.ndarray, " parameters"]  # by relative changes of the free parameters
-    is_open: bool  # whether it changes where the responses do not
-
-
 def derive(fit: "Fit", quantity: Quantity, name: str, *, model_error: bool) -> Combination:
     """A quantity with its standard error, as `Fit.derived` says."""
-    value, slope, is_open = propagate(fit, quantity)
+    value, slope, is_open = _propagate(fit, quantity)
     if is_open:
         lost = ", ".join(fit.verdict.undetermined)
         raise UndeterminedError(
@@ -77,7 +76,7 @@ def tied_parameters(fit: "Fit") -> tuple[Tied, ...]:
     """The tied parameters, in the order of `tied=`; none where nothing was fitted."""
     ties = []
     for place, _ in fit.parameters.ties if fit.verdict.fitted else ():
-        value, slope, is_open = propagate(fit, number_at(place))
+        value, slope, is_open = _propagate(fit, number_at(place))
         parts = (fit.relative_covariance, fit.relative_noise_covariance)
         error, by_noise = (float(np.sqrt(max(slope @ part @ slope, 0.0))) for part in parts)
         sharp = fit.identifiable or error <= LIMIT * abs(value)
@@ -88,8 +87,8 @@ def tied_parameters(fit: "Fit") -> tuple[Tied, ...]:
     return tuple(ties)
 
 
-def propagate(fit: "Fit", quantity: Quantity) -> Propagated:
-    """Value and slope of a quantity, and whether it is left open."""
+def _propagate(fit: "Fit", quantity: Quantity) -> tuple[float, Vector, bool]:
+    """A quantity, its slope by relative changes, and whether it moves where responses do not."""
     verdict, places = fit.verdict, (fit.values, *fit.verdict.alternatives)
     arguments = quantity, fit.parameters, fit.model
     try:
@@ -99,10 +98,9 @@ def propagate(fit: "Fit", quantity: Quantity) -> Propagated:
             value, *others = [_value_and_slope(*arguments, values) for values in places]
     value, slope = float(value[0]), np.asarray(value[1]) * fit.units
     differs = any(abs(float(other) - value) > 1e-6 * abs(value) for other, _ in others)
-    # Whether it changes where the responses do not.
     along_null = np.abs(verdict.exact @ slope) > 1e-6 * np.linalg.norm(slope)
     on_curved = [slope[fit.names.index(name)] != 0 for name in verdict.curved]
-    return Propagated(value, slope, bool(differs or np.any(along_null) or any(on_curved)))
+    return value, slope, bool(differs or np.any(along_null) or any(on_curved))
 
 
 @eqx.filter_jit
@@ -147,12 +145,23 @@ class Factors(eqx.Module):
     delay: Combination  # s; its error is 0 where it was fixed
 
     def __str__(self) -> str:
-        above = [_factor_text(factor) for factor in self.zeros]
-        below = ["(0)"] * self.integrators + [_factor_text(factor) for factor in self.poles]
-        lines = [" ".join([_number(*self.gain[1:3]), *above])]
+        def number(value: float, error: float) -> str:
+            if np.isnan(value):
+                return "not determined"
+            return f"{value:.4g} +- {error:.2g}" if error else f"{value:.4g}"
+
+        def text(factor: Factor) -> str:
+            if factor.repeated:
+                inside = ", ".join(f"~{value:.4g}" for value in factor.values)
+            else:
+                inside = ", ".join(map(number, factor.values, factor.standard_errors))
+            return f"[{inside}]" if len(factor.values) > 1 else f"({inside})"
+
+        below = ["(0)"] * self.integrators + [text(factor) for factor in self.poles]
+        lines = [" ".join([number(*self.gain[1:3]), *map(text, self.zeros)])]
         lines[0] += f" / ({' '.join(below)})" if below else ""
         if self.delay.value != 0:
-            lines[0] += f" exp(-({_number(*self.delay[1:3])}) s)"
+            lines[0] += f" exp(-({number(*self.delay[1:3])}) s)"
         lines.append(
             "(a) is s + a, [zeta, omega] is s^2 + 2 zeta omega s + omega^2, rad/s; +- one std. "
             "error"
@@ -162,41 +171,6 @@ class Factors(eqx.Module):
                 "~ repeated within its error: the roots may be two, and have no first-order error"
             )
         return "\n".join(lines)
-
-
-def _factor_text(factor: "Factor") -> str:
-    pairs = zip(factor.values, factor.standard_errors, strict=True)
-    if factor.repeated:
-        inside = ", ".join(f"~{value:.4g}" for value in factor.values)
-    else:
-        inside = ", ".join(_number(*pair) for pair in pairs)
-    return f"[{inside}]" if len(factor.values) > 1 else f"({inside})"
-
-
-def _number(value: float, error: float) -> str:
-    if np.isnan(value):
-        return "not determined"
-    return f"{value:.4g} +- {error:.2g}" if error else f"{value:.4g}"
-
-
-class _Spread(NamedTuple):
-    """What turns slopes by the parameters' relative changes into standard errors."""
-
-    covariance: Float[np.ndarray, "parameters parameters"]
-    exact: Float[np.ndarray, "null parameters"]
-    identifiable: bool
-
-    def error(self, slope: Float[np.ndarray, " parameters"]) -> float:
-        """Infinite along a direction that changes nothing."""
-        if np.any(np.abs(self.exact @ slope) > 1e-6 * np.linalg.norm(slope)):
-            return np.inf
-        return float(np.sqrt(max(slope @ self.covariance @ slope, 0.0)))
-
-    def number(self, value: float, slope: Float[np.ndarray, " parameters"]) -> tuple[float, float]:
-        """Value and error, or nan and infinity if the error is too large for a number."""
-        error = self.error(slope)
-        lost = not self.identifiable and not error <= LIMIT * abs(value)
-        return (np.nan, np.inf) if lost else (value, error)
 
 
 def factors(fit: "Fit") -> Factors:
@@ -228,12 +202,24 @@ def factors(fit: "Fit") -> Factors:
         reasons = "; ".join(fit.verdict.reasons)
         advice = reasons or "fit fewer zeros and poles, or excite a wider band"
         raise UndeterminedError(f"no factors, for no coefficient is determined: {advice}")
-    spread = _Spread(fit.relative_covariance, fit.verdict.exact, fit.identifiable)
+
+    def error_of(slope: Vector) -> float:
+        """Infinite along a direction that changes nothing."""
+        if np.any(np.abs(fit.verdict.exact @ slope) > 1e-6 * np.linalg.norm(slope)):
+            return np.inf
+        return float(np.sqrt(max(slope @ fit.relative_covariance @ slope, 0.0)))
+
+    def number(value: float, slope: Vector) -> tuple[float, float]:
+        """Value and error, or nan and infinity if the error is too large for a number."""
+        error = error_of(slope)
+        lost = not fit.identifiable and not error <= LIMIT * abs(value)
+        return (np.nan, np.inf) if lost else (value, error)
+
     above, below = (np.asarray(c) for c in (model.numerator, model.denominator))
     # Derivatives of the coefficients, free and tied, by the relative changes of the free ones.
     slopes = dict(zip(fit.names, np.diag(fit.units), strict=True))
     for place, _ in fit.parameters.ties:
-        slopes[place.name] = propagate(fit, number_at(place)).slope
+        slopes[place.name] = _propagate(fit, number_at(place))[1]
     none = np.zeros(len(fit.names))
     rows = lambda field, count: np.array(
         [slopes.get(f"{field}[{k}]", none) for k in range(count)]
@@ -245,55 +231,290 @@ def factors(fit: "Fit") -> Factors:
     fixed = [c == 0 and f"denominator[{k}]" not in fit.names for k, c in enumerate(below)]
     integrators = len(fixed) if all(fixed) else fixed[::-1].index(False)
     left = below.size - integrators
-    gain = *spread.number(float(above[0] / below[0]), gain_slope), fit.freedom_of(gain_slope)
-    delay = *spread.number(float(model.delay), late), fit.freedom_of(late)
+    gain = *number(float(above[0] / below[0]), gain_slope), fit.freedom_of(gain_slope)
+    delay = *number(float(model.delay), late), fit.freedom_of(late)
+
+    def factored(coefficients: np.ndarray, slopes: np.ndarray) -> tuple[Factor, ...]:
+        """The factors of one polynomial, slowest first."""
+        roots, factors = np.roots(coefficients).astype(complex), []
+        powers = np.arange(coefficients.size - 1, -1, -1)
+        for k in sorted(np.flatnonzero(np.imag(roots) >= 0), key=lambda k: abs(roots[k])):
+            root, others = complex(roots[k]), np.delete(roots, k)
+            steep = np.polyval(np.polyder(coefficients), roots[k])
+            with np.errstate(all="ignore"):
+                slope = -(roots[k] ** powers) @ slopes / steep
+            size, real, imag = abs(root), np.real(slope), np.imag(slope)
+            pairs = [(-root.real, -real)]
+            if root.imag != 0:
+                wider = (root.real * real + root.imag * imag) / size
+                damping = -root.real / size
+                pairs = [(damping, -(real + damping * wider) / size), (size, wider)]
+            # Of another root so near that the sum and difference of the two are mixed up.
+            distance = float(np.min(np.abs(others - root), initial=np.inf))
+            repeated = distance <= 1e-6 * size or not np.all(np.isfinite(slope))
+            if not repeated:
+                error = np.hypot(error_of(real), error_of(imag))
+                repeated = bool(distance < min(_CLOSE * error, LIMIT * size))
+            numbers = [(v, np.nan) if repeated else number(v, slope) for v, slope in pairs]
+            values, errors = zip(*numbers, strict=True)
+            factors.append(Factor(root, values, errors, repeated))
+        return tuple(factors)
+
     return Factors(
         gain=Combination("gain", *gain),
-        zeros=_factored(above, d_above, spread),
-        poles=_factored(below[:left], d_below[:left], spread),
+        zeros=factored(above, d_above),
+        poles=factored(below[:left], d_below[:left]),
         integrators=integrators,
         delay=Combination("delay", *delay),
     )
 
 
-def _factored(
-    coefficients: Float[np.ndarray, " powers"],
-    slopes: Float[np.ndarray, "powers parameters"],
-    spread: _Spread,
-) -> tuple[Factor, ...]:
-    """The factors of one polynomial, slowest first."""
-    roots = np.roots(coefficients).astype(complex)
-    upper = sorted(np.flatnonzero(np.imag(roots) >= 0), key=lambda k: abs(roots[k]))
-    powers = np.arange(coefficients.size - 1, -1, -1)
-    factors = []
-    for k in upper:
-        steep = np.polyval(np.polyder(coefficients), roots[k])
-        with np.errstate(all="ignore"):
-            slope = -(roots[k] ** powers) @ slopes / steep
-        factors.append(_factor(complex(roots[k]), np.delete(roots, k), slope, spread))
-    return tuple(factors)
+class ResponseBand(NamedTuple):
+    """The frequency response of a fitted model, with half of its 95 % band."""
+
+    omega: Float[np.ndarray, " frequencies"]  # rad/s
+    response: Complex[np.ndarray, "frequencies outputs inputs"]
+    decibels: Float[np.ndarray, "frequencies outputs inputs"]  # from the magnitude to either end
+    degrees: Float[np.ndarray, "frequencies outputs inputs"]  # from the phase to either end
 
 
-def _factor(
-    root: complex,
-    others: Complex[np.ndarray, " others"],
-    slope: Complex[np.ndarray, " parameters"],
+class StepBand(NamedTuple):
+    """The answer to a unit step of each input, with half of its 95 % band."""
+
+    time: Float[np.ndarray, " samples"]  # s, from the step
+    value: Float[np.ndarray, "samples outputs inputs"]
+    reach: Float[np.ndarray, "samples outputs inputs"]  # from the value to either end of the band
+
+    @property
+    def low(self) -> Float[np.ndarray, "samples outputs inputs"]:
+        """The lower end of the 95 % band."""
+        return self.value - self.reach
+
+    @property
+    def high(self) -> Float[np.ndarray, "samples outputs inputs"]:
+        """The upper end of the 95 % band."""
+        return self.value + self.reach
+
+
+def step_response(
+    model: PyTree, time: Float[ArrayLike, " samples"]
+) -> Float[np.ndarray, "samples outputs inputs"]:
+    """The answer of a linear model at rest to a unit step of each input at time 0.
+
+    **Arguments:**
+
+    - `model`: a `jq.TransferFunction`, a `jq.StateSpace`, or a model with `transfer_function()` or
+        `state_space()`.
+    - `time`: equally spaced, from 0, in s.
+
+    **Raises:**
+
+    - `ValueError`: the model has none of these forms, or `time` is not equally spaced from 0.
+    """
+    t, plant = np.asarray(time, float), linear_model(model)
+    if t.ndim != 1:
+        raise ValueError(f"time has the shape {t.shape}: give times in s, equally spaced from 0")
+    steps = np.diff(t)
+    if t.ndim != 1 or t.size < 2 or t[0] != 0 or not np.allclose(steps, steps[:1], rtol=1e-6):
+        raise ValueError(
+            "time is not equally spaced from 0: give two or more, as np.linspace(0, 2, 401)"
+        )
+    dt = float(t[-1] / (t.size - 1))
+    if isinstance(plant, TransferFunction):
+        return np.asarray(simulate_linear(plant, np.ones(t.size), dt))[:, None, None]
+    inputs = np.eye(plant.G.shape[1])
+    steps = (np.broadcast_to(unit, (t.size, len(inputs))) for unit in inputs)
+    return np.stack([np.asarray(simulate_linear(plant, u, dt)) for u in steps], axis=-1)
+
+
+@ft.partial(Jit, options=hasty_options)
+def _response(model: PyTree, omega: Float[Array | np.ndarray, " frequencies"]) -> Array:
+    return evaluate_response(model, jnp.asarray(omega))
+
+
+def model_response(
+    model: PyTree, omega: Float[np.ndarray, " frequencies"]
+) -> Complex[np.ndarray, "frequencies outputs inputs"]:
+    """The response of a model at frequencies in rad/s, by one program whatever their number."""
+    padded = np.pad(omega, (0, -omega.size % _AT_ONCE), mode="edge").reshape(-1, _AT_ONCE)
+    parts = [np.asarray(_response(model, part)) for part in padded]
+    return np.concatenate(parts)[: omega.size]
+
+
+def fitted_step_response(fit: "Fit", time: Float[ArrayLike, " samples"]) -> StepBand:
+    value, reach = _with_reach(fit, lambda model: step_response(model, time))
+    return StepBand(np.asarray(time, float), value, reach(lambda slopes: slopes))
+
+
+def fitted_response(fit: "Fit", omega: Float[ArrayLike, " frequencies"]) -> ResponseBand:
+    grid = np.asarray(omega, float)
+    if grid.ndim != 1:
+        raise ValueError(f"omega has the shape {grid.shape}: give a list of frequencies in rad/s")
+    value, reach = _with_reach(fit, lambda model: model_response(model, grid))
+    decibels = 20 / np.log(10) * reach(lambda slopes: np.real(slopes / value))
+    return ResponseBand(
+        grid, value, decibels, np.degrees(reach(lambda slopes: np.imag(slopes / value)))
+    )
+
+
+def pole_reach(fit: "Fit") -> Complex[np.ndarray, " poles"]:
+    start = linear_model(fit.model).poles
+
+    def poles(model: PyTree) -> Complex[np.ndarray, " poles"]:
+        left, ordered = list(linear_model(model).poles), []
+        for pole in start:  # in the order of the fit's poles
+            ordered.append(left.pop(int(np.argmin(np.abs(np.array(left) - pole)))))
+        return np.array(ordered, complex)
+
+    reach = _with_reach(fit, poles)[1]
+    return reach(np.real) + 1j * reach(np.imag)
+
+
+def _with_reach(
+    fit: "Fit", curve: Callable[[PyTree], Inexact[np.ndarray, "..."]]
+) -> tuple[np.ndarray, Callable[[Callable[[np.ndarray], np.ndarray]], np.ndarray]]:
+    """A curve of the model, and half of the 95 % band of what a function makes of its slopes.
+
+    Slopes are by differences: the program of the curve itself serves, whatever the model.
+    """
+    value, rows = curve(fit.model), []
+    # Directions along which no response changes are left out.
+    covariance = fit.relative_covariance if fit.identifiable else known_covariance(fit)
+
+    def changed(k: int, by: float) -> Inexact[np.ndarray, "..."]:
+        values = np.array(fit.values, float)
+        values[k] += by * fit.units[k]
+        return curve(fit.parameters.replace(fit.model, values))
+
+    for k in range(len(fit.names)):
+        above = changed(k, _CHANGE)
+        if fit.values[k]:
+            rows.append((above - changed(k, -_CHANGE)) / (2 * _CHANGE))
+        else:  # a lag or delay of 0 has no lower neighbour
+            rows.append((above - value) / _CHANGE)
+
+    def reach(part: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+        slopes = part(np.stack(rows))
+        flat = slopes.reshape(len(slopes), -1)
+        with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
+            variance = np.einsum("ij,ik,kj->j", flat, covariance, flat)
+            shares = flat**2 * np.diagonal(covariance)[:, None]
+            doubt = np.sum(shares / fit.degrees_of_freedom[:, None], axis=0)
+            freedom = np.where(doubt > 0, np.sum(shares, axis=0) / doubt, np.inf)
+        factor = np.array([reach_of_interval(number) for number in freedom])
+        return (factor * np.sqrt(np.maximum(variance, 0.0))).reshape(slopes.shape[1:])
+
+    return value, reach
+
+
+def draw_models(
+    fit: "Fit", scores: Float[ArrayLike, "parameters members"], *, hold_undetermined: bool = False
+) -> PyTree:
+    """Draw models from a fit at given standard normal numbers, as `Fit.ensemble` does.
+
+    `scores` has one column for each model.
+
+    **Raises:** as `Fit.ensemble`.
+    """
+    check_drawable(fit, hold_undetermined)
+    covariance = known_covariance(fit)
+    logarithmic = np.array(fit.parameters.logarithmic[: len(fit.names)])
+    here, units = np.asarray(fit.values), np.asarray(fit.units)
+    at_zero = [fit.names.index(bound.name) for bound in fit.verdict.bounds]
+    along = covariance[at_zero] / np.diagonal(covariance)[at_zero, None]
+    # In other units than its value a parameter is mixed up with others near zero.
+    scaled = logarithmic & (here != 0) & ~np.isclose(units, here, rtol=1e-9, atol=0.0)
+    mixed_up = np.setdiff1d(np.flatnonzero(scaled), at_zero)
+    relative = np.asarray(fit.relative_covariance)[mixed_up]
+    along = np.concatenate([along, relative / relative[np.arange(len(relative)), mixed_up, None]])
+    at_zero += mixed_up.tolist()
+    logarithmic[at_zero] = False
+    variances, directions = np.linalg.eigh(covariance)
+    root = directions * np.sqrt(np.maximum(variances, 0.0))
+    spread = _Spread(root, tuple(at_zero), along, here, units, logarithmic)
+    drawn = jax.tree.leaves(_drawn(fit.parameters, fit.model, spread, as_array(scores)))
+    places = (*fit.parameters.places[: len(fit.names)], *(p for p, _ in fit.parameters.ties))
+    leaves, structure = jax.tree.flatten(fit.model)
+    floating = [k for k, leaf in enumerate(leaves) if eqx.is_inexact_array(leaf)]
+    for k in {floating[place.leaf] for place in places}:
+        leaves[k] = drawn[k]
+    return jax.tree.unflatten(structure, leaves)
+
+
+class _Spread(NamedTuple):
+    """How the free parameters of a fit are drawn."""
+
+    root: Matrix  # of the covariance of relative changes
+    at_zero: tuple[int, ...]  # parameters at or near their bound
+    along: Float[np.ndarray, "bounds parameters"]  # what changes with each of these
+    here: Float[np.ndarray, " parameters"]
+    units: Float[np.ndarray, " parameters"]
+    logarithmic: Bool[np.ndarray, " parameters"]
+
+
+@eqx.filter_jit  # as one program: eager, it would be half a dozen for each number of members
+def _drawn(
+    parameters: Parameters,
+    model: PyTree,
     spread: _Spread,
-) -> Factor:
-    size, real, imag = abs(root), np.real(slope), np.imag(slope)
-    if root.imag == 0:
-        pairs = [(-root.real, -real)]
-    else:
-        wider = (root.real * real + root.imag * imag) / size
-        damping = -root.real / size
-        pairs = [(damping, -(real + damping * wider) / size), (size, wider)]
-    # Of another root so near that the sum and difference of the two are mixed up.
-    distance = float(np.min(np.abs(others - root), initial=np.inf))
-    repeated = distance <= 1e-6 * size or not np.all(np.isfinite(slope))
-    if not repeated:
-        error = np.hypot(spread.error(real), spread.error(imag))
-        repeated = bool(distance < min(_CLOSE * error, LIMIT * size))
-    if repeated:
-        return Factor(root, tuple(v for v, _ in pairs), (np.nan,) * len(pairs), True)
-    numbers = [spread.number(*pair) for pair in pairs]
-    return Factor(root, tuple(v for v, _ in numbers), tuple(e for _, e in numbers))
+    scores: Float[Array, "parameters members"],
+) -> PyTree:
+    """The models, with the members on the last axis of every array."""
+    changes = spread.root @ scores
+    here, units = spread.here[:, None], spread.units[:, None]
+    for k, along in zip(spread.at_zero, spread.along, strict=True):
+        # Folded to one side of zero, with what goes along with it: they keep their sign.
+        drawn = spread.here[k] / spread.units[k] + changes[k]
+        folded = jnp.abs(drawn) - drawn
+        changes += along[:, None] * folded[None]
+    linear = here + units * changes
+    # Several that go along with each other may have pushed one back.
+    near = np.isin(np.arange(len(linear)), spread.at_zero)[:, None]
+    linear = jnp.where(near, jnp.copysign(linear, units), linear)
+    values = jnp.where(spread.logarithmic[:, None], here * jnp.exp(changes), linear)
+    return jax.vmap(lambda v: parameters.replace(model, v), in_axes=-1, out_axes=-1)(values)
+
+
+def check_drawable(fit: "Fit", hold_undetermined: bool) -> None:
+    """Raise ValueError for a fit that cannot be drawn from, as `Fit.ensemble` says."""
+    if not fit.verdict.fitted:
+        raise UndeterminedError(f"there is nothing to draw from: {fit.verdict.summary}")
+    stopped = [remark for remark in fit.remarks if remark.kind == NO_MINIMUM]
+    if stopped:
+        raise ValueError(
+            f"the fit did not converge, so there is nothing to draw from: {stopped[0]}"
+        )
+    errors = fit.standard_errors[fit.determined]
+    if not (np.all(np.isfinite(fit.relative_covariance)) and np.all(np.isfinite(errors))):
+        raise ValueError(
+            "the fit's standard errors are not finite, so there is nothing to draw from: use a "
+            "response with random errors, and fit again"
+        )
+    lost = fit.verdict.undetermined
+    if lost and not hold_undetermined:
+        names, sums = ", ".join(lost), " and ".join(c.name for c in fit.combinations)
+        raise UndeterminedError(
+            f"the record does not determine {names}{f' (only {sums} is)' if sums else ''}, so they "
+            "cannot be drawn: fix them at measured values as far as needed, give a "
+            "jq.identify.Prior or a second record; or, for quantities that depend on determined "
+            "combinations alone, give hold_undetermined=True"
+        )
+
+
+def known_covariance(fit: "Fit") -> Matrix:
+    """The covariance of relative changes, without the directions that are not determined.
+
+    These are undetermined exactly or by the noise; quantities that depend on none of them keep
+    their variance.
+    """
+    verdict, names = fit.verdict, fit.names
+    shares = [[row.get(name, 0.0) for name in names] for row in verdict.null_directions]
+    null = np.array(shares).reshape(-1, len(names))
+    single = np.eye(len(names))[~fit.determined & ~np.any(null, axis=0)]
+    # The printed directions leave small shares out; the exact ones must not.
+    rest = null - null @ verdict.exact.T @ verdict.exact
+    count = len(null) - len(verdict.exact)
+    noisy = np.linalg.svd(rest, full_matrices=False)[2][:count] if count > 0 else rest[:0]
+    lost = np.linalg.qr(np.concatenate([verdict.exact, noisy, single]).T)[0].T
+    keep = np.eye(len(names)) - lost.T @ lost
+    return keep @ fit.relative_covariance @ keep

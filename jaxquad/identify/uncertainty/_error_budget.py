@@ -11,32 +11,21 @@ Source: Kennedy & O'Hagan (2001), Bayesian calibration of computer models; Rasmu
 (2006), Gaussian Processes for Machine Learning, sec. 4.2.1.
 """
 
+import dataclasses
 import functools as ft
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Complex, Float
 
 from jaxquad._core import pytree_node
 from jaxquad.spectra import FrequencyResponse
 
-from ..frequency_domain._cost import Mixing, Points, Weights
+from ..frequency_domain._cost import expected_cost, mix, mix_twice, Mixing, Points
 from ..frequency_domain._problem import Problem
 from ..frequency_domain._solve import Solution
-from ._accuracy import (
-    Block,
-    blocks_of,
-    calibrated_covariance,
-    gauss_newton,
-    Matrix,
-    Noise,
-    noise_effect,
-    PriorRows,
-    ResponseTerm,
-    scaled_inverse,
-)
 
 
 LENGTHS = (1.0, 3.0, 9.0)  # in ln(omega); 2.3 is a decade
@@ -49,6 +38,130 @@ _RANK = 16  # of a kernel over a band of two decades: 1 to 6 % of its variance i
 _OTHER = 3.0  # times the prior's mean: a width that follows it is the prior's
 FOLLOWS = 1.25  # factor by which such a width grows
 _DENSE = 256  # frequencies, up to which whole kernels are made
+
+Matrix = Float[np.ndarray, "parameters parameters"]
+Units = Float[np.ndarray, " all"]
+
+
+def units_of(solution: Solution) -> Units:
+    """What relative changes are relative to: the value, or the change that shows of one at zero.
+
+    Relative to itself, a lag at zero would look as if it had no effect, while in truth it trades
+    off with the delay.
+    """
+    units = np.asarray(solution.slopes).copy()
+    units[list(solution.at_zero)] = solution.units_at_zero
+    return units
+
+
+def rescale(solution: Solution, units: Units) -> Units:
+    """From derivatives by z to derivatives by changes relative to `units`."""
+    slopes = np.asarray(solution.slopes)
+    return np.where(slopes == 0, 1.0, units / np.where(slopes == 0, 1.0, slopes))
+
+
+class PriorRows(NamedTuple):
+    """Prior knowledge, in standard errors, by relative changes."""
+
+    misfit: Float[np.ndarray, " priors"]
+    slopes: Float[np.ndarray, "priors all"]
+
+
+def prior_rows(solution: Solution, units: Units) -> PriorRows:
+    """Those of the solution, relative to `units`."""
+    parts = solution.sensitivity
+    slopes = np.asarray(parts.prior_slopes) * rescale(solution, units)
+    return PriorRows(np.asarray(parts.prior_misfits), slopes)
+
+
+class Noise(NamedTuple):
+    """What the noise does: J'W S W J of data and of priors, and its share of the cost."""
+
+    data: Matrix
+    priors: Matrix
+    cost: float  # expected cost of the noise before any parameter is fitted to it
+
+
+def scaled_inverse(matrix: Matrix) -> Matrix:
+    """Pseudo-inverse after unit scaling of the diagonal."""
+    return _scaled_inverse(matrix.tobytes(), len(matrix))
+
+
+@ft.lru_cache(maxsize=64)
+def _scaled_inverse(elements: bytes, count: int) -> Matrix:
+    # Ten parts of an assessment ask for the inverse of the same matrix.
+    matrix = np.frombuffer(elements).reshape(count, count)
+    scale = np.sqrt(np.diagonal(matrix))
+    scale = np.where(scale > 0, scale, 1.0)
+    unit = matrix / np.outer(scale, scale)
+    return np.linalg.pinv(unit, rcond=1e-13, hermitian=True) / np.outer(scale, scale)
+
+
+def calibrated_covariance(bread: Matrix, noise: Noise) -> Matrix:
+    """Sandwich covariance: (J'WJ)^-1 J'W S W J (J'WJ)^-1, S the covariance of the errors.
+
+    It holds for any weights, and counts neighbouring frequencies that share their noise once only.
+    """
+    inverse = scaled_inverse(bread)
+    return inverse @ (noise.data + noise.priors) @ inverse
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class ResponseTerm:
+    """One frequency response as the fit sees it."""
+
+    frf: FrequencyResponse
+    misfit: Float[np.ndarray, "frequencies outputs inputs 2"]
+    slopes: Float[np.ndarray, "frequencies outputs inputs 2 all"]
+    weights: Float[np.ndarray, "frequencies outputs inputs 2"]
+    mixing: Mixing | None
+    count: int  # of free parameters, the first of all
+
+    @ft.cached_property
+    def used(self) -> np.ndarray:
+        return self.weights[..., 0] > 0
+
+    @ft.cached_property
+    def pairs(self) -> list[tuple[slice, int, int]]:
+        """Where the response pairs are that have usable frequencies."""
+        places = np.argwhere(np.any(self.weights, axis=(0, 3))).tolist()
+        return [(slice(None), o, i) for o, i in places]
+
+    @ft.cached_property
+    def residual(self) -> Float[np.ndarray, "frequencies outputs inputs 2"]:
+        """What the fit lowers."""
+        return mix(self.mixing, self.weights * self.misfit)
+
+    @ft.cached_property
+    def rows(self) -> Float[np.ndarray, "frequencies outputs inputs 2 all"]:
+        """Slopes of the residual."""
+        return mix(self.mixing, self.weights[..., None] * self.slopes)
+
+    @ft.cached_property
+    def pulls(self) -> Float[np.ndarray, "frequencies outputs inputs 2 parameters"]:
+        """How far a misfit of each point moves the gradient by each free parameter."""
+        rows = self.weights[..., None] * self.slopes[..., : self.count]
+        return self.weights[..., None] * mix_twice(self.mixing, rows)
+
+    @ft.cached_property
+    def ratio(self) -> Complex[np.ndarray, "frequencies outputs inputs"]:
+        """Measurement over model."""
+        return np.exp(-self.misfit[..., 0] - 1j * self.misfit[..., 1])
+
+    @ft.cached_property
+    def error_exponent(self) -> Float[np.ndarray, "frequencies outputs inputs"]:
+        """As in `FrequencyResponse`."""
+        return self.frf.error_exponent
+
+    @ft.cached_property
+    def measured_error(self) -> Float[np.ndarray, "frequencies outputs inputs"]:
+        """Random error relative to the model."""
+        return np.asarray(self.frf.random_error) * np.abs(self.ratio) ** self.error_exponent
+
+    @ft.cached_property
+    def error(self) -> Float[np.ndarray, "frequencies outputs inputs"]:
+        """The same, but never 0: an exact response would have infinite weight."""
+        return np.maximum(self.measured_error, 1e-7)
 
 
 @pytree_node
@@ -82,6 +195,185 @@ class Mixture(NamedTuple):
         return float(np.sqrt(np.sum(self.powers)))
 
 
+@dataclasses.dataclass(frozen=True, eq=False)
+class ErrorBudget:
+    """A problem at its solution, to first order in relative changes, and the errors there."""
+
+    records: list[ResponseTerm]
+    prior: PriorRows
+    count: int  # of free parameters, the first of all
+    mixtures: tuple[Mixture, Mixture] = (Mixture(np.zeros(len(LENGTHS)), 1.0),) * 2
+
+    @ft.cached_property
+    def products(self) -> tuple[Matrix, Float[np.ndarray, " parameters"]]:
+        """`J'J` and `J'r` of the weighted residuals over the free parameters."""
+        jacobian, residual = [self.prior.slopes[:, : self.count]], [self.prior.misfit]
+        for record in self.records:
+            for at in record.pairs:
+                jacobian.append(record.rows[at][..., : self.count].reshape(-1, self.count))
+                residual.append(record.residual[at].reshape(-1))
+        j, r = np.concatenate(jacobian), np.concatenate(residual)
+        return j.T @ j, j.T @ r
+
+    @property
+    def bread(self) -> Matrix:
+        return self.products[0]
+
+    @property
+    def gradient(self) -> Float[np.ndarray, " parameters"]:
+        return self.products[1]
+
+    @ft.cached_property
+    def data_cost(self) -> float:
+        """The sum of squares, without the priors."""
+        pairs = ((record.residual, at) for record in self.records for at in record.pairs)
+        return sum(float(np.sum(residual[at] ** 2)) for residual, at in pairs)
+
+    @property
+    def cost(self) -> float:
+        return self.data_cost + float(np.sum(self.prior.misfit**2))
+
+    @ft.cached_property
+    def noise(self) -> Noise:
+        """The responses' errors, with all their correlation, seen through weights and slopes."""
+        data, cost = np.zeros((self.count, self.count)), 0.0
+        for record in self.records:
+            pulls, used = record.pulls, record.used
+            model = np.where(used, np.asarray(record.frf.response) / record.ratio, 1.0)
+            off = np.where(used, np.abs(record.ratio), 1.0) ** (1 - record.error_exponent)
+            # Magnitude and phase of the misfit are the parts of dT over T.
+            columns = (pulls[..., 0, :] + 1j * pulls[..., 1, :]) / (model.conj() * off)[..., None]
+            errors = record.frf.errors
+            # A bound method of an `eqx.Module` is made like a model.
+            data = data + type(errors).project(errors, np.where(used[..., None], columns, 0.0))
+            error = np.where(used, record.error, 0.0)
+            expected = expected_cost(record.mixing, record.weights * error[..., None])
+            for _, o, i in record.pairs:
+                cost += float(expected[o, i])
+        slopes = self.prior.slopes[:, : self.count]
+        return Noise(data, slopes.T @ slopes, cost)
+
+    @property
+    def fitted_noise(self) -> float:
+        """Cost that the parameters take off by following the noise: their number, if white."""
+        return float(np.trace(scaled_inverse(self.bread) @ self.noise.data))
+
+    @property
+    def misfit_ratio(self) -> float:
+        """The data's cost over what noise alone would leave of it: about 1 for the right model."""
+        return self.data_cost / max(self.noise.cost - self.fitted_noise, 1e-300)
+
+    @property
+    def root(self) -> Float[np.ndarray, "rows all"]:
+        """Slopes over the random error: its singular values say what the record determines."""
+        rows = []
+        for record in self.records:
+            sharp = np.where(record.weights > 0, 1 / record.error[..., None], 0.0)[..., None]
+            rows += [sharp[at] * record.slopes[at] for at in record.pairs]
+        return np.concatenate([row.reshape(-1, row.shape[-1]) for row in rows])
+
+    @property
+    def degrees_of_freedom(self) -> Float[np.ndarray, " parameters"]:
+        """Of the noise estimate behind each parameter's variance; infinite where it is known.
+
+        The variance is a sum over frequencies of noise powers, each estimated: with shares p of it
+        and L the covariance of the powers' logarithms, 2 / (p'L p). Source: Satterthwaite (1946),
+        "An approximate distribution of estimates of variance components".
+        """
+        inverse, doubt = scaled_inverse(self.bread), np.zeros(self.count)
+        variance = np.diagonal(inverse @ self.noise.priors @ inverse).copy()
+        for record in self.records:
+            error = np.where(record.used, record.measured_error, 0.0)
+            moved = record.pulls @ inverse
+            share = np.sum((error[..., None, None] * moved) ** 2, axis=(2, 3))
+            variance += np.sum(share, axis=(0, 1))
+            covariance = record.frf.log_noise_covariance
+            if covariance is not None:
+                doubt += np.einsum("fop,fg,gop->p", share, covariance, share, optimize=True)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            freedom = 2 * variance**2 / doubt
+        return np.where(doubt > 0, np.maximum(freedom, 1.0), np.inf)
+
+    @ft.cached_property
+    def by_noise(self) -> Matrix:
+        """The covariance of relative changes by the noise alone."""
+        return calibrated_covariance(self.bread, self.noise)
+
+    @property
+    def covariance(self) -> Matrix:
+        """With what the model leaves unexplained."""
+        return self.by_noise + self._unexplained[0]
+
+    @ft.cached_property
+    def _unexplained(self) -> tuple[Matrix, Matrix]:
+        """Covariances by the discrepancy, under its prior and under one of a larger mean."""
+        # J'W D W J of a discrepancy D of unit amplitude, for each length.
+        effect = np.zeros((len(LENGTHS), self.count, self.count))
+        for record in self.records:
+            pulls = np.where(record.weights[..., None] > 0, record.pulls, 0.0)
+            basis = kernel_basis(np.asarray(record.frf.omega).tobytes())
+            pulls = np.reshape(pulls * SHARES[:, None], (len(pulls), -1))
+            along = (np.swapaxes(basis, 1, 2) @ pulls).reshape(len(LENGTHS), -1, self.count)
+            effect += np.swapaxes(along, 1, 2) @ along
+        inverse, (one, other) = scaled_inverse(self.bread), self.mixtures
+        added = lambda mixture: inverse @ np.tensordot(mixture.powers, effect, axes=1) @ inverse
+        return added(one), added(other)
+
+    @ft.cached_property
+    def discrepancy(self) -> Discrepancy:
+        """In words and numbers."""
+        parts = (np.zeros_like(self.bread), *self._unexplained)
+        variances = [np.diagonal(self.by_noise + part) for part in parts]
+        by_noise, with_one, with_other = (np.sqrt(np.maximum(v, 0.0)) for v in variances)
+        widths = np.where(with_other > FOLLOWS * with_one, "prior", "data")
+        widths = np.where(with_one < FOLLOWS * by_noise, "noise", widths)
+        mixture = self.mixtures[0]
+        weight = mixture.powers / max(float(np.sum(mixture.powers)), 1e-300)
+        length = float(np.exp(weight @ np.log(LENGTHS)))
+        return Discrepancy(mixture.amplitude, length, mixture.none, tuple(widths.tolist()))
+
+
+def error_budget(
+    problem: Problem,
+    points: Sequence[Points],
+    solution: Solution,
+    units: Units,
+    changes: Mapping[int, Sequence[np.ndarray]] | None = None,
+) -> ErrorBudget:
+    """By changes relative to `units`; `changes` are slopes by some of the values themselves."""
+    scale, parts, terms = rescale(solution, units), solution.sensitivity, []
+    rows = zip(points, parts.misfits, parts.slopes, problem.weights, problem.mixings, strict=True)
+    for number, (one, misfit, slopes, weights, mixing) in enumerate(rows):
+        slopes = np.asarray(slopes) * scale
+        for k, change in (changes or {}).items():
+            slopes[..., k] = units[k] * change[number]
+        parts = one.frf, np.asarray(misfit), slopes, np.asarray(weights), mixing
+        terms.append(ResponseTerm(*parts, problem.parameters.count))
+    return ErrorBudget(terms, prior_rows(solution, units), problem.parameters.count)
+
+
+class Weighting(NamedTuple):
+    """How the points of a fit count: as the noise says, and with what the model leaves unexplained.
+
+    `budget` is that of the problem at a solution, by changes relative to its own units. `by_noise`
+    is the problem under the weights of the noise alone, where its own have a floor on the error.
+    """
+
+    points: Sequence[Points]
+    budget: ErrorBudget
+    by_noise: Problem | None = None
+
+
+def weighting_at(problem: Problem, points: Sequence[Points], solution: Solution) -> Weighting:
+    """The responses at a solution, and what the model leaves unexplained of them."""
+    budget, fixed = error_budget(problem, points, solution, units_of(solution)), set()
+    if solution.at_zero:
+        fixed = {k for k in solution.at_zero if budget.gradient[k] > 0}
+    moving = [k for k in range(budget.count) if k not in fixed]
+    mixtures = find_discrepancy(budget.records, points, budget.prior, moving)
+    return Weighting(points, dataclasses.replace(budget, mixtures=mixtures))
+
+
 def find_discrepancy(
     records: Sequence[ResponseTerm],
     points: Sequence[Points],
@@ -98,8 +390,7 @@ def find_discrepancy(
     # unit amplitude over the noise, and these products.
     products, gains, along, errors = rows.T @ rows, [], [], []
     for record, counted in zip(records, points, strict=True):
-        used = record.weights[..., 0] > 0
-        error = np.maximum(record.error, 1e-7)
+        used, error = record.used, record.error
         inverse = np.where(used, error**-2 / counted.shared, 0.0)
         rows = np.concatenate([record.slopes[..., columns], record.misfit[..., None]], axis=-1)
         rows = np.where(used[..., None, None], rows, 0.0)
@@ -114,8 +405,18 @@ def find_discrepancy(
     typical = float(0.5 * (error[error.size // 2] + error[-(error.size // 2) - 1]))
     lowest = np.log(0.1 * typical)
     amplitudes = np.exp(np.linspace(lowest, max(0.0, lowest + 1.4), _AMPLITUDES))
-    power = np.concatenate([[0.0], amplitudes]) ** 2
-    likelihoods = _restricted_likelihoods(products, gains, along, power[None, :, None])
+    # Restricted likelihoods by length and amplitude: the parameters' own changes are projected out.
+    power, width = np.concatenate([[0.0], amplitudes])[None, :, None] ** 2, len(products)
+    damped = power / (1 + power * gains[:, None, :])
+    left = products - np.reshape(damped @ along, (*damped.shape[:2], width, width))
+    scale = np.sqrt(np.maximum(np.diagonal(products), 1e-300))
+    left = left / np.outer(scale, scale) + 1e-11 * np.eye(width)
+    slopes, misfit = left[..., :-1, :-1], left[..., :-1, -1]
+    step = np.linalg.solve(slopes, misfit[..., None])[..., 0]
+    rest = (left[..., -1, -1] - np.sum(misfit * step, axis=-1)) * scale[-1] ** 2
+    volume = np.linalg.slogdet(slopes)[1]
+    grown = np.sum(np.log1p(power * gains[:, None, :]), axis=-1)
+    likelihoods = -0.5 * (grown + volume + rest)
     relative = np.exp(likelihoods - np.max(likelihoods))
 
     def mix(mean: float) -> Mixture:
@@ -147,25 +448,6 @@ def _components(
     return gains.reshape(len(basis), -1), products.reshape(len(basis), -1, columns.shape[-1] ** 2)
 
 
-def _restricted_likelihoods(
-    products: Float[np.ndarray, "columns columns"],
-    gains: Float[np.ndarray, "lengths components"],
-    along: Float[np.ndarray, "lengths components squares"],
-    power: Float[np.ndarray, "1 amplitudes 1"],
-) -> Float[np.ndarray, "lengths amplitudes"]:
-    """Logarithms, up to a constant; the parameters' own changes are projected out."""
-    damped, width = power / (1 + power * gains[:, None, :]), len(products)
-    left = products - np.reshape(damped @ along, (*damped.shape[:2], width, width))
-    scale = np.sqrt(np.maximum(np.diagonal(products), 1e-300))
-    left = left / np.outer(scale, scale) + 1e-11 * np.eye(width)
-    slopes, misfit = left[..., :-1, :-1], left[..., :-1, -1]
-    step = np.linalg.solve(slopes, misfit[..., None])[..., 0]
-    rest = (left[..., -1, -1] - np.sum(misfit * step, axis=-1)) * scale[-1] ** 2
-    volume = np.linalg.slogdet(slopes)[1]
-    grown = np.sum(np.log1p(power * gains[:, None, :]), axis=-1)
-    return -0.5 * (grown + volume + rest)
-
-
 @ft.lru_cache(maxsize=16)
 def kernel_basis(omega: bytes) -> Float[np.ndarray, "lengths frequencies rank"]:
     """Roots of the kernels of all lengths at frequencies (the bytes of their array, rad/s).
@@ -193,133 +475,3 @@ def kernel_basis(omega: bytes) -> Float[np.ndarray, "lengths frequencies rank"]:
         values, vectors = eigh_tridiagonal(diagonal, neighbours, select="i", select_range=(0, last))
         root[order] = vectors / np.sqrt(values)
     return roots
-
-
-def discrepancy_effect(
-    records: Sequence[ResponseTerm], count: int
-) -> Float[np.ndarray, "lengths parameters parameters"]:
-    """J'W D W J of a discrepancy D of unit amplitude, for each length."""
-    total = np.zeros((len(LENGTHS), count, count))
-    for record in records:
-        pulls = np.where(record.weights[..., None] > 0, record.pulls, 0.0)
-        basis = kernel_basis(np.asarray(record.frf.omega).tobytes())
-        pulls = np.reshape(pulls * SHARES[:, None], (len(pulls), -1))
-        along = (np.swapaxes(basis, 1, 2) @ pulls).reshape(len(LENGTHS), -1, count)
-        total += np.swapaxes(along, 1, 2) @ along
-    return total
-
-
-def describe_discrepancy(
-    mixtures: tuple[Mixture, Mixture], bread: Matrix, noise: Matrix, effect: np.ndarray
-) -> tuple[Discrepancy, Matrix]:
-    """The discrepancy in words and numbers, and the covariance that it adds to the parameters."""
-    inverse = scaled_inverse(bread)
-    one, other = (
-        inverse @ np.tensordot(mixture.powers, effect, axes=1) @ inverse for mixture in mixtures
-    )
-    by_noise, with_one, with_other = (
-        np.sqrt(np.maximum(np.diagonal(part), 0.0)) for part in (noise, noise + one, noise + other)
-    )
-    widths = np.where(with_other > FOLLOWS * with_one, "prior", "data")
-    widths = np.where(with_one < FOLLOWS * by_noise, "noise", widths)
-    mixture = mixtures[0]
-    weight = mixture.powers / max(float(np.sum(mixture.powers)), 1e-300)
-    length = float(np.exp(weight @ np.log(LENGTHS)))
-    return Discrepancy(mixture.amplitude, length, mixture.none, tuple(widths.tolist())), one
-
-
-Units = Float[np.ndarray, " all"]
-
-
-class Weighting(NamedTuple):
-    """How the points of a fit count: as the noise says, and with what the model does not explain.
-
-    `records` are at the solution, by changes relative to its own units. `weights` are those by the
-    noise alone, where those of the problem have a floor on the error.
-    """
-
-    points: Sequence[Points]
-    records: list[ResponseTerm]
-    mixtures: tuple[Mixture, Mixture]  # what the model leaves unexplained
-    weights: Sequence[Weights] | None = None
-    mixings: Sequence[Mixing | None] | None = None
-
-
-def weighting_at(problem: Problem, points: Sequence[Points], solution: Solution) -> Weighting:
-    """The responses at a solution, and what the model leaves unexplained of them."""
-    units, count = units_of(solution), solution.z.size
-    records = records_of(problem, [one.frf for one in points], solution, units)
-    prior, fixed = prior_rows(solution, units), set()
-    if solution.at_zero:
-        gradient = gauss_newton(blocks_of(records), prior, count)[1]
-        fixed = {k for k in solution.at_zero if gradient[k] > 0}
-    moving = [k for k in range(count) if k not in fixed]
-    return Weighting(points, records, find_discrepancy(records, points, prior, moving))
-
-
-class ErrorBudget(NamedTuple):
-    """Derivatives and errors at a solution, by changes relative to some units."""
-
-    records: list[ResponseTerm]
-    blocks: list[Block]
-    prior: PriorRows
-    bread: Matrix  # J'J
-    gradient: Float[np.ndarray, " parameters"]
-    noise: Noise
-    by_noise: Matrix  # covariance
-    covariance: Matrix  # with what the model leaves unexplained
-    discrepancy: Discrepancy
-
-
-def error_budget(
-    records: list[ResponseTerm],
-    mixtures: tuple[Mixture, Mixture],
-    solution: Solution,
-    units: Units,
-) -> ErrorBudget:
-    """All of it, with these mixtures of a discrepancy; changes are relative to `units`."""
-    count = solution.z.size
-    blocks, prior = blocks_of(records), prior_rows(solution, units)
-    bread, gradient = gauss_newton(blocks, prior, count)
-    noise = noise_effect(records, blocks, prior, count)
-    by_noise = calibrated_covariance(bread, noise)
-    effect = discrepancy_effect(records, count)
-    discrepancy, added = describe_discrepancy(mixtures, bread, by_noise, effect)
-    parts = (bread, gradient, noise, by_noise, by_noise + added, discrepancy)
-    return ErrorBudget(records, blocks, prior, *parts)
-
-
-def units_of(solution: Solution) -> Units:
-    """What relative changes are relative to: the value, or the change that shows of one at zero.
-
-    Relative to itself, a lag at zero would look as if it had no effect, while in truth it trades
-    off with the delay.
-    """
-    units = np.asarray(solution.slopes).copy()
-    units[list(solution.at_zero)] = solution.units_at_zero
-    return units
-
-
-def rescale(solution: Solution, units: Units) -> Units:
-    """From derivatives by z to derivatives by changes relative to `units`."""
-    slopes = np.asarray(solution.slopes)
-    return np.where(slopes == 0, 1.0, units / np.where(slopes == 0, 1.0, slopes))
-
-
-def records_of(
-    problem: Problem, frfs: Sequence[FrequencyResponse], solution: Solution, units: Units
-) -> list[ResponseTerm]:
-    """Misfits and slopes of each response, by changes relative to `units`."""
-    scale, parts = rescale(solution, units), solution.sensitivity
-    weights = [np.asarray(one) for one in problem.weights]
-    misfits = [np.asarray(one) for one in parts.misfits]
-    slopes = [np.asarray(one) * scale for one in parts.slopes]
-    terms = zip(frfs, misfits, slopes, weights, problem.mixings, strict=True)
-    return [ResponseTerm(*term, problem.parameters.count) for term in terms]
-
-
-def prior_rows(solution: Solution, units: Units) -> PriorRows:
-    """Those of the priors, likewise."""
-    parts = solution.sensitivity
-    slopes = np.asarray(parts.prior_slopes) * rescale(solution, units)
-    return PriorRows(np.asarray(parts.prior_misfits), slopes)

@@ -1,5 +1,8 @@
-"""What a record determines of a model's parameters, in numbers and in words."""
+"""What a record determines of a model's parameters: by its Fisher information, and in words."""
 
+import dataclasses
+from collections.abc import Callable, Sequence
+from fractions import Fraction
 from typing import Literal, NamedTuple
 
 import equinox as eqx
@@ -8,9 +11,22 @@ from jaxtyping import Float
 
 from jaxquad._core import as_messages, Message, pytree_node
 
+from ..frequency_domain._parameters import Place
+from ._error_budget import Matrix, PriorRows
+
 
 Kind = Literal["identifiable", "not identifiable", "no minimum", "no model", "too few points"]
 NO_MINIMUM: Kind = "no minimum"  # of a remark, too
+LIMIT = 0.5  # standard error, relative, above which a parameter counts as undetermined
+USUAL = 0.95  # level of an interval
+_VAGUE = 0.3  # as LIMIT, of a combination
+_MEMBER = 0.05  # share of a null direction from which a parameter takes part in it
+_MOVE = 0.4  # finite relative change along a null direction, to test products against sums
+_FLOOR = 1e-8  # of the largest singular value: below it lies rounding
+_KINDS = ("product", "sum")
+
+Vector = Float[np.ndarray, " parameters"]
+Directions = Float[np.ndarray, "_ parameters"]
 
 
 class UndeterminedError(ValueError):
@@ -20,20 +36,8 @@ class UndeterminedError(ValueError):
         super().__init__(Message(reason))
 
 
-USUAL = 0.95  # level of an interval
-
-
 def reach_of_interval(degrees_of_freedom: float, level: float | int = USUAL) -> float:
-    """How many standard errors reach from the middle of an interval to its end.
-
-    **Arguments:**
-
-    - `degrees_of_freedom`: of the noise estimate behind the standard errors; infinite where the
-        noise is known.
-    - `level`: the share of intervals that hold the truth.
-
-    **Returns:** the point of Student's t with half of 1 - `level` above it, 97.5 % by default.
-    """
+    """How many standard errors reach from the middle of an interval to its end: Student's t."""
     # Imported here: scipy.special takes a tenth of the time of `import jaxquad`.
     from scipy.special import ndtri, stdtrit
 
@@ -49,9 +53,7 @@ def _require_level(level: float | int) -> None:
         raise ValueError(f"level is {level!r}: give a share between 0 and 1, 0.9 for 90 %")
 
 
-def pooled_freedom(
-    freedom: Float[np.ndarray, " parameters"], shares: Float[np.ndarray, " parameters"]
-) -> float:
+def pooled_freedom(freedom: Vector, shares: Vector) -> float:
     """Degrees of freedom of a quantity whose variance has these `shares` of the parameters'."""
     doubt = float(np.sum(shares / freedom))
     return float(np.sum(shares)) / doubt if doubt > 0 else np.inf
@@ -215,18 +217,6 @@ class Verdict:
         return lines
 
 
-def remedies_for(lost: tuple[str, ...]) -> tuple[Message, ...]:
-    """What determines parameters that one record leaves open."""
-    names = " or ".join(lost)
-    texts = (
-        f"fix {names} at a measured value« (leave it out of free=)»",
-        "give a known value: priors=[jq.identify.Prior(name or function, value, standard error)]",
-        f"fit a second record under a known change of {names}: "
-        "conditions=(None, jq.identify.Changed(name, change))",
-    )
-    return as_messages(texts)
-
-
 def without_numbers(kind: Kind, names: tuple[str, ...], reason: str, *remedies: str) -> Verdict:
     """A verdict under which no parameter, and no combination of them, is determined."""
     return Verdict(
@@ -240,3 +230,250 @@ def without_numbers(kind: Kind, names: tuple[str, ...], reason: str, *remedies: 
         alternatives=(),
         curved=(),
     )
+
+
+class Information(NamedTuple):
+    """All that the decision rests on: free parameters first, then the fixed ones.
+
+    The fixed ones take part in names only: the arm L in L K_t / J_x. `root` holds derivatives of
+    ln-magnitudes and phases (alternate rows), in units of their random error, with respect to
+    relative changes; `covariance` is that of the free parameters' relative changes, and `by_noise`
+    what of it the noise alone accounts for; `same` says whether other values of the free ones give
+    the same responses.
+    """
+
+    root: Float[np.ndarray, "rows all"]
+    covariance: Matrix
+    by_noise: Matrix
+    places: Sequence[Place]
+    values: Float[np.ndarray, " all"]
+    units: Float[np.ndarray, " all"]
+    same: Callable[[Vector], bool]
+
+
+def identifiability_of(
+    information: Information, prior: PriorRows, bounds: tuple[Bound, ...] = ()
+) -> tuple[Verdict, Verdict]:
+    """What data and priors determine together, and what the data determine alone.
+
+    Parameters with a bound are determined by it, and take part in no direction.
+    """
+    by_data = _determine(information, bounds)
+    if not len(prior.misfit):
+        return by_data, by_data
+    # Rows come in pairs of magnitude and phase; a prior's row counts once.
+    priors = np.repeat(prior.slopes, 2, axis=0) / np.sqrt(2)
+    together = information._replace(root=np.concatenate([information.root, priors]))
+    return _determine(together, bounds), by_data
+
+
+def _determine(information: Information, bounds: tuple[Bound, ...]) -> Verdict:
+    """Null directions of the Fisher information, and the combinations outside them."""
+    count, places = len(information.covariance), information.places
+    if bounds:
+        at_zero = {bound.name for bound in bounds}
+        kept = np.array([k for k, place in enumerate(places) if place.name not in at_zero], int)
+        free = kept[kept < count]
+
+        def completed(values: np.ndarray) -> np.ndarray:
+            """With the bounded ones where they are."""
+            complete = information.values[:count].copy()
+            complete[free] = values
+            return complete
+
+        some = Information(
+            root=information.root[:, kept],
+            covariance=information.covariance[np.ix_(free, free)],
+            by_noise=information.by_noise[np.ix_(free, free)],
+            places=[places[k] for k in kept],
+            values=information.values[kept],
+            units=information.units[kept],
+            same=lambda values: information.same(completed(values)),
+        )
+        verdict = _determine(some, ())
+        exact = np.zeros((len(verdict.exact), count))
+        exact[:, free] = verdict.exact
+        alternatives = tuple(completed(values) for values in verdict.alternatives)
+        return dataclasses.replace(verdict, exact=exact, alternatives=alternatives, bounds=bounds)
+    root = information.root[:, :count]
+    # All rows of `right` are wanted, and of the other factor none.
+    _, singular, right = np.linalg.svd(root, full_matrices=len(root) < count)
+    singular = np.concatenate([singular, np.zeros(count - len(singular))])
+    is_exact = singular <= _FLOOR * singular[0]
+    null, exact = right[is_exact | (singular * LIMIT < 1)], right[is_exact]
+    null = _sparse(null) if len(null) else null
+    # What a record determines is a matter of its noise: a standard error beyond the limit; what is
+    # unknown by all of its size even so, model error included, is of no use to anyone.
+    parts = (information.covariance, information.by_noise)
+    errors = [np.sqrt(np.maximum(np.diagonal(part), 0.0)) for part in parts]
+    imprecise = (errors[0] > 2 * LIMIT) | (errors[1] > LIMIT)
+    lost = np.any(null, axis=0) | imprecise
+    left = imprecise & ~np.any(null, axis=0)
+    if left.any():  # the direction of most variance of an imprecise parameter that is in none
+        spread, directions = np.linalg.eigh(information.covariance)
+        most = {int(np.argmax(spread * directions[k] ** 2)) for k in np.flatnonzero(left)}
+        null = _sparse(np.concatenate([null, directions.T[sorted(most)]]))
+    undetermined, remedies = tuple(places[k].name for k in np.flatnonzero(lost)), []
+    combinations, alternatives, curved = _analyse_groups(null, exact, information)
+    if undetermined:
+        names = " or ".join(undetermined)
+        remedies = [
+            f"fix {names} at a measured value« (leave it out of free=)»",
+            "give a known value: "
+            "priors=[jq.identify.Prior(name or function, value, standard error)]",
+            f"fit a second record under a known change of {names}: "
+            "conditions=(None, jq.identify.Changed(name, change))",
+        ]
+    return Verdict(
+        kind="not identifiable" if undetermined else "identifiable",
+        undetermined=undetermined,
+        combinations=tuple(combinations),
+        null_directions=tuple(
+            {places[k].name: float(row[k]) for k in np.flatnonzero(row)} for row in null
+        ),
+        reasons=(),
+        remedies=as_messages(remedies),
+        exact=exact,
+        alternatives=tuple(alternatives),
+        curved=tuple(curved),
+    )
+
+
+def _sparse(null: Directions) -> Directions:
+    """Unit directions spanning the same space, with small shares left out."""
+    rows = _echelon(null)
+    rows = rows / np.linalg.norm(rows, axis=1, keepdims=True)
+    return np.where(np.abs(rows) > _MEMBER, rows, 0.0)
+
+
+def _echelon(rows: Directions) -> Directions:
+    """Reduced row echelon form with full pivoting: the same space, with many zeros."""
+    rows, pivots = rows.copy(), []
+    for k in range(len(rows)):
+        rest = np.abs(rows[k:])
+        rest[:, pivots] = 0
+        i, j = np.unravel_index(np.argmax(rest), rest.shape)
+        rows[[k, k + i]] = rows[[k + i, k]]
+        rows[k] /= rows[k, j]
+        others = [m for m in range(len(rows)) if m != k]
+        rows[others] -= np.outer(rows[others, j], rows[k])
+        pivots.append(j)
+    return rows
+
+
+def _analyse_groups(
+    null: Directions, exact: Directions, information: Information
+) -> tuple[list[Combination], list[Vector], list[str]]:
+    """Of each group of parameters that share null directions: what of them is determined.
+
+    Combinations of the kind, product or sum, that holds over a finite change; the values to which
+    that change leads; and names of parameters of which neither kind holds.
+    """
+    combinations, alternatives, curved = [], [], []
+    if not len(null):
+        return combinations, alternatives, curved
+    # A pseudo-inverse shows no variance along exact null directions.
+    keep = np.eye(null.shape[1]) - exact.T @ exact
+    covariance = keep @ information.covariance @ keep + 1e4 * exact.T @ exact
+    information = information._replace(covariance=covariance)
+    groups: list[set[int]] = []
+    for row in null:
+        group = set(np.flatnonzero(row).tolist())
+        for other in [other for other in groups if other & group]:
+            groups.remove(other)
+            group |= other
+        groups.append(group)
+    sparse = _sparse(exact) if len(exact) else exact
+    for block in (np.array(sorted(group)) for group in groups):
+        mine = sparse[np.any(sparse[:, block], axis=1)]
+        moved = {}
+        if len(mine):  # a finite way along null directions, at constant products and sums
+            shares = np.arange(1, len(mine) + 1)[:, None] / len(mine)
+            change = _MOVE * np.sum(mine * shares, axis=0)
+            values, units = information.values[: null.shape[1]], information.units[: null.shape[1]]
+            moved = {"product": values * np.exp(change), "sum": values + units * change}
+            moved = {kind: x for kind, x in moved.items() if information.same(x)}
+        kinds = tuple(moved) if len(mine) else _KINDS
+        # Combinations of the members that no null direction moves.
+        directions = null[:, block][np.any(null[:, block], axis=1)]
+        _, singular, right = np.linalg.svd(directions, full_matrices=True)
+        rows = _echelon(right[int(np.sum(singular > 1e-6)) :])
+        effects = information.root[:, block] @ np.linalg.pinv(rows) if len(rows) else rows.T
+        for k, row in enumerate(rows) if kinds else ():
+            combination = _combination(row, block, effects[:, k], information, kinds)
+            combinations += [] if combination is None else [combination]
+        alternatives += moved.values()
+        names = [information.places[k].name for k in block]
+        curved += names if not kinds and len(rows) else []
+    return combinations, alternatives, curved
+
+
+def _combination(
+    row: np.ndarray, block: np.ndarray, effect: np.ndarray, information: Information,
+    kinds: tuple[str, ...],
+) -> Combination | None:  # fmt: skip
+    """The product or sum, as a person would write it, that is as sharp as `row` of the `block`.
+
+    Exponents are whole numbers up to 2, coefficients 1 or -1, and cost no more than a quarter in
+    standard error. None where nothing of the kind is as sharp, or where its error is beyond 30 %.
+    """
+    weights, count = np.zeros(len(information.values)), len(information.covariance)
+    weights[block] = row
+    if "product" in kinds:  # with fixed parameters that act just as the combination does
+        for k in range(count, len(weights)):
+            column = information.root[:, k]
+            power = float(column @ effect) / max(float(effect @ effect), 1e-300)
+            rest = np.linalg.norm(column - power * effect)
+            if abs(power) > 0.1 and rest < 1e-6 * np.linalg.norm(column):
+                weights[k] = power
+        weights = -weights if np.sum(effect[::2]) < 0 else weights  # to raise the response
+    order = lambda k: (information.places[k].leaf, information.places[k].index)
+    used = np.array(sorted(np.flatnonzero(weights), key=order))  # as the model orders them
+    relative = np.zeros((len(weights), len(weights)))
+    relative[:count, :count] = information.covariance
+    relative, weights = relative[np.ix_(used, used)], weights[used]
+    names, values = [information.places[k].name for k in used], information.values[used]
+    units = information.units[used]  # the value itself where its logarithm is fitted
+    error = lambda w: float(np.sqrt(max(w @ relative @ w, 0.0)))
+
+    def simplest(weights: Vector, largest: int) -> Vector | None:
+        """The nearest vector of whole numbers up to `largest`, or None if there is none near."""
+        unit = weights / np.max(np.abs(weights))
+        parts = [Fraction(float(w)).limit_denominator(largest) for w in unit]
+        exact = np.array([float(part) for part in parts])
+        integers = exact * np.lcm.reduce([part.denominator for part in parts])
+        near = np.max(np.abs(exact - unit)) < 0.25 and np.max(np.abs(integers)) <= largest
+        return integers * np.sign(weights @ integers) if near else None
+
+    def as_sharp(simple: Vector) -> bool:
+        along = abs(float(simple @ weights)) / float(weights @ weights)
+        return error(simple) <= 1.25 * error(weights) * along
+
+    logarithmic = bool(np.all(units == values))
+    powers = simplest(weights, 2) if logarithmic and "product" in kinds else None
+    sums = simplest(weights / units, 1) if "sum" in kinds else None
+    powers = powers if powers is not None and as_sharp(powers) else None
+    sums = sums if sums is not None and as_sharp(sums * units) else None
+    # Times that only lower the response add up.
+    if sums is not None and (
+        powers is None or np.abs(sums).max() < np.abs(powers).max() or np.all(powers <= 0)
+    ):
+        sums = sums * np.sign(sums[np.argmax(np.abs(sums * units))])
+        name, terms = "", [(w, n) for w, n in zip(sums, names, strict=True) if w]
+        for w, n in terms:
+            sign = ("- " if w < 0 else "") if not name else (" - " if w < 0 else " + ")
+            name += sign + (n if abs(w) == 1 else f"{abs(w):g} {n}")
+        value, members = float(np.sum(sums * values)), tuple(n for _, n in terms)
+        combination = Combination(name, value, error(sums * units), sum_of=members)
+    elif powers is not None:
+        value, pairs = float(np.prod(np.abs(values) ** powers)), zip(names, powers, strict=True)
+        texts = [(n if abs(p) == 1 else f"{n}^{abs(p):g}", p) for n, p in pairs]
+        above, below = ([text for text, p in texts if p * sign > 0] for sign in (1, -1))
+        name = " ".join(above) or "1"
+        if below:
+            name += " / " + (below[0] if len(below) == 1 else f"({' '.join(below)})")
+        combination = Combination(name, value, value * error(powers))
+    else:
+        return None
+    precise = combination.standard_error <= _VAGUE * abs(combination.value)
+    return combination if precise else None

@@ -1,26 +1,30 @@
-"""Parameters that may be zero: the limits that they stay below, and errors up to there.
+"""Parameters that keep their sign, at zero: decided at the optimum, with limits and errors there.
 
-At a bound the optimum is a one-sided problem: the cost rises from it with a slope, and the limit is
-where the profile likelihood has risen by 2.71 / 2.
+By its logarithm the cost has no slope near zero, and a solver may stop anywhere. What counts is the
+slope of the cost by the parameter itself. At a bound the optimum is a one-sided problem: the cost
+rises from it with a slope, and the limit is where the profile likelihood has risen by 2.71 / 2.
 Source: Self and Liang (1987), Asymptotic properties of maximum likelihood estimators and likelihood
 ratio tests under nonstandard conditions.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
+import equinox as eqx
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
-from ..frequency_domain._bounds import linearise, polish
+from ..frequency_domain._cost import mix
 from ..frequency_domain._problem import Problem
-from ..frequency_domain._solve import Solution, solution_at
-from ._accuracy import Matrix, scaled_inverse
-from ._error_budget import ErrorBudget
-from ._identifiability import LIMIT
-from ._verdict import Bound
+from ..frequency_domain._solve import Solution, solution_at, solve
+from ._error_budget import ErrorBudget, Matrix, scaled_inverse, Units
+from ._verdict import Bound, LIMIT
 
 
+_NEAR = 1e-2  # of the change that shows: a parameter below it is at zero
+_AT_ZERO = 1e-6  # likewise, where its slopes are evaluated
+_ROUNDS = 4  # of releasing parameters that do not belong at zero
+_SMALLEST = 60.0  # in ln, below the start: 1e-26 of it
 _RISE = 2.71  # of the cost, at the end of a one-sided 95 % interval
 _EVALUATIONS = 12  # of the profile
 _CLOSE = 0.02  # of the rise
@@ -31,7 +35,109 @@ _SLIGHT = 0.1
 _FEW = 0.1  # of the limit: below it the slopes at a value say little about the way to the limit
 _ONE_SIDED = 1.645  # standard errors that reach from the middle of a one-sided 95 % interval
 
-Units = Float[np.ndarray, " all"]
+Vector = Float[np.ndarray, " parameters"]
+
+
+class Linearised(NamedTuple):
+    """Weighted residuals at a solution, those of the priors last, and their slopes by `z`."""
+
+    residual: Float[np.ndarray, " residuals"]
+    jacobian: Float[np.ndarray, "residuals parameters"]
+
+    @property
+    def cost(self) -> float:
+        return float(self.residual @ self.residual)
+
+
+def linearise(problem: Problem, solution: Solution) -> Linearised:
+    jacobian, parts, count = [], solution.sensitivity, problem.parameters.count
+    for weights, mixing, slopes in zip(problem.weights, problem.mixings, parts.slopes, strict=True):
+        weights = np.asarray(weights)
+        with np.errstate(invalid="ignore", over="ignore"):  # a model that is not finite there
+            scaled = weights[..., None] * np.asarray(slopes)[..., :count]
+            jacobian.append(mix(mixing, scaled)[weights > 0])
+    jacobian = np.concatenate([*jacobian, np.asarray(parts.prior_slopes)[:, :count]])
+    return Linearised(parts.weighted(problem), jacobian)
+
+
+def solve_within_bounds(
+    problem: Problem, z: Vector, solver: eqx.Module | None, max_steps: int
+) -> Solution:
+    """Solve from `z`; parameters that belong at zero are there, wherever the path to it ended."""
+    solution = solve(problem, z, solver, max_steps)
+    return settle_at_bounds(problem, solution, solver, max_steps)
+
+
+def settle_at_bounds(
+    problem: Problem, solution: Solution, solver: eqx.Module | None, max_steps: int
+) -> Solution:
+    """The solution with its parameters at zero marked; a better one if they do not belong there."""
+    logarithmic = np.array(problem.parameters.logarithmic[: solution.z.size])
+    least = np.asarray(problem.parameters.start)[: solution.z.size] - _SMALLEST
+    for _ in range(_ROUNDS):
+        lost = (solution.z < least) & logarithmic
+        if lost.any():  # where a value is a number that its slopes can be seen at
+            z = np.where(lost, least, solution.z)
+            solution = solution_at(problem, z, steps=solution.steps)
+        local, z = linearise(problem, solution), np.asarray(solution.z)
+        # The change of each `z` that stands out from the scatter of the residuals.
+        freedom = max(local.residual.size - z.size, 1)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            visible = np.sqrt(local.cost / freedom) / np.sqrt(np.sum(local.jacobian**2, axis=0))
+        # Parameters near zero could grow a hundred times without being seen.
+        near = np.isfinite(visible) & (visible > 1 / _NEAR) & logarithmic
+        low = np.flatnonzero(near).tolist()
+        if not low:
+            return solution
+        from scipy.optimize import lsq_linear
+
+        # The Gauss-Newton step under which none near zero becomes negative; of these the value to
+        # go to, in units of what shows.
+        units, smallest = np.ones(z.size), np.full(z.size, -np.inf)
+        units[low], smallest[low] = visible[low], 0.0
+        bounds, rows = (smallest, np.inf), local.jacobian * units
+        step = lsq_linear(rows, -local.residual, bounds, method="bvls").x
+        if any(step[k] > _NEAR for k in low):
+            change = step.copy()
+            change[low] = np.log(np.maximum(step[low], _AT_ZERO) * visible[low])
+            solution = solve(problem, z + change, solver, max_steps)
+            continue
+        z = z.copy()
+        z[low] += np.log(_AT_ZERO * visible[low])
+        solution = polish(problem, z, low, solution)[0]
+        sizes = tuple((solution.slopes[low] / _AT_ZERO).tolist())
+        marked = solution._replace(at_zero=tuple(low), units_at_zero=sizes)
+        z = solution.z.copy()
+        z[low] = -np.inf  # the logarithm of 0
+        at = solution_at(problem, z)
+        # Values of exactly 0, where the model has a response there: one of 0 is -inf in magnitude.
+        if all(np.all(misfit < np.inf) for misfit in at.sensitivity.misfits):
+            return marked._replace(values=at.values, model=at.model)
+        return marked
+    return solution
+
+
+def polish(
+    problem: Problem, z: Vector, fixed: Sequence[int], start: Solution, rounds: int = 3
+) -> tuple[Solution, Linearised]:
+    """The optimum over the other parameters, from near it, by undamped Gauss-Newton steps."""
+    free = np.setdiff1d(np.arange(z.size), fixed)
+    solution = solution_at(problem, z, steps=start.steps)
+    local = linearise(problem, solution)
+    for _ in range(rounds):
+        if not (np.isfinite(local.cost) and np.all(np.isfinite(local.jacobian))):
+            break  # so far out that the model has no numbers
+        step = np.linalg.lstsq(local.jacobian[:, free], -local.residual, rcond=1e-10)[0]
+        z = z.copy()
+        z[free] += step
+        moved = solution_at(problem, z, steps=start.steps)
+        there = linearise(problem, moved)
+        if not there.cost <= local.cost:
+            break
+        solution, local = moved, there
+        if np.max(np.abs(step), initial=0.0) < 1e-9:
+            break
+    return solution, local
 
 
 class NearZero(NamedTuple):
@@ -85,16 +191,11 @@ def near_zeros(problem: Problem, solution: Solution, budget: ErrorBudget) -> lis
 def one_sided_limits(
     problem: Problem, solution: Solution, k: int, inflations: Sequence[float]
 ) -> tuple[list[float], float]:
-    """Where a parameter that may be zero leaves its one-sided 95 % interval, in its own unit.
+    """Where parameter `k`, which may be zero, leaves its one-sided 95 % interval, in its own unit.
 
-    **Arguments:**
-
-    - `problem`, `solution`: with the parameter at zero, or at so small a value that it might be.
-    - `k`: which parameter.
-    - `inflations`: its variance over what the curvature of the cost says, one for each limit.
-
-    **Returns:** the limits, with the parameter's sign, infinite where the cost does not rise so
-    far; and how far beyond zero the cost would be lowest, without a sign.
+    `inflations` are its variance over what the curvature of the cost says, one for each limit.
+    Limits have the parameter's sign, and are infinite where the cost does not rise so far. The last
+    number is how far beyond zero the cost would be lowest, without a sign.
     """
     local, unit = linearise(problem, solution), float(np.asarray(solution.slopes)[k])
     # Slope and curvature of the profile, over the value at which these are evaluated.
@@ -137,10 +238,10 @@ def bounds_among(
     That is where another one would change by too much if this one had a value up to its limit: it
     then counts as much as that other one.
     """
-    bounds, mixed = [], {}
+    bounds, mixed, covariance = [], {}, budget.covariance
     slight = [one.k for one in near if one.slight]
     for one in near:
-        along = np.abs(budget.covariance[:, one.k] / budget.covariance[one.k, one.k])
+        along = np.abs(covariance[:, one.k] / covariance[one.k, one.k])
         moved = along * abs(one.bound.limit / units[one.k])
         moved[[one.k, *(solution.at_zero if one.k in solution.at_zero else ())]] = 0.0
         moved[slight if one.slight else []] = 0.0
@@ -148,7 +249,7 @@ def bounds_among(
             bounds.append(one.bound)
         elif one.k in solution.at_zero or one.changes is not None:
             mixed[one.k] = moved
-    others = [j for j in range(len(budget.bread)) if j not in mixed]
+    others = [j for j in range(len(covariance)) if j not in mixed]
     units = units.copy()
     for one in near:
         if one.k in mixed and np.isfinite(one.bound.limit):
@@ -157,34 +258,15 @@ def bounds_among(
     return tuple(bounds), units
 
 
-def one_sided_covariance(
-    covariance: Matrix, budget: ErrorBudget, names: tuple[str, ...], bounds: Sequence[Bound]
-) -> Matrix:
-    """The covariance with what the bounds of parameters at zero cut off taken away."""
-    covariance, steps = _unbounded(covariance, budget, names, bounds)
-    for k, step in steps.items():
-        covariance = one_sided(covariance, k, step)
-    return covariance
-
-
-def pulled_beyond(
-    budget: ErrorBudget, names: tuple[str, ...], bounds: Sequence[Bound]
-) -> Mapping[str, float]:
-    """How far beyond zero the data want parameters at zero, in random errors."""
-    covariance, steps = _unbounded(budget.by_noise, budget, names, bounds)
-    errors = {k: float(np.sqrt(max(covariance[k, k], 1e-300))) for k in steps}
-    return {names[k]: -step / errors[k] for k, step in steps.items()}
-
-
-def _unbounded(
-    covariance: Matrix, budget: ErrorBudget, names: tuple[str, ...], bounds: Sequence[Bound]
+def without_bounds(
+    covariance: Matrix, budget: ErrorBudget, zeros: Sequence[int]
 ) -> tuple[Matrix, dict[int, float]]:
-    """The covariance without bounds, and where parameters at zero would go without them.
+    """The covariance without bounds, and where the parameters at zero would go without them.
 
     One by one, while the others stay there: two lags at zero do the same to a response, so that
     without their bounds one could grow without limit as the other becomes negative.
     """
-    zeros, bread = [names.index(bound.name) for bound in bounds if not bound.value], budget.bread
+    bread = budget.bread
     if len(zeros) < 2:
         step = -scaled_inverse(bread) @ budget.gradient
         return covariance, {k: float(step[k]) for k in zeros}
@@ -202,9 +284,7 @@ def _unbounded(
     return total, steps
 
 
-def _sandwich(
-    bread: Matrix, meat: Matrix, some: Int[np.ndarray, " some"]
-) -> tuple[Float[np.ndarray, "some some"], Float[np.ndarray, "some some"]]:
+def _sandwich(bread: Matrix, meat: Matrix, some: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The covariance of some parameters while the others are fixed, and the inverse bread."""
     inverse = scaled_inverse(bread[np.ix_(some, some)])
     return inverse @ meat[np.ix_(some, some)] @ inverse, inverse

@@ -1,0 +1,307 @@
+"""Commands on logs: channels, identify, report, verify, and batch for all logs of a folder."""
+
+import argparse
+import math
+import sys
+from collections import Counter
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import jaxquad.workflows as workflows
+from jaxquad.records import parse_mix, require_file
+from jaxquad.workflows import BatchSettings, default_folder, IdentifySettings, in_options, open_logs
+
+from . import _options as shell
+from ._options import command, Run
+
+
+if TYPE_CHECKING:
+    from jaxquad.workflows import Identification
+
+NOT_IDENTIFIABLE = 3
+_CODES = "exit codes: 0 done, 2 unusable input, 3 the record does not determine the parameters\n"
+
+
+@command(
+    "list the channels of a file",
+    """examples:
+  jaxquad channels flight.npz
+  jaxquad channels table.npy --time "data[0]"
+  jaxquad channels table.csv --dt 0.004
+
+A channel without a known time has no rate: name the channel that holds the time (--time), or give
+the distance of its rows (--dt).
+exit codes: 0 done, 2 unusable input
+""",
+)
+def channels(declared: argparse.ArgumentParser) -> Run:
+    shell.add_paths(declared, "file")
+    shell.add_settings(declared, IdentifySettings, only={"time": "", "time_unit": "", "dt": ""})
+    shell.add_output(declared, "the list", quiet=False, force="")
+
+    def run(options: argparse.Namespace) -> int:
+        from jaxquad.records import channels, flights
+
+        typed = vars(options).get
+        listed = channels(
+            options.file, time=typed("time"), time_unit=typed("time_unit"), dt=typed("dt")
+        )
+        if options.json:
+            shell.print_json([channel._asdict() for channel in listed])
+            return 0
+        heads = ("channel", "samples", "rate, Hz", "from, s", "to, s", "minimum", "maximum", "unit")
+        rows: list[tuple[str, ...]] = [heads]
+        for c in listed:
+            numbers = (f"{c.rate:.5g}", f"{c.start:.6g}", f"{c.stop:.6g}", f"{c.minimum:.4g}")
+            rows.append((c.name, f"{c.samples}", *numbers, f"{c.maximum:.4g}", c.unit))
+        first, *widths = (max(map(len, column)) for column in zip(*rows, strict=True))
+        for name, *cells in rows:
+            padded = (f"{cell:>{width}}" for cell, width in zip(cells, widths, strict=True))
+            print("  ".join((f"{name:<{first}}", *padded)).rstrip())
+        if any(math.isnan(c.rate) for c in listed):
+            print(
+                "\nnan: no time of that length is known, or its unit is not, or it goes back. Name "
+                "it (--time), its unit (--time-unit), or give --dt."
+            )
+        if any(c.name.startswith("log1.") for c in listed):
+            print("", *flights(options.file), "--flight N chooses one of them", sep="\n")
+        return 0
+
+    return run
+
+
+def finish_identification(
+    options: argparse.Namespace, result: "Identification", folder: Path, note: str = ""
+) -> int:
+    """Print an identification, write its folder, and tell whether it is identifiable."""
+    verified = result.settings.verify
+    sources = [*result.paths, *([verified] if verified else [])]
+    same = {"settings": result.settings.content()}
+    with shell.stdout_for_json(options):
+        print(in_options(result.message()), flush=True)
+        path = result.write(shell.folder_to_write(options, folder, "result.json", same, sources))
+        drawn = [name for name in result.figure_names if path.with_name(name).exists()]
+        names = ", ".join(["report.html", *drawn])
+        print(f"\n{path}, {names}{note.format(report=path.with_name('report.html'))}")
+    if options.json:
+        print(path.read_text(), end="")
+    if result.fit.identifiable:
+        return 0
+    print("jaxquad: error:", " ".join(result.fit.verdict.summary.split()), file=sys.stderr)
+    return NOT_IDENTIFIABLE
+
+
+@command(
+    "fit K e^(-delay s) / (s^n (lag s + 1)), or a transfer function, to a log",
+    """examples:
+  jaxquad identify flight.ulg
+  jaxquad identify flight.npz --input M --output q --reference x0 --rate 250 --start 50 --stop 76
+  jaxquad identify flight.csv --input "roll=-m1-m2+m3+0.5*m4" --output p --band 0.7 12 --no-lag
+  jaxquad identify flight.csv --input elevator --output q --integrators 0 --poles 3 --zeros 1
+  jaxquad identify flight.csv --input p_cmd --output p --segment 22:30 --segment 41:49.5
+  jaxquad identify log15 --input "roll=-motor.m1^2-motor.m2^2+motor.m3^2+motor.m4^2" --output gyro.x
+  jaxquad identify a.npz --input "cmd[0]" --output "rate[0]" --verify b.npz --json > fit.json
+  jaxquad identify flight1.csv flight2.csv --input u --output p
+
+Without --input and --output, the log of a known autopilot proposes them, and the full command line
+is printed. Several logs of one vehicle in one condition (mass, battery, speed) give one response;
+--start, --stop and --segment hold in each of them. Powers of a channel describe motors with a
+thrust curve. The keys of a file for --config are the names of the options, but units, segments,
+lag = false and delay = false.
+"""
+    + _CODES,
+)
+def identify(declared: argparse.ArgumentParser) -> Run:
+    text = "a log of an autopilot, CSV, NPZ, MAT, HDF5, ...; several logs of one vehicle in one "
+    text += "condition are fitted together"
+    declared.add_argument("file", type=Path, nargs="+", help=text)
+    shell.add_paths(declared, "--config")
+    shell.add_settings(declared, IdentifySettings)
+    shell.add_output(declared, "result.json", folder="results/NAME of the first file")
+
+    def run(options: argparse.Namespace) -> int:
+        settings = shell.settings_of(options, IdentifySettings)
+        for path in options.file:
+            require_file(path)
+            if path.is_dir() and not (path / "metadata.yaml").is_file():  # no ROS 2 bag
+                raise ValueError(
+                    f"{path} is a folder: jaxquad batch {path} identifies each log in it; for one "
+                    "log, name the file"
+                )
+        texts = (settings.input, settings.output, settings.reference)
+        used = [name for text in texts if text for name in parse_mix(text)]
+        for name in (unit.partition("=")[0].strip() for unit in vars(options).get("units", ())):
+            if used and name not in used:  # without names, the log proposes them
+                raise ValueError(
+                    f"--unit names {name!r}, but the channels in use are {', '.join(used)}"
+                )
+        if settings.verify:
+            require_file(settings.verify)
+        shell.start_computing()
+        opened = open_logs(options.file, settings)
+        if opened.proposal is not None:
+            with shell.stdout_for_json(options):
+                print(f"{opened.proposal}\n", flush=True)
+        folder = options.out or default_folder(options.file[0])
+        return finish_identification(options, workflows.identify_opened(opened), folder)
+
+    return run
+
+
+@command(
+    "write the report and the figures of a result again",
+    """example:
+  jaxquad report results/flight
+
+The log is identified again with the settings in result.json. It has to be the same file.
+"""
+    + _CODES,
+)
+def report(declared: argparse.ArgumentParser) -> Run:
+    shell.add_paths(declared, "result", "--log")
+    shell.add_output(declared, "result.json", folder="the folder of the result")
+
+    def run(options: argparse.Namespace) -> int:
+        stored = workflows.load_result(options.result)
+        shell.start_computing()
+        result = workflows.identify_again(stored, log=options.log)
+        return finish_identification(options, result, options.out or stored.folder)
+
+    return run
+
+
+_OF_A_RECORD = {
+    "input": "the input, if it has another name in this file",
+    "output": "the output, likewise",
+    "time": "",
+    "time_unit": "",
+    "dt": "",
+    "rate": "resample to this rate; by default that of the result",
+    "valid": "",
+    "max_gap": "",
+    "hold": "for how long its input keeps each value; by default as in the result",
+    "start": "",
+    "stop": "",
+    "band": "compare between these frequencies, in Hz; by default the whole band of the result",
+    "band_rad": "",
+}
+
+
+@command(
+    "simulate an identified model on another log, and compare",
+    """example:
+  jaxquad verify results/flight second_flight.npz --start 20 --stop 45 --out verification.png
+
+Channels, rate and band are those of the result, unless other ones are given.
+exit codes: 0 done, 2 unusable input, 3 the record that was identified does not determine the
+parameters of the model, or the result holds none
+""",
+)
+def verify(declared: argparse.ArgumentParser) -> Run:
+    shell.add_paths(declared, "result", "file")
+    shell.add_settings(declared, IdentifySettings, only=_OF_A_RECORD)
+    file = ("PNG", "draw both outputs into a figure")
+    shell.add_output(declared, "the measures of agreement", file=file, force="")
+
+    def run(options: argparse.Namespace) -> int:
+        stored = workflows.load_result(options.result)
+        require_file(options.file)
+        shell.start_computing()
+        from jaxquad.plot import compare, headless
+        from jaxquad.report import verification_content
+
+        check = workflows.verify_result(
+            stored, options.file, shell.typed_settings(options, IdentifySettings)
+        )
+        with shell.stdout_for_json(options):
+            if stored.doubts:
+                print(f"THE MODEL IS WEAK: {stored.doubts[0]}")
+                print("  a good agreement below does not make up for that")
+            for doubt in stored.doubts[1:]:
+                print(f"! {doubt}")
+            print(check)
+            if options.out:
+                picture = options.out if options.out.suffix else options.out.with_suffix(".png")
+                picture.parent.mkdir(parents=True, exist_ok=True)
+                with headless():
+                    compare(check, title=options.file.name).figure.savefig(picture, dpi=130)
+                print(picture)
+        if options.json:
+            model = {"identifiable": stored.identifiable, "verdict": stored.summary}
+            shell.print_json(model | verification_content(check))
+        return 0 if stored.identifiable else NOT_IDENTIFIABLE
+
+    return run
+
+
+_SOME_FAILED = 4
+
+
+@command(
+    "identify all logs of a folder",
+    """examples:
+  jaxquad batch logs/ --config fleet.toml
+  jaxquad batch logs/ --config fleet.toml --workers 4 --out results/fleet
+  jaxquad batch logs/ --config fleet.toml --scheduler tcp://10.0.0.1:8786
+
+fleet.toml, in which every key may be left out:
+  logs = "**/*.ulg"             # a file pattern below the folder, or a list of them
+  timeout = 600                 # s for one log; workers and scheduler likewise
+  input = "roll=-m1-m2+m3+m4"   # without input and output, an autopilot's log proposes them
+  output = "p"
+  reference = "setpoint"
+  units = { p = "rad/s" }
+  band = [0.7, 12]              # Hz
+  lag = false                   # as --no-lag
+  [[override]]
+  logs = "flight_07*"           # these logs alone
+  segments = [[22, 30], [41, 49.5]]
+The other keys are the options of jaxquad identify (--unit and --segment are units and segments).
+
+A batch that was stopped or killed continues where it was: start it again.
+exit codes: 0 done, 2 unusable input, 4 some logs failed (see table.csv)
+A log that is not identifiable has not failed.
+""",
+)
+def batch(declared: argparse.ArgumentParser) -> Run:
+    declared.add_argument("folder", type=Path, help="the folder that contains the logs")
+    shell.add_paths(declared, "--config")
+    text = "identify logs again that failed before"
+    declared.add_argument("--again", action="store_true", help=text)
+    shell.add_settings(declared, BatchSettings)
+    shell.add_output(
+        declared, "the rows of the table", folder="results/NAME of the folder", force=""
+    )
+
+    def run(options: argparse.Namespace) -> int:
+        from tqdm import tqdm
+
+        settings = shell.settings_of(options, BatchSettings)
+        out = options.out or Path("results") / options.folder.resolve().name
+        logs = workflows.find_logs(options.folder, settings, out=out)
+        # A bar on a terminal, plain lines elsewhere, nothing with --quiet.
+        bar = tqdm(total=len(logs), unit="log", leave=False, disable=options.quiet or None)
+        shown: list[str] = []
+
+        def show(row: dict) -> None:
+            text = f"{row['log']}: {row['status']}"
+            shown.append("".join(c if c.isprintable() else "?" for c in text))
+            if not bar.disable:
+                bar.set_postfix_str(shown[-1], refresh=False)
+                bar.update()
+            elif not options.quiet:
+                print(f"{len(shown)}/{len(logs)} {shown[-1]}", file=sys.stderr, flush=True)
+
+        with shell.stdout_for_json(options), bar:
+            rows = workflows.batch(
+                options.folder, settings, out=out, again=options.again, listener=show
+            )
+        if options.json:
+            shell.print_json(rows)
+        else:
+            counts = Counter(row["status"] for row in rows)
+            print(f"{len(rows)} logs:", ", ".join(f"{n} {state}" for state, n in counts.items()))
+            print(f"{out / 'summary.html'}, table.csv")
+        return _SOME_FAILED if any(row["status"] == "failed" for row in rows) else 0
+
+    return run

@@ -1,0 +1,289 @@
+import functools as ft
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxquad._core import require_all_positive, signal_shape
+
+from ._estimator import AbstractInertia, empty_past, LastEstimate, motion, Past, ProbeTones
+from ._protocols import Signal
+
+
+class LockInSolution(NamedTuple):
+    inertia: Signal  # kg m^2
+    variance: Signal  # (kg m^2)^2
+    stiffness: Signal  # N m/rad
+    informed: Signal  # 1 where enough tones stand out
+
+
+def solve(
+    acceleration: Float[Array, " parts tones places axes *ensemble"],
+    torque: Float[Array, " parts tones places axes *ensemble"],
+    square: Float[Array, " tones *ones"],
+    *,
+    contrast: float,
+    stiff: bool,
+) -> LockInSolution:
+    """Inertia from the correlations of torque and acceleration with each tone.
+
+    The parts are a tone's cosine and sine; the places a frequency below it, its own, one above.
+    At a tone torque / acceleration = J - k / w^2 + j (damping, lag), with w^2 the `square`: the
+    real part is used. Beside it there is no tone: the torque that the ratio does not explain there
+    is the disturbance, whose power, of four degrees of freedom, gives the variance. A tone counts
+    if its acceleration has `contrast` times the power of its neighbours'.
+    """
+    a, u = acceleration[:, :, 1], torque[:, :, 1]
+    power = jnp.sum(a**2, axis=0)
+    neighbours = jnp.sum(acceleration[:, :, ::2] ** 2, axis=(0, 2)) / 2
+    stands_out = power > contrast * neighbours
+    inverse = jnp.where(stands_out, 1 / jnp.where(stands_out, power, 1), 0)
+    ratio = jnp.sum(a * u, axis=0) * inverse  # of each tone, kg m^2
+    imaginary = (a[0] * u[1] - a[1] * u[0]) * inverse
+    x, y = acceleration[:, :, ::2]
+    explained = [
+        ratio[:, None] * x - imaginary[:, None] * y,
+        ratio[:, None] * y + imaginary[:, None] * x,
+    ]
+    left = torque[:, :, ::2] - jnp.stack(explained)
+    noise = jnp.sum(left**2, axis=(0, 2)) / 4
+    rounding = 1e-12 * jnp.sum(u**2, axis=0)  # keeps the weights of a perfect record finite
+    # 1 / variance of the ratio.
+    weight = jnp.where(stands_out, power / jnp.where(stands_out, noise + rounding, 1), 0)
+    total = jnp.sum(weight, axis=0)
+    some = total > 0
+    variance = jnp.where(some, 1 / jnp.where(some, total, 1), 0)
+    inertia = jnp.sum(weight * ratio, axis=0) * variance
+    if not stiff:
+        return LockInSolution(
+            inertia, variance, jnp.zeros_like(inertia), some.astype(inertia.dtype)
+        )
+    # Weighted least squares of the ratios on 1 and -1/w^2.
+    away = -1 / square - jnp.sum(weight / -square, axis=0)[None] * variance[None]
+    spread = jnp.sum(weight * away**2, axis=0)
+    some = spread * variance > 1e-9 / jnp.max(square) ** 2
+    inverse = jnp.where(some, 1 / jnp.where(some, spread, 1), 0)
+    stiffness = jnp.sum(weight * away * ratio, axis=0) * inverse
+    centre = jnp.sum(weight / -square, axis=0) * variance
+    inertia, variance = inertia - centre * stiffness, variance + centre**2 * inverse
+    return LockInSolution(inertia, variance, stiffness, some.astype(stiffness.dtype))
+
+
+BESIDE = 2  # periods per window: the nearest that a Hann window separates from the tone
+
+
+class WindowSums(NamedTuple):
+    correlations: Float[Array, " windows parts lines signals axes *ensemble"]
+    valid: Float[Array, " windows axes *ensemble"]  # 1 while nothing was missing
+    index: Int[Array, ""]  # sample within the first window
+
+
+class LockInWindows(eqx.Module):
+    """Two staggered Hann windows and the sines that they correlate with, by counted samples."""
+
+    frequencies: tuple[float, ...] = eqx.field(static=True)  # Hz
+    window: float = eqx.field(static=True)  # s
+    dt: float = eqx.field(static=True)  # s
+
+    def __check_init__(self):
+        samples = self.window / self.dt
+        if abs(samples - round(samples)) > 1e-6 * samples or not 100 <= samples <= 40000:
+            raise ValueError(
+                f"A window of {self.window} s holds {samples:g} samples of {self.dt} s: give it "
+                "a whole number of samples from 100 to 40000."
+            )
+        for frequency in self.frequencies:
+            periods = frequency * self.window
+            if abs(periods - round(periods)) > 1e-6 * periods:
+                raise ValueError(
+                    f"A tone of {frequency} Hz has {periods:g} periods in a window of "
+                    f"{self.window} s: give a whole number, such as "
+                    f"{max(round(periods), 5) / self.window:g} Hz."
+                )
+            if not 5 <= round(periods) <= self.samples / 10:
+                raise ValueError(
+                    f"A tone of {frequency} Hz has {periods:g} periods in a window of "
+                    f"{self.window} s: give it from 5 to {self.samples // 10}."
+                )
+        spacing = np.diff(sorted(self.periods))
+        if np.any(spacing < 2 * BESIDE):
+            raise ValueError(
+                f"Tones of {self.frequencies} Hz are closer than {2 * BESIDE / self.window:g} Hz, "
+                f"the resolution of a window of {self.window} s: give a longer window."
+            )
+
+    @property
+    def samples(self) -> int:
+        return round(self.window / self.dt)
+
+    @property
+    def periods(self) -> np.ndarray:
+        """Of each tone in a window."""
+        return np.array([round(f * self.window) for f in self.frequencies])
+
+    def phase(self, index: Int[Array, ""]) -> Float[Array, " tones"]:
+        """Of the tones in cycles."""
+        return _cycles(self.periods, index, self.samples)
+
+    def square(self, signal: Signal) -> Float[Array, " tones *ones"]:
+        """w^2 in (rad/s)^2, as the second difference of a sampled sine shows it."""
+        w = 2 / self.dt * np.sin(np.pi * self.periods / self.samples)
+        return jnp.asarray(w**2, signal.dtype).reshape((-1,) + (1,) * signal.ndim)
+
+    def init(self, like: Signal) -> WindowSums:
+        lines = 3 * len(self.frequencies)
+        correlations = jnp.zeros((2, 2, lines, 2, *like.shape), like.dtype)
+        valid = jnp.zeros((2, *like.shape), like.dtype)
+        return WindowSums(correlations, valid, jnp.zeros((), jnp.int32))
+
+    def add(
+        self, sums: WindowSums, signals: Float[Array, " signals axes *ensemble"], counts: Signal
+    ) -> WindowSums:
+        """One more sample, `counts` 0 where its window is not to count."""
+        place = self._place(sums.index)
+        going = _over((place > 0).astype(signals.dtype), sums.correlations)
+        weights = self._weights(sums.index, place).astype(signals.dtype)
+        weights = weights.reshape(weights.shape + (1,) * signals.ndim)
+        correlations = going * sums.correlations + weights * signals[None, None, None]
+        valid = jnp.where(_over(place == 0, sums.valid), 1, sums.valid) * counts[None]
+        return WindowSums(correlations, valid, (sums.index + 1) % self.samples)
+
+    def ends(self, sums: WindowSums) -> Bool[Array, ""]:
+        """Whether the last sample ended one of the windows."""
+        return jnp.any(self._place(sums.index) == 0)
+
+    def ended(self, sums: WindowSums) -> tuple[Array, Array]:
+        """Its correlations [parts, tones, places, signals, ...] and whether it counts."""
+        first = sums.index == 0
+        chosen, valid = (jnp.where(first, x[0], x[1]) for x in (sums.correlations, sums.valid))
+        return chosen.reshape(2, len(self.frequencies), 3, *chosen.shape[2:]), valid
+
+    def _place(self, index):
+        """Of the sample within each window."""
+        return (index + jnp.array([0, self.samples // 2], jnp.int32)) % self.samples
+
+    def _weights(self, index, place):
+        """Hann windows times cosine and sine of every line: [windows, parts, lines]."""
+        lines = (self.periods[:, None] + np.array([-BESIDE, 0, BESIDE])).reshape(-1)
+        angle = 2 * jnp.pi * _cycles(lines, index, self.samples)
+        hann = jnp.sin(jnp.pi * _ratio(place, self.samples)) ** 2
+        return hann[:, None, None] * jnp.stack([jnp.cos(angle), jnp.sin(angle)])[None]
+
+
+def _cycles(periods, index, samples):
+    """Phases in cycles, exact however long the flight."""
+    return _ratio((jnp.asarray(periods, jnp.int32) * index) % samples, samples)
+
+
+def _ratio(count, samples):
+    return count.astype(jnp.result_type(float)) / samples
+
+
+def _over(x, like):
+    return x.reshape(x.shape + (1,) * (like.ndim - x.ndim))
+
+
+class LockInState(NamedTuple):
+    past: Past
+    sums: WindowSums
+    last: LastEstimate
+    stiffness: Signal  # N m/rad
+    exciting: Signal  # 1 while the tones are on
+
+
+class LockInInertia(AbstractInertia):
+    """Inertia by a lock-in at its own test tones: torque over acceleration, in phase.
+
+    Both sides of the sampled equation of motion are correlated with each tone over Hann windows of
+    `window` seconds; a new window begins each half window. Each tone has a whole number of periods
+    in a window. Signals with another whole number, such as a constant torque or the paper's 5 s
+    sine, drop out exactly; a motor's lag and damping are in quadrature; the ends of a window, where
+    encoder noise would enter, have no weight. A delay of d seconds biases the inertia by
+    cos(omega d) - 1, an encoder angles of a count or two by 0.5 to 4 %. A stiffness k leaves
+    J - k / omega^2 at one tone; `nuisance=("angle",)` with two tones or more removes it.
+
+    The standard deviation is that of one window, from the disturbance at two periods per window
+    beside the tones. It has four degrees of freedom, so that it is known to a third, and it assumes
+    a spectrum that is flat from there to the tone. Between windows the relative deviation grows by
+    `drift` per root second. Windows count in which the tones were on throughout, and tones of
+    `contrast` times the power beside them. After a change of the inertia the first window that
+    begins after it counts, one and a half windows later at most.
+    Source: docs/control.md.
+
+    **Arguments:**
+
+    - `torque_gain`: in N m per unit of command; `nominal`: the design's inertia in kg m^2. Both are
+        scalars, one value per axis, or `[axes, *ensemble]`.
+    - `tones`: the test signal.
+    - `window`: in s, from 100 to 40000 samples.
+    - `nuisance`: () or ("angle",).
+    - `contrast`; `trust`: the relative deviation up to which an estimate is trusted; `drift`: in
+        1/sqrt(s); `dt`: in s.
+
+    **Raises:** `ValueError`: a tone does not fit the window or the other tones, or a value is not
+    positive.
+    """
+
+    tones: ProbeTones = eqx.field(default_factory=ProbeTones)
+    window: float = eqx.field(static=True, default=5.0)  # s
+    nuisance: tuple[str, ...] = eqx.field(static=True, default=())
+    contrast: float = eqx.field(static=True, default=10.0)
+
+    def __check_init__(self):
+        require_all_positive(dt=self.dt, window=self.window)
+        if self.nuisance not in ((), ("angle",)):
+            raise ValueError(f"nuisance is {self.nuisance}: give () or ('angle',).")
+        if self.nuisance and len(self.tones.frequencies) < 2:
+            raise ValueError(
+                f"One tone, {self.tones.frequencies} Hz, cannot separate stiffness from inertia: "
+                "give ProbeTones two frequencies, or leave the nuisance 'angle' out."
+            )
+        self._windows()
+
+    def _windows(self) -> LockInWindows:
+        return LockInWindows(self.tones.frequencies, self.window, self.dt)
+
+    def init(self, like: Signal) -> LockInState:
+        """Before the first sample; shaped as the measurement `like` and as the ensemble."""
+        like = zero = jnp.zeros(signal_shape(like, self.ensemble), like.dtype)
+        sums = self._windows().init(like)
+        return LockInState(empty_past(like), sums, self._start(like), zero, zero + 1)
+
+    def update(self, state: LockInState, command: Signal, measurement: Signal) -> LockInState:
+        """Add the command held during the last sample and the angle at its end."""
+        past, now = motion(state.past, self.torque_gain, command, measurement, self.dt)
+        windows = self._windows()
+        pair = now.valid * jnp.stack([now.acceleration, now.torque])
+        sums = windows.add(state.sums, pair, state.exciting)
+        aged = state.last._replace(age=state.last.age + self.drift**2 * self.dt)
+        last, stiffness = jax.lax.cond(
+            windows.ends(sums),
+            ft.partial(self._renew, windows),
+            lambda sums, *unchanged: unchanged,
+            sums, aged, state.stiffness,
+        )  # fmt: skip
+        exciting = self.tones.switch(state.exciting, self._assess(last))
+        return LockInState(past, sums, last, stiffness, exciting)
+
+    def _renew(self, windows, sums, last, stiffness):
+        """The estimate of the window that has just ended, where it shows one."""
+        done, valid = windows.ended(sums)
+        solved = solve(
+            done[:, :, :, 0], done[:, :, :, 1], windows.square(valid),
+            contrast=self.contrast, stiff=bool(self.nuisance),
+        )  # fmt: skip
+        new = LastEstimate(solved.inertia, solved.variance, jnp.zeros_like(valid), solved.informed)
+        renew = ft.partial(jnp.where, (valid > 0) & (solved.informed > 0))
+        return jax.tree.map(renew, (new, solved.stiffness), (last, stiffness))
+
+    def stiffness(self, state: LockInState) -> Signal:
+        """In N m/rad beside the inertia; 0 unless the nuisance is "angle"."""
+        return state.stiffness
+
+    def probe(self, state: LockInState) -> Signal:
+        """The test signal to add to the next command."""
+        phase = self._windows().phase(state.sums.index).astype(state.exciting.dtype)
+        return self.tones.wave(phase, state.exciting)
