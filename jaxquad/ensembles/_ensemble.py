@@ -235,8 +235,9 @@ class Ensemble(eqx.Module):
                 f"the loop's plant is a {type(plant).__name__}, but an ensemble needs a "
                 "jq.DecoupledAxes or jq.models.Multirotor. For an identified model use "
                 "jq.Ensemble(jq.ensembles.Posterior(fit, ...)), with plant= for one of your own. "
-                "To fly any other plant, draw its arrays yourself, with the members on the last axis "
-                "and fields made by jq.loops.per_member, and fly them with jq.evaluate(jq.Loop(plant, ...), scenario)"
+                "To fly any other plant, draw its arrays yourself, with the members on the last "
+                "axis and fields made by jq.loops.per_member, and fly them with "
+                "jq.evaluate(jq.Loop(plant, ...), scenario)"
             )
         shape = plant.shape[1:] if isinstance(plant, DecoupledAxes) else plant.ensemble
         if shape or loop.delay.ndim:
