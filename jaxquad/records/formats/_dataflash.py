@@ -230,14 +230,38 @@ def load(path: Path) -> Log:
             "there is no FMT message: the file is not a DataFlash log, or its beginning is missing",
             offset=0,
         )
-    formats, offsets, left_out = _one_log(data, parts)
+    ends = [*(part.begin for part in parts[1:]), len(data)]
+    for part, end in zip(parts, ends, strict=True):
+        part.end = end
+        stored = [x for kind, x in part.formats.items() if part.offsets.get(kind)]
+        part.chirped = any(layout.name == "SIDD" for layout in stored)
+        timed = [x for x in stored if x.columns[0] in _CLOCKS and x.name not in _ABOUT]
+        timed = [layout for layout in timed if layout.dtype() is not None]
+        if timed:
+            most = max(timed, key=lambda layout: len(part.offsets[layout.kind]))
+            rows, _ = _rows(data, {most.kind: most}, part.offsets)
+            clock = most.columns[0]
+            part.span = _span(_CLOCKS[clock] * rows[most.name][clock].astype(np.float64))
+    numbers, left_out = _choose_log(parts)
+    offsets: Offsets = collections.defaultdict(list)
+    for i in numbers:
+        if parts[i].redefined and (i == 0 or i - 1 in numbers):
+            place, old, new = parts[i].redefined[0]
+            raise ReadError(
+                f"message type {new.kind} ({old.name}) is defined a second time, differently "
+                f"({new.name}): if the file holds two logs, cut it there",
+                offset=place,
+            )
+        for kind, places in parts[i].offsets.items():
+            offsets[kind] += places
+    formats = parts[numbers[-1]].formats
     rows, odd = _rows(data, formats, offsets)
     remarks += left_out
     if odd:
         remarks.append(f"messages with an inconsistent format were left out: {', '.join(odd)}")
     units, mults = _cells(rows.get("UNIT"), "Id", "Label"), _cells(rows.get("MULT"), "Id", "Mult")
     scaling = _Scaling(
-        {chr(letter & 0xFF): _text(label) for letter, label in units},
+        {chr(letter & 0xFF): _text(label) for letter, label in dict(units).items()},
         {chr(letter & 0xFF): mult for letter, mult in dict(mults).items() if 0 < mult < np.inf},
         {
             formats[kind].name: (_text(units), _text(mults))
@@ -309,70 +333,36 @@ def _scan(data: bytes) -> tuple[list[_Part], list[str]]:
         elif place + length > end:
             break
         else:
-            if kind == _FORMAT_TYPE:
-                part = _define(data, place, parts, lengths)
+            if kind == _FORMAT_TYPE:  # which begins a part where it defines its type once more
+                body = data[place + 3 : place + _FMT_LENGTH]
+                new_kind, size = body[0], body[1]
+                if new_kind in part.defined and part.offsets.keys() != {_FORMAT_TYPE}:
+                    if len(parts) == _MOST_PARTS:
+                        raise ReadError(
+                            f"the file defines its messages more than {_MOST_PARTS} times: "
+                            f"{_CUT_IT}",
+                            offset=place,
+                        )
+                    parts.append(part := _Part(place, dict(part.formats)))
+                part.defined.add(new_kind)
+                name, codes, columns = (_text(body[a:b]) for a, b in ((2, 6), (6, 22), (22, 86)))
+                old = part.formats.get(new_kind)
+                new = _Format(new_kind, size, name, codes, tuple(columns.split(",")))
+                if old is not None and old != new:
+                    part.redefined.append((place, old, new))
+                part.formats[new_kind] = new
+                if new_kind == _FORMAT_TYPE and size != _FMT_LENGTH:
+                    raise ReadError(
+                        f"the FMT message declares a length of {size} bytes; it has 89",
+                        offset=place,
+                    )
+                lengths[new_kind] = size if size > 3 else 0
             part.offsets[kind].append(place)
             last = place
             place += length
     if skipped and skipped[-1][1] == end and not data[skipped[-1][0] :].strip(b"\0\xff"):
         skipped.pop()  # what a file was prepared with, and not written
     return parts, describe_skips(skipped, end, end)
-
-
-def _define(data: bytes, place: int, parts: list[_Part], lengths: list[int]) -> _Part:
-    """Take a FMT message; returns its part: a new one where it defines its type once more."""
-    body, part = data[place + 3 : place + _FMT_LENGTH], parts[-1]
-    kind, length = body[0], body[1]
-    if kind in part.defined and part.offsets.keys() != {_FORMAT_TYPE}:
-        if len(parts) == _MOST_PARTS:
-            raise ReadError(
-                f"the file defines its messages more than {_MOST_PARTS} times: {_CUT_IT}",
-                offset=place,
-            )
-        parts.append(part := _Part(place, dict(part.formats)))
-    part.defined.add(kind)
-    name, codes, columns = (_text(body[a:b]) for a, b in ((2, 6), (6, 22), (22, 86)))
-    old = part.formats.get(kind)
-    new = part.formats[kind] = _Format(kind, length, name, codes, tuple(columns.split(",")))
-    if old is not None and old != new:
-        part.redefined.append((place, old, new))
-    if kind == _FORMAT_TYPE and length != _FMT_LENGTH:
-        raise ReadError(
-            f"the FMT message declares a length of {length} bytes; it has 89", offset=place
-        )
-    lengths[kind] = length if length > 3 else 0
-    return part
-
-
-def _one_log(
-    data: bytes, parts: Sequence[_Part]
-) -> tuple[Mapping[int, _Format], Offsets, list[str]]:
-    """Formats and offsets of one of the logs that a file holds, and a remark on the others."""
-    ends = [*(part.begin for part in parts[1:]), len(data)]
-    for part, end in zip(parts, ends, strict=True):
-        part.end = end
-        stored = [x for kind, x in part.formats.items() if part.offsets.get(kind)]
-        part.chirped = any(layout.name == "SIDD" for layout in stored)
-        timed = [x for x in stored if x.columns[0] in _CLOCKS and x.name not in _ABOUT]
-        timed = [layout for layout in timed if layout.dtype() is not None]
-        if timed:
-            most = max(timed, key=lambda layout: len(part.offsets[layout.kind]))
-            rows, _ = _rows(data, {most.kind: most}, part.offsets)
-            clock = most.columns[0]
-            part.span = _span(_CLOCKS[clock] * rows[most.name][clock].astype(np.float64))
-    numbers, remarks = _choose_log(parts)
-    offsets: Offsets = collections.defaultdict(list)
-    for i in numbers:
-        if parts[i].redefined and (i == 0 or i - 1 in numbers):
-            place, old, new = parts[i].redefined[0]
-            raise ReadError(
-                f"message type {new.kind} ({old.name}) is defined a second time, differently "
-                f"({new.name}): if the file holds two logs, cut it there",
-                offset=place,
-            )
-        for kind, places in parts[i].offsets.items():
-            offsets[kind] += places
-    return parts[numbers[-1]].formats, offsets, remarks
 
 
 def _text(field: bytes) -> str:
