@@ -72,7 +72,8 @@ def _in_child(name: str, per_megabyte: float, path: Path) -> Log:
             f'pip install "jaxquad[logs]"'
         )
     if "oversize" in answer:
-        check_size(*answer["oversize"], stored)
+        what, declared = answer["oversize"]
+        check_size(what, declared, stored)
     if "error" in answer:
         raise ReadError(
             f"cannot be read as {kind}: the file is cut off or damaged "
