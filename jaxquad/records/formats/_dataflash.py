@@ -66,6 +66,9 @@ class _Scaling(NamedTuple):
     letters: Mapping[str, tuple[str, str]]  # by message: one letter per column, of either kind
 
 
+_RATES = ("RDes", "R", "PDes", "P", "YDes", "Y")  # of RATE: set-points and rates
+_GYROS = {"R": "GyrX", "P": "GyrY", "Y": "GyrZ"}  # of IMU, in rad/s
+_DEGREES = {1.0: ("rad/s", 1.0), 57.3: ("deg/s", 1.0), 5730.0: ("deg/s", 0.01)}  # rate over gyro
 _FIRMWARE = re.compile(r"\b[A-Z][\w:]*\w V\d+\.\d+[^\0,]*")
 
 
@@ -110,46 +113,37 @@ def _log(
             kept = columns[instance] == number
             values = {name: column[kept] for name, column in columns.items() if name != instance}
             tables[f"{layout.name}[{number:.0f}]"] = Table(values, time[kept], units, scales)
-    if not scaling.letters.get("RATE"):
-        remarks = [*remarks, *_find_rate_unit(tables)]
+    rate = tables.get("RATE")
+    if rate is not None and not scaling.letters.get("RATE"):
+        # Logs before FMTU do not say its unit: it follows from the deviations over all axes of the
+        # first gyro, `IMU` or `IMU[0]`.
+        imus = (name for name in tables if name.partition("[")[0] == "IMU")
+        imu = tables.get(min(imus, default=""))
+        gyros = {} if imu is None else imu.columns
+        pairs = [(rate.columns.get(r), gyros.get(g)) for r, g in _GYROS.items()]
+        pairs = [(r, g) for r, g in pairs if r is not None and g is not None]
+        turned = np.sqrt(sum(float(np.var(r)) for r, _ in pairs))
+        measured = np.sqrt(sum(float(np.var(g)) for _, g in pairs))
+        usual, why = 57.3, "as ArduPilot 3.4 and later log it"
+        if measured > 1e-3 and turned > 0:
+            ratio = float(turned / measured)
+            usual = min(_DEGREES, key=lambda usual: abs(np.log(ratio / usual)))
+            why = f"because its rates are {ratio:.3g} times those of IMU's gyro in rad/s"
+        unit, scale = _DEGREES[usual]
+        named = [name for name in _RATES if name in rate.columns]
+        tables["RATE"] = dataclasses.replace(
+            rate,
+            units={**rate.units, **dict.fromkeys(named, unit)},
+            scales={**rate.scales, **dict.fromkeys(named, scale)},
+        )
+        hundredths = " (logged in hundredths)" if scale != 1.0 else ""
+        remark = f"the log does not say the unit of RATE: taken as {unit}{hundredths}, {why}"
+        remarks = [*remarks, remark]
     settings = {name: value for _, name, value in stamped}
     changes = changes_of(stamped, lambda time: time)
     hit = next(filter(None, map(_FIRMWARE.search, texts)), None)
     firmware = "" if hit is None else hit.group().strip()
     return Log(tables, tuple(remarks), "ardupilot", settings, changes, firmware)
-
-
-_RATES = ("RDes", "R", "PDes", "P", "YDes", "Y")  # of RATE: set-points and rates
-_GYROS = {"R": "GyrX", "P": "GyrY", "Y": "GyrZ"}  # of IMU, in rad/s
-_DEGREES = {1.0: ("rad/s", 1.0), 57.3: ("deg/s", 1.0), 5730.0: ("deg/s", 0.01)}  # rate over gyro
-
-
-def _find_rate_unit(tables: dict[str, Table]) -> list[str]:
-    """Give RATE its unit in logs before FMTU, by the size of IMU's gyro; returns the remark."""
-    rate = tables.get("RATE")
-    if rate is None:
-        return []
-    # The first gyro, as `IMU` or `IMU[0]`; by the deviations over all axes.
-    imu = tables.get(min((name for name in tables if name.partition("[")[0] == "IMU"), default=""))
-    gyros = {} if imu is None else imu.columns
-    pairs = [(rate.columns.get(r), gyros.get(g)) for r, g in _GYROS.items()]
-    pairs = [(r, g) for r, g in pairs if r is not None and g is not None]
-    turned = np.sqrt(sum(float(np.var(r)) for r, _ in pairs))
-    measured = np.sqrt(sum(float(np.var(g)) for _, g in pairs))
-    unit, scale = _DEGREES[57.3]
-    why = "as ArduPilot 3.4 and later log it"
-    if measured > 1e-3 and turned > 0:
-        ratio = float(turned / measured)
-        unit, scale = _DEGREES[min(_DEGREES, key=lambda usual: abs(np.log(ratio / usual)))]
-        why = f"because its rates are {ratio:.3g} times those of IMU's gyro in rad/s"
-    named = [name for name in _RATES if name in rate.columns]
-    tables["RATE"] = dataclasses.replace(
-        rate,
-        units={**rate.units, **dict.fromkeys(named, unit)},
-        scales={**rate.scales, **dict.fromkeys(named, scale)},
-    )
-    hundredths = " (logged in hundredths)" if scale != 1.0 else ""
-    return [f"the log does not say the unit of RATE: taken as {unit}{hundredths}, {why}"]
 
 
 @dataclasses.dataclass
@@ -388,7 +382,6 @@ def _cells(rows: np.ndarray | None, *columns: str) -> Iterator[tuple]:
 _MOST_TYPES = 1000
 _MOST_COLUMNS = 64
 _BEGIN = re.compile(rb"^[ \t]*FMT, *128,", re.MULTILINE)
-Lines = dict[str, list[bytes]]  # what follows the name of a message, by name
 
 
 def sniff_text(head: bytes, path: Path) -> bool:
@@ -471,8 +464,8 @@ def load_text(path: Path) -> Log:
     return _log(messages, _Scaling(units, factors, letters), remarks, stamped, texts, applied=True)
 
 
-def _lines(content: bytes) -> tuple[Lines, int]:
-    """The lines by the name of their message; and how many have none."""
+def _lines(content: bytes) -> tuple[dict[str, list[bytes]], int]:
+    """What follows the name of a message on its lines, by name; and how many lines have none."""
     lines: dict[bytes, list[bytes]] = {}
     skipped = 0
     for line in content.split(b"\n"):
@@ -488,7 +481,7 @@ def _split(lines: Sequence[bytes]) -> list[list[str]]:
     return [[cell.strip() for cell in line.decode("latin-1").split(",")] for line in lines]
 
 
-def _text_formats(lines: Lines) -> list[_Format]:
+def _text_formats(lines: dict[str, list[bytes]]) -> list[_Format]:
     """From `140, 27, RATE, Qfff, TimeUS,RDes,R,ROut`; the first of a name counts."""
     formats: dict[str, _Format] = {}
     for kind, length, name, codes, *columns in (c for c in _split(lines.get("FMT", [])) if c[4:]):
