@@ -81,10 +81,9 @@ def _log(
     *,
     applied: bool,
 ) -> Log:
-    """The messages of each type as a table, or one table per instance: `IMU[0]`, `IMU[1]`, ...
+    """The messages of each type with a time stamp as a table, or one per instance: `IMU[0]`.
 
-    They are columns by name, with their own scale `applied` or not. Messages without a time stamp
-    (formats, parameters) make no table. The `texts` of VER and MSG name the firmware.
+    Their columns have their own scale `applied` or not; `texts` of VER and MSG name the firmware.
     """
     tables: dict[str, Table] = {}
     for layout, rows in messages:
