@@ -107,8 +107,14 @@ def estimate_local_polynomial(
         width, rational = np.full(at.size, float(options.width)), np.zeros(at.size, bool)
     else:
         widest = reach(windows.grid, windows.narrow, windows.widest, rest.bins, rest.sources)
-        respond = setup.to_plant(rest, sources)
-        chosen = choose_widths(windows.grid, windows.least, widest, noise, respond)
+        to_moved = setup.to_moved(rest)
+
+        def to_plant(omega: Grid, half_width: Grid, shape: Shape) -> LocalFit:
+            moved = to_moved(omega, half_width, shape)
+            left = setup.factors(moved)[0]
+            return coloured_gain(setup.plant(moved), sources, left, omega, rest.bins)
+
+        chosen = choose_widths(windows.grid, windows.least, widest, noise, to_plant)
         width, rational = (part[at] for part in chosen)
     respond = setup.to_moved(rest)
     moved = respond(omega, width, "polynomial")
@@ -217,17 +223,6 @@ class Setup(NamedTuple):
                 omega, half_width, rest.bins, rest.sources, rest.moved, self.order, shape
             )
             return rest.add_models(omega, fit)
-
-        return respond
-
-    def to_plant(self, rest: Rest, sources: Noise) -> Respond:
-        """Fits from inputs to outputs, with the gain of the noise `sources` of what is moved."""
-        to_moved = self.to_moved(rest)
-
-        def respond(omega: Grid, half_width: Grid, shape: Shape) -> LocalFit:
-            moved = to_moved(omega, half_width, shape)
-            left = self.factors(moved)[0]
-            return coloured_gain(self.plant(moved), sources, left, omega, rest.bins)
 
         return respond
 
