@@ -31,10 +31,10 @@ from ._global_model import (
     left_moving,
     response_left,
     Rest,
-    shared_errors,
     subtract_models,
     take_off,
     weighted_models,
+    with_models,
 )
 from ._local_fit import (
     Bins,
@@ -157,10 +157,11 @@ def estimate_local_polynomial(
         ends = [x[-max(int(_END * len(x)), _FEWEST) :].copy() for x in columns]
         ringing = left_moving(rest, ends, windows.grid, sources)[at]
     left, right = setup.factors(moved)
-    models = shared_errors(rest, bins, omega, moved, sources, left, right)
     edges, freedom = window_slices(windows.grid, windows.narrow, bins), narrow.freedom
     log_noise = smoothed(windows.grid, covariance_of_bands(*edges, freedom), freedom)
-    errors = error_covariance(omega, plant, noise, at, bins, back, sources, left, models)
+    parts = error_covariance(omega, plant, noise, at, bins, back, sources, left)
+    right = right * np.where(plant.determined[:, None, None], back, 0)
+    errors = with_models(*parts, rest, bins, moved, sources, left, right)
     response = plant.response * back
     with np.errstate(divide="ignore", invalid="ignore"):
         error = np.where(finite, np.sqrt(errors.variance() / 2) / np.abs(response), np.inf)
