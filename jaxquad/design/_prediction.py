@@ -70,17 +70,9 @@ Noise = float | int | Sequence[float] | Callable[[Lines], np.ndarray] | Measured
 
 
 def noise_covariance(noise: Noise, omega: Lines, outputs: int) -> Matrices:
-    """The outputs' noise at each line as covariance matrices, one-sided per Hz.
+    """The noise of so many outputs at lines in rad/s as covariance matrices, one-sided per Hz.
 
-    **Arguments:**
-
-    - `noise`: as in `predict_accuracy`.
-    - `omega`: lines in rad/s.
-    - `outputs`: how many.
-
-    **Raises:**
-
-    - `ValueError`: a density of another shape, not finite or not above 0.
+    **Raises:** ValueError for a density of another shape, not finite or not above 0.
     """
     density = np.asarray(noise(omega) if callable(noise) else noise)
     if density.ndim == 1 and callable(noise):
