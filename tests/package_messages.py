@@ -1,7 +1,9 @@
 """Every text that the package can show, collected from its source by AST."""
 
 import ast
+import functools
 from collections.abc import Iterator
+from pathlib import Path
 
 from conftest import ROOT
 
@@ -9,10 +11,15 @@ from conftest import ROOT
 PACKAGE = ROOT / "jaxquad"
 
 
+@functools.cache
+def parsed(path: Path) -> ast.Module:
+    return ast.parse(path.read_text())
+
+
 def messages() -> Iterator[tuple[str, str]]:
     """Every text of four words or more that is neither a docstring nor an annotation."""
     for path in sorted(PACKAGE.rglob("*.py")):
-        tree = ast.parse(path.read_text())
+        tree = parsed(path)
         silent = {id(node) for each in ast.walk(tree) for node in _silent(each)}
         for node in ast.walk(tree):
             text = "" if id(node) in silent else _text(node)

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 from conftest import ROOT
+from package_messages import PACKAGE, parsed
 
 
-PACKAGE = ROOT / "jaxquad"
 ORDER = (
     "_core", "_xla", "_compile", "records", "datasets", "excitation", "models", "spectra",
     "identify", "design", "control", "loops", "simulation", "ensembles", "tuning",
@@ -21,7 +21,7 @@ def imports(path: Path) -> Iterator[tuple[str, ...]]:
     """The absolute names of the modules of this package that a file imports."""
     own = path.relative_to(ROOT).with_suffix("").parts
     package = own[:-1]
-    for node in ast.walk(ast.parse(path.read_text())):
+    for node in ast.walk(parsed(path)):
         if isinstance(node, ast.ImportFrom):
             base = package[: len(package) - node.level + 1] if node.level else ()
             yield (*base, *(node.module or "").split(".")) if node.module else base
@@ -57,9 +57,10 @@ def test_no_file_but_its_own_asks_whether_a_firmware_is_the_one():
     firmwares = {"ardupilot", "px4", "betaflight", "crazyflie"}
     for path in (path for path in FILES if "formats" not in path.parts):
         others = firmwares - ({*path.stem.split("_")} if "firmwares" in path.parts else set())
-        for node in ast.walk(ast.parse(path.read_text())):
-            words = [x.value for x in ast.walk(node) if isinstance(x, ast.Constant)]
-            assert not (isinstance(node, ast.Compare) and others & {*words}), (path, node.lineno)
+        for node in ast.walk(parsed(path)):
+            if isinstance(node, ast.Compare):
+                words = {x.value for x in ast.walk(node) if isinstance(x, ast.Constant)}
+                assert not others & words, (path, node.lineno)
 
 
 VAGUE = {
@@ -84,7 +85,7 @@ def test_a_name_says_what_a_value_is():
     vague = [
         f"{path.relative_to(ROOT)}:{line}: {name}"
         for path in FILES
-        for line, name in (*bindings(ast.parse(path.read_text())), (0, path.stem))
+        for line, name in (*bindings(parsed(path)), (0, path.stem))
         if name.strip("_") in VAGUE
     ]
     assert not vague, "\n".join(["name the value by the field's noun:", *vague])

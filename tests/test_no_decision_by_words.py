@@ -5,9 +5,9 @@ from collections.abc import Iterator
 
 import pytest
 from conftest import ROOT
+from package_messages import PACKAGE, parsed
 
 
-PACKAGE = ROOT / "jaxquad"
 OF_JAX = ("_xla", "_compile")  # errors of JAX say by their text alone what they are
 TEXTS = {
     "error",
@@ -87,7 +87,7 @@ def test_no_code_decides_by_the_words_of_a_message():
         f"{path.relative_to(ROOT)}:{node.lineno}: {ast.unparse(node)}"
         for path in sorted(PACKAGE.rglob("*.py"))
         if path.relative_to(PACKAGE).parts[0] not in OF_JAX
-        for node in decisions(ast.parse(path.read_text()))
+        for node in decisions(parsed(path))
     ]
     assert not found
 

@@ -195,14 +195,25 @@ class _Program:
 
     def _find(self, arrays: Sequence[Numbers], folder: Path) -> _Call:
         """From the disk or the compiler; by `jax.jit` where it has no name."""
-        name = self._name(arrays)
+        structure, others = self._settings
+        args = jax.tree.unflatten(structure, _together(arrays, others))
+        name = _name(self._function, self._options(), args)
         if name is None:
             return self._by_jit
         path = folder / name
         program = _read(path, len(arrays)) if path.is_file() else None
         if program is not None:
             return program
-        lowered, form = self._lower(name, arrays)
+        forms: list[_Form] = []
+
+        def traced(arrays: Sequence[Any]) -> list[Any]:
+            results, form = self._run(arrays)
+            forms.append(form)
+            return results
+
+        traced.__name__ = _stem(name)  # JAX's own files of a program begin with it
+        jit = jax.jit(traced, compiler_options=self._options() or None)
+        lowered, [form, *_] = jit.lower(list(arrays)), forms
         _remove_of_jax(name)  # what JAX takes from its own files cannot be written again
         run = lowered.compile()
         _remove_of_jax(name)
@@ -212,23 +223,6 @@ class _Program:
     def _by_jit(self, arrays: Sequence[Numbers]) -> PyTree:
         results, form = self.plain(arrays)
         return form.filled(results)
-
-    def _lower(self, name: str, arrays: Sequence[Numbers]) -> tuple[jax.stages.Lowered, _Form]:
-        forms: list[_Form] = []
-
-        def run(arrays: Sequence[Any]) -> list[Any]:
-            results, form = self._run(arrays)
-            forms.append(form)
-            return results
-
-        run.__name__ = _stem(name)  # JAX's own files of a program begin with it
-        jit = jax.jit(run, compiler_options=self._options() or None)
-        return jit.lower(list(arrays)), forms[0]
-
-    def _name(self, arrays: Sequence[Numbers]) -> str | None:
-        structure, others = self._settings
-        args = jax.tree.unflatten(structure, _together(arrays, others))
-        return _name(self._function, self._options(), args)
 
 
 def _is_outermost(leaves: list) -> bool:
@@ -319,20 +313,20 @@ def _kind(array: Any) -> tuple:
     return kind.shape, kind.dtype, kind.weak_type
 
 
-def _written(leaf: object) -> object:
-    """In words, for a file's name."""
-    if not isinstance(leaf, _ARRAYS):
-        return type(leaf), leaf
-    shape, dtype, weak = _kind(leaf)
-    return shape, str(dtype), weak
-
-
 def _name(function: Callable[..., PyTree], options: dict, args: PyTree) -> str | None:
     """The file of a program; None where what it is traced from is not known by its name."""
     settings = sorted((k, v) for k, v in jax.config.values.items() if "cache" not in k)
     prefixes = ("XLA_", "JAXQUAD_K")
     environment = sorted((k, v) for k, v in os.environ.items() if k.startswith(prefixes))
-    kinds = jax.tree.map(_written, args), thread_settings(), compilers().switches()
+
+    def written(leaf: object) -> object:
+        """In words, for a file's name."""
+        if not isinstance(leaf, _ARRAYS):
+            return type(leaf), leaf
+        shape, dtype, weak = _kind(leaf)
+        return shape, str(dtype), weak
+
+    kinds = jax.tree.map(written, args), thread_settings(), compilers().switches()
     what = kinds, sorted(options.items()), settings, environment
     with io.BytesIO() as file:
         try:

@@ -87,7 +87,8 @@ def advance(
     """One step of every member that is still running."""
     trial = state.z + state.change
     normal = evaluate(trial)
-    first, finite = jnp.isinf(state.normal.cost), _finite(normal)
+    first, finite = jnp.isinf(state.normal.cost), jnp.isfinite(normal.cost)
+    finite &= jnp.all(jnp.isfinite(normal.gradient), axis=0)
     saved = state.normal.cost - normal.cost
     ratio = jnp.where(first, 0.5, saved / jnp.where(state.predicted > 0, state.predicted, 1e-300))
     accepted = finite & (first | ((state.predicted > 0) & (ratio > 1e-3)))
@@ -97,7 +98,7 @@ def advance(
     stalled = active & ((damping > 1e16) | (first & ~finite))
     taken = active & accepted
     size = jnp.where(taken & ~first, _relative(state.change, state.z), state.size)
-    moved = state._replace(
+    state = state._replace(
         z=_select(taken, trial, state.z),
         normal=Normal(*(_select(taken, *both) for both in zip(normal, state.normal, strict=True))),
         damping=jnp.where(active, damping, state.damping),
@@ -106,11 +107,7 @@ def advance(
         steps=state.steps + (active & ~first).astype(int),
         status=jnp.where(stalled, STALLED, state.status),
     )
-    return _with_next_step(moved, tolerance)
-
-
-def _with_next_step(state: Descent, tolerance: float) -> Descent:
-    """The next step, damped; the last one is taken at once, without a trial evaluation."""
+    # The next step, damped; the last one is taken at once, without a trial evaluation.
     damping = state.damping * _size(state.normal.hessian)
     hessian, gradient = _damped(state.normal.hessian, damping), state.normal.gradient
     change, definite = solve_definite(hessian, -gradient)
@@ -172,7 +169,10 @@ def minimise_on_host(
     for step in range(max_steps):
         extra = damping * max(np.max(np.diagonal(hessian)), 1e-300)
         damped = hessian + extra * np.eye(gradient.size)
-        change = -_solved(damped, gradient)
+        try:
+            change = -np.linalg.solve(damped, gradient)
+        except np.linalg.LinAlgError:
+            change = -np.linalg.lstsq(damped, gradient, rcond=None)[0]
         predicted = 0.5 * change @ (extra * change - gradient)
         short = np.max(np.abs(change) / (1 + np.abs(here.z))) <= tolerance
         last = damping <= undamped and (short or predicted <= saving * here.cost)
@@ -191,13 +191,6 @@ def minimise_on_host(
         if damping > 1e16:
             return here, STALLED, step + 1
     return here, RUNNING, max_steps
-
-
-def _solved(matrix: np.ndarray, vector: np.ndarray) -> np.ndarray:
-    try:
-        return np.linalg.solve(matrix, vector)
-    except np.linalg.LinAlgError:
-        return np.linalg.lstsq(matrix, vector, rcond=None)[0]
 
 
 def _relative(
@@ -262,7 +255,3 @@ def _damped(
     count = hessian.shape[0]
     identity = np.eye(count).reshape((count, count) + (1,) * damping.ndim)
     return hessian + damping[None, None] * identity
-
-
-def _finite(normal: Normal) -> Bool[Array, " *batch"]:
-    return jnp.isfinite(normal.cost) & jnp.all(jnp.isfinite(normal.gradient), axis=0)

@@ -122,17 +122,14 @@ def _leaves(
     if jax.tree_util.all_leaves([tree]):
         yield at, tree, rank
         return
-    ranks = _declared(tree)
+    ranks: dict[str | None, int] = {}
+    if isinstance(tree, eqx.Module):
+        fields = dataclasses.fields(tree)
+        ranks |= {x.name: x.metadata[_KEY] for x in fields if _KEY in x.metadata}
     children, _ = jax.tree_util.tree_flatten_with_path(tree, is_leaf=lambda x: x is not tree)
     for path, child in children:
         name = path[0].name if isinstance(path[0], jax.tree_util.GetAttrKey) else None
         yield from _leaves(child, ranks.get(name, rank), at + path)
-
-
-def _declared(tree: PyTree) -> dict[str | None, int]:
-    if not isinstance(tree, eqx.Module):
-        return {}
-    return {x.name: x.metadata[_KEY] for x in dataclasses.fields(tree) if _KEY in x.metadata}
 
 
 def _name(tree: PyTree, path: KeyPath) -> str:
@@ -196,13 +193,11 @@ def pick_gain(
         raise ValueError(
             f"member is {member}, but the ensemble has the shape {ensemble}: give one index each."
         )
-    return gain[axis][tuple(map(_index, members, ensemble))]
-
-
-def _index(member: Member, size: int) -> Member:
-    if isinstance(member, int) and not 0 <= member < size and size > 1:
-        raise ValueError(f"member is {member}, but the ensemble's are 0 to {size - 1}.")
-    return 0 if size == 1 else member
+    for one, size in zip(members, ensemble, strict=True):
+        if isinstance(one, int) and not 0 <= one < size and size > 1:
+            raise ValueError(f"member is {one}, but the ensemble's are 0 to {size - 1}.")
+    pairs = zip(members, ensemble, strict=True)
+    return gain[axis][tuple(0 if size == 1 else one for one, size in pairs)]
 
 
 def require_common_shape(gains: Mapping[str, Array]) -> None:

@@ -257,43 +257,25 @@ def number(value: Any, kind: np.dtype) -> str:
 
 
 def statements(jaxpr: ClosedJaxpr, args: Sequence[str], prefix: str) -> tuple[list[str], list[str]]:
-    """The lines that compute a jaxpr of scalars, and what its results are called.
-
-    The arguments are called `args`; what is new begins with the `prefix`.
-    """
-    return _Writer(prefix).write(jaxpr, args)
-
-
-class _Writer:
-    def __init__(self, prefix: str):
-        self.prefix = prefix
-        self.lines: list[str] = []
-
-    def write(self, jaxpr: ClosedJaxpr, args: Sequence[str]) -> tuple[list[str], list[str]]:
-        body = jaxpr.jaxpr
-        names = dict(zip(body.invars, args, strict=True))
-        for v, value in zip(body.constvars, jaxpr.consts, strict=True):
-            names[v] = number(value, v.aval.dtype)  # pyright: ignore[reportAttributeAccessIssue]
-        source = {v: equation for equation in body.eqns for v in equation.outvars}
-        for equation in _in_order(body.outvars, source):
-            self._statement(equation, names, source)
-        return self.lines, [_name(v, names) for v in body.outvars]
-
-    def _statement(self, equation: JaxprEqn, names: dict[Var, str], source: Source) -> None:
-        name, args = _shortened(equation, source)
-        [out] = equation.outvars
+    """The lines that compute a jaxpr of scalars `args`, and what its results are called; what is
+    new begins with the `prefix`."""
+    body, lines = jaxpr.jaxpr, list[str]()
+    names = dict(zip(body.invars, args, strict=True))
+    for v, value in zip(body.constvars, jaxpr.consts, strict=True):
+        names[v] = number(value, v.aval.dtype)  # pyright: ignore[reportAttributeAccessIssue]
+    source = {v: equation for equation in body.eqns for v in equation.outvars}
+    for equation in _in_order(body.outvars, source):
+        (name, operands), [out] = _shortened(equation, source), equation.outvars
         kind = type_of(out.aval.dtype)  # pyright: ignore[reportAttributeAccessIssue]
-        text = EXPRESSIONS[name](kind, equation.params, *(_name(v, names) for v in args))
-        names[out] = f"{self.prefix}{len(self.lines)}"
-        self.lines.append(f"const {kind} {names[out]} = {text};")
+        text = EXPRESSIONS[name](kind, equation.params, *(_name(v, names) for v in operands))
+        names[out] = f"{prefix}{len(lines)}"
+        lines.append(f"const {kind} {names[out]} = {text};")
+    return lines, [_name(v, names) for v in body.outvars]
 
 
 def _in_order(results: Sequence[Any], source: Source) -> list[JaxprEqn]:
-    """Each equation just before the first result that needs it.
-
-    A compiler keeps the order of a long text to some degree: numbers that are computed late are
-    held in registers for a shorter time.
-    """
+    """Each equation just before the first result that needs it: numbers that are computed late are
+    held in registers for a shorter time."""
     ordered: dict[int, JaxprEqn] = {}
     for v in results:
         open_ = [source[v]] if isinstance(v, Var) and v in source else []
@@ -310,14 +292,11 @@ def _in_order(results: Sequence[Any], source: Source) -> list[JaxprEqn]:
 
 
 def _shortened(equation: JaxprEqn, source: Source) -> tuple[str, list]:
-    """The name in `EXPRESSIONS` of what an operation is, and what that is given.
-
-    Small groups, as derivatives make them, are one expression.
-    """
+    """The name in `EXPRESSIONS`, and operands, of an operation or of a small group of them, as
+    derivatives make it."""
     name = equation.primitive.name
-    rule = _RULES.get(name)
-    rule_result = None if rule is None else rule(equation.invars, source)
-    return (name, equation.invars) if rule_result is None else rule_result
+    group = _RULES[name](equation.invars, source) if name in _RULES else None
+    return group or (name, equation.invars)
 
 
 def _slope_of_clamp(operands: list, source: Source) -> tuple[str, list] | None:

@@ -7,7 +7,7 @@ goes in is bounded; all else is compiled as any other program.
 """
 
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any, NamedTuple, TypeGuard
+from typing import Any, TypeGuard
 
 import equinox as eqx
 import jax
@@ -168,10 +168,8 @@ def _owner(x: ir.Value) -> Op | ir.Block:
 
 
 def _forward_passes(call: Op, program: mlir.ModuleContext) -> Iterator[Op]:
-    """The calls whose results a call takes, without their marks where nothing else was asked of.
-
-    What is in a function takes them as its arguments; its forward pass is in one written before.
-    """
+    """The calls whose results a call takes. What is in a function takes them as its arguments; its
+    forward pass is in one written before."""
     owners = [_owner(operand) for operand in call.operands]
     yield from filter(_is_plain_call, owners)
     alone = isinstance(program.axis_context, mlir.ShardingContext)  # then all functions are for one
@@ -258,60 +256,67 @@ def evaluate_once(function: Callable[..., PyTree], *, least: int) -> Callable[..
         leaves, structure = jax.tree.flatten(args)
         flat = lambda *xs: function(*jax.tree.unflatten(structure, xs))
         closed, shape = jax.make_jaxpr(flat, return_shape=True)(*leaves)
-        values = _evaluate(closed.jaxpr, closed.consts, leaves, _Computed(least, {}))
+        values = _Once(least).evaluate(closed.jaxpr, closed.consts, leaves)
         return jax.tree.unflatten(jax.tree.structure(shape), values)
 
     return run
 
 
-class _Computed(NamedTuple):
-    """What has been computed, of arrays of so many elements at least."""
+class _Once:
+    """Evaluates jaxprs, and remembers what it has computed: slopes by different parameters were
+    traced apart, and what they share has to be found again."""
 
-    least: int
-    values: dict[tuple, tuple[Sequence[Value], list[Value]]]
+    def __init__(self, least: int):
+        self.least, self.computed = least, dict[tuple, tuple[Sequence[Value], list[Value]]]()
 
+    def evaluate(self, jaxpr: Jaxpr, consts: Sequence[Value], args: Sequence[Value]) -> list[Value]:
+        values = dict(zip(jaxpr.constvars, consts, strict=True))
+        values.update(zip(jaxpr.invars, args, strict=True))
+        read = lambda var: var.val if isinstance(var, Literal) else values[var]
+        for equation in jaxpr.eqns:
+            results = self._apply(equation, [read(var) for var in equation.invars])
+            values.update(zip(equation.outvars, results, strict=True))
+        return [read(var) for var in jaxpr.outvars]
 
-def _evaluate(
-    jaxpr: Jaxpr, consts: Sequence[Value], args: Sequence[Value], computed: _Computed
-) -> list[Value]:
-    values = dict(zip(jaxpr.constvars, consts, strict=True))
-    values.update(zip(jaxpr.invars, args, strict=True))
-    read = lambda var: var.val if isinstance(var, Literal) else values[var]
-    for equation in jaxpr.eqns:
-        results = _apply(equation, [read(var) for var in equation.invars], computed)
-        values.update(zip(equation.outvars, results, strict=True))
-    return [read(var) for var in jaxpr.outvars]
+    def _apply(self, equation: JaxprEqn, args: list[Value]) -> list[Value]:
+        name, params = equation.primitive.name, equation.params
+        sizes = [getattr(var.aval, "size", 0) for var in equation.outvars]
+        if name in _INLINED:
+            inner = params[_INLINED[name]]
+            is_marked = (equation.ctx.xla_metadata or {}).get("inlineable") == "false"
+            if is_marked and max(sizes) >= _LARGE:  # by `no_fuse`, and longer than a call
+                return self._once(("call", id(inner)), args, lambda: _bind(equation, args))
+            return self.evaluate(inner.jaxpr, inner.consts, args)
+        if equation.primitive.multiple_results:
+            return _bind(equation, args)
 
+        def compute() -> list[Value]:
+            if sizes[0] < self.least:
+                return _bind(equation, args)
+            if name == "div" and jnp.iscomplexobj(args[1]):
+                return [args[0] * self._reciprocal(args[1])]
+            if name == "integer_pow" and params["y"] < 0 and jnp.iscomplexobj(args[0]):
+                return [jax.lax.integer_pow(self._reciprocal(args[0]), -params["y"])]
+            if name in _COSTLY:
+                return [no_fuse(lambda *xs: _bind(equation, xs)[0], *args)]
+            return _bind(equation, args)
 
-def _apply(equation: JaxprEqn, args: list[Value], computed: _Computed) -> list[Value]:
-    name, params = equation.primitive.name, equation.params
-    if name in _INLINED:
-        inner = params[_INLINED[name]]
-        if _stays_a_call(equation):
-            return _remembered(("call", id(inner)), args, computed, lambda: _bind(equation, args))
-        return _evaluate(inner.jaxpr, inner.consts, args, computed)
-    if equation.primitive.multiple_results:
-        return _bind(equation, args)
-    return _remembered(
-        (name, str(params)), args, computed, lambda: [_single(equation, args, computed)]
-    )
+        return self._once((name, str(params)), args, compute)
 
+    def _once(
+        self, what: tuple, args: Sequence[Value], compute: Callable[[], list[Value]]
+    ) -> list[Value]:
+        key = (*what, *map(_key_of, args))
+        if key not in self.computed:
+            self.computed[key] = args, compute()  # holding the arguments keeps their ids their own
+        return self.computed[key][1]
 
-def _stays_a_call(equation: JaxprEqn) -> bool:
-    """Whether `no_fuse` keeps apart what takes longer than a call."""
-    sizes = [var.aval.size for var in equation.outvars]  # pyright: ignore[reportAttributeAccessIssue]
-    is_marked = (equation.ctx.xla_metadata or {}).get("inlineable") == "false"
-    return is_marked and max(sizes) >= _LARGE
+    def _reciprocal(self, value: Value) -> Value:
+        def reciprocal(value: Value) -> Value:
+            squared = jnp.real(value) ** 2 + jnp.imag(value) ** 2
+            return jax.lax.complex(jnp.real(value) / squared, -jnp.imag(value) / squared)
 
-
-def _remembered(
-    what: tuple, args: Sequence[Value], computed: _Computed, compute: Callable[[], list[Value]]
-) -> list[Value]:
-    """The slopes by each parameter were traced apart: what they share has to be found again."""
-    key = (*what, *(_key_of(arg) for arg in args))
-    if key not in computed.values:
-        computed.values[key] = args, compute()  # holding the arguments keeps their ids their own
-    return computed.values[key][1]
+        return self._once(("reciprocal",), [value], lambda: [no_fuse(reciprocal, value)])[0]
 
 
 def _key_of(arg: Value) -> Value:
@@ -320,31 +325,9 @@ def _key_of(arg: Value) -> Value:
     return (str(arg.dtype), repr(arg.item())) if is_number else id(arg)
 
 
-def _single(equation: JaxprEqn, args: list[Value], computed: _Computed) -> Value:
-    name, params = equation.primitive.name, equation.params
-    if equation.outvars[0].aval.size < computed.least:  # pyright: ignore[reportAttributeAccessIssue]
-        return _bind(equation, args)[0]
-    if name == "div" and jnp.iscomplexobj(args[1]):
-        return args[0] * _reciprocal_of(args[1], computed)
-    if name == "integer_pow" and params["y"] < 0 and jnp.iscomplexobj(args[0]):
-        return jax.lax.integer_pow(_reciprocal_of(args[0], computed), -params["y"])
-    if name in _COSTLY:
-        return no_fuse(lambda *xs: _bind(equation, xs)[0], *args)
-    return _bind(equation, args)[0]
-
-
 def _bind(equation: JaxprEqn, args: Sequence[Value]) -> list[Value]:
     bound = equation.primitive.get_bind_params(equation.params)
     functions, params = bound if isinstance(bound, tuple) else ((), bound)  # before jax 0.10, both
     with equation.ctx.manager:  # without it `no_fuse` would be lost
         results = equation.primitive.bind(*functions, *args, **params)
     return list(results) if equation.primitive.multiple_results else [results]
-
-
-def _reciprocal_of(value: Any, computed: _Computed) -> Value:
-    return _remembered(("reciprocal",), [value], computed, lambda: [no_fuse(_reciprocal, value)])[0]
-
-
-def _reciprocal(value: Value) -> Value:
-    squared = jnp.real(value) ** 2 + jnp.imag(value) ** 2
-    return jax.lax.complex(jnp.real(value) / squared, -jnp.imag(value) / squared)

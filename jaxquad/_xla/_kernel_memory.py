@@ -82,11 +82,8 @@ def rows_of(
 
 
 class Tile(NamedTuple):
-    """Numbers of one type of each carry of a loop at several times, for a kernel's own use.
-
-    In memory a block's threads are beside each other, and then a time's numbers: what a thread
-    reads at a time lies at fixed distances. What is `shared` is a block's own, and goes with it.
-    """
+    """Numbers of one type of each carry of a loop at several times, for a kernel's own use: a
+    block's threads, then a time's numbers. What is `shared` is a block's own, and goes with it."""
 
     name: str
     kind: np.dtype
@@ -146,10 +143,7 @@ def tiles_of(loop: Loop, prefix: str, times: int, *, shared: bool = False) -> li
 
 
 class InBlock:
-    """Numbers in double precision that a thread holds in its block's memory, if it is to do so.
-
-    They are read and written there each time (`volatile`).
-    """
+    """Numbers in double precision that a thread holds in its block's memory, if it is to do so."""
 
     def __init__(self, is_used: bool):
         self.is_used, self._count = is_used, 0
@@ -238,10 +232,7 @@ def run(
     loop: Loop, lines: Lines, inputs: tuple[Sequence[Rows | Tile], Flat],
     outputs: tuple[Sequence[Rows | Tile], Sequence[Shaped]], shared: int = 0,
 ) -> Flat:  # fmt: skip
-    """What a kernel of these lines makes of arguments and writes to results.
-
-    Each block has some bytes of its own.
-    """
+    """What a kernel of these lines makes of arguments and writes to results."""
     parameters = [x.parameter("const ") for x in inputs[0]] + [x.parameter("") for x in outputs[0]]
     bounds = f"__launch_bounds__({BLOCK}, {BLOCKS})"
     head = f'extern "C" __global__ void {bounds} kernel({", ".join(parameters)})'

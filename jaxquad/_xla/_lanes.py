@@ -10,7 +10,6 @@ The members' axis is kept as one of length 1, so that axes have the same numbers
 sum over it is allowed, it stays undone: the result has each member's share of it.
 """
 
-import functools as ft
 import math
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -81,9 +80,11 @@ class Lanes:
         name, params = equation.primitive.name, equation.params
         if name in CALLS:
             called = params[CALLS[name]]
-            in_its_place = _known_function(called)
-            if in_its_place:
-                return [self._of_lanes(operation, *args) for operation in in_its_place]
+            first = called.eqns[0] if called.eqns else None
+            if first is not None and first.primitive.name == "name":
+                # What a kernel computes in place of a function, which tells its name first.
+                if in_its_place := FUNCTIONS.get(first.params["name"], ()):
+                    return [self._of_lanes(operation, *args) for operation in in_its_place]
             return self.call(called, args)
         if name in _KEPT:
             return args
@@ -135,14 +136,6 @@ class Lanes:
 
     def is_members(self, shape: Shape, axis: int | np.integer) -> bool:
         return shape[axis] == self.members
-
-
-def _known_function(jaxpr: ClosedJaxpr | Jaxpr) -> tuple[Primitive, ...]:
-    """What a kernel computes in place of a function, which tells its name first."""
-    first = jaxpr.eqns[0] if jaxpr.eqns else None
-    if first is None or first.primitive.name != "name":
-        return ()
-    return FUNCTIONS.get(first.params["name"], ())
 
 
 def numbers(shape: Shape, members: int) -> int:
@@ -420,14 +413,13 @@ def _cond(lanes: Lanes, equation: JaxprEqn, index: Cells, *args: Cells) -> list[
     chosen = branches[0]
     for k, branch in enumerate(branches[1:], 1):
         takes = choice if choice.dtype == bool else jax.lax.ge(choice, choice.dtype.type(k))
-        pick = ft.partial(_choose, takes)
-        chosen = [pick(new, old) for new, old in zip(branch, chosen, strict=True)]
+        selected = []
+        for new, old in zip(branch, chosen, strict=True):
+            pairs = zip(new.reshape(-1), old.reshape(-1), strict=True)
+            row = [jax.lax.select(takes, *pair) for pair in pairs]
+            selected.append(cells_of(row, new.shape))
+        chosen = selected
     return chosen
-
-
-def _choose(takes: Lane, new: Cells, old: Cells) -> Cells:
-    pairs = zip(new.reshape(-1), old.reshape(-1), strict=True)
-    return cells_of([jax.lax.select(takes, *pair) for pair in pairs], new.shape)
 
 
 @_rule("scan")
@@ -435,7 +427,12 @@ def _scan(lanes: Lanes, equation: JaxprEqn, *args: Cells) -> list[Cells]:
     """A loop of a few iterations, one after the other."""
     params, length = equation.params, equation.params["length"]
     _require(length <= _LONGEST, f"a loop of {length} iterations within a sample")
-    n, m = _counts(equation)
+    # Its names for the numbers of constants and carries differ between JAX versions. What is
+    # scanned has one axis less in the body.
+    rank, body = lambda v: len(v.aval.shape), params["jaxpr"].jaxpr
+    alike = lambda outer, inner: sum(rank(a) == rank(b) for a, b in zip(outer, inner, strict=True))
+    m = alike(equation.outvars, body.outvars)
+    n = alike(equation.invars, body.invars) - m
     consts, carry, xs = args[:n], list(args[n : n + m]), args[n + m :]
     stored: list[list[Cells]] = []
     order = range(length - 1, -1, -1) if params["reverse"] else range(length)
@@ -445,17 +442,6 @@ def _scan(lanes: Lanes, equation: JaxprEqn, *args: Cells) -> list[Cells]:
         stored.append(out[m:])
     rows = stored[::-1] if params["reverse"] else stored
     return [*carry, *(np.stack(column) for column in zip(*rows, strict=True))]
-
-
-def _counts(equation: JaxprEqn) -> tuple[int, int]:
-    """How many constants a scan has, and carries: its names for these differ between JAX versions.
-
-    What is scanned has one axis less in the body.
-    """
-    rank, body = lambda v: len(v.aval.shape), equation.params["jaxpr"].jaxpr
-    kept = lambda outer, inner: sum(rank(a) == rank(b) for a, b in zip(outer, inner, strict=True))
-    carry = kept(equation.outvars, body.outvars)
-    return kept(equation.invars, body.invars) - carry, carry
 
 
 def _keep_apart(lanes: Lanes, equation: JaxprEqn, axes: Sequence[int | np.integer]) -> None:

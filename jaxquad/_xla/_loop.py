@@ -22,17 +22,12 @@ from ._cuda_text import EXPRESSIONS
 from ._lanes import as_cells, CALLS, cells_of, Lane, Lanes, NotInLanes, NUMBERS, numbers
 
 
-# How often the forward kernel of a time loop keeps the carry for the reverse one.
-#
-# The reverse kernel computes the samples between two kept carries once more, and puts their
-# carries down until it comes back to them. In the memory that a processor of the GPU shares among
-# its threads they cost next to nothing, but few have room there: so carries are kept as often as a
-# part of the device's memory allows. Where that is not often enough, they are kept every
-# sqrt(samples) samples, and put down in the device's memory.
-#
-# What a thread holds from sample to sample (constants, the sums of their cotangents, the carry's
-# cotangents) goes to the shared memory first where its registers have no room for it, as in double
-# precision: what the compiler has no register for it puts down in memory that is slow.
+# The reverse kernel computes the samples between two kept carries once more. In the memory that a
+# processor of the GPU shares among its threads their carries cost next to nothing, but few have
+# room there: so carries are kept as often as a part of the device's memory allows. Where that is
+# not often enough, they are kept every sqrt(samples) samples, and put down in the device's memory.
+# What a thread holds from sample to sample goes to the shared memory first where its registers have
+# no room for it, as in double precision.
 
 _LEAST = 2  # samples: a carry is then written in less time than a sample takes
 _SHARE = 0.15  # of the device's free memory, for what is kept: a program may have some loops
@@ -59,10 +54,7 @@ class Segments(NamedTuple):
 
 
 def segments_of(count: int, carry: int, members: int, block: int, shared: int = 0) -> Segments:
-    """For `members` whose carry has so many bytes, in blocks of so many threads.
-
-    `held` are the bytes of each that `held_bytes` found.
-    """
+    """For `members` whose carry has so many bytes; `shared` are those that `held_bytes` found."""
     room = _memory()[0]
     most = (_shared_by_block() - shared * block) // max(carry * block, 1)
     length = max(_LEAST, math.ceil(count * carry * members / (_SHARE * room))) if room else count
@@ -72,11 +64,8 @@ def segments_of(count: int, carry: int, members: int, block: int, shared: int = 
 
 
 def held_bytes(in_registers: int, of_eight: int, block: int) -> int:
-    """Bytes of a thread that go to shared memory, of those that it holds from sample to sample.
-
-    `of_eight` are those of numbers with eight bytes. None where registers have room for all, and
-    where that memory has none.
-    """
+    """Bytes of a thread, of those in numbers of eight bytes, that go to shared memory; 0 where
+    registers have room for all, and where that memory has none."""
     registers = in_registers // 4
     return of_eight if registers > _HELD and of_eight * block <= _shared_by_block() else 0
 

@@ -36,28 +36,16 @@ def launch(
     text: str, name: str, args: Sequence[Array], outs: Sequence[Any], threads: int, block: int,
     shared: int,
 ) -> list[Array]:  # fmt: skip
-    """What the kernel `name` of a text in CUDA C writes to `outs`, [`block`] `threads` at a time.
-
-    Its parameters are pointers to the arguments and then to the results. A block has so many bytes
-    that its threads share.
-    """
+    """What the kernel `name` of a text in CUDA C, of pointers to arguments and then to results,
+    writes to `outs`; the threads of a `block` have `shared` bytes together."""
     call = jax.ffi.ffi_call("__gpu$xla.gpu.ptx", tuple(outs))
     one = np.int32(1)
-    return list(
-        call(
-            *args,
-            name=name,
-            kernel_type="ptx",
-            kernel_data=ptx_of(text, architecture()),
-            grid_x=np.int32(-(-threads // block)),
-            grid_y=one,
-            grid_z=one,
-            block_x=np.int32(block),
-            block_y=one,
-            block_z=one,
-            shared_mem_bytes=np.int32(shared),
-        )  # fmt: skip
-    )
+    results = call(
+        *args, name=name, kernel_type="ptx", kernel_data=ptx_of(text, architecture()),
+        grid_x=np.int32(-(-threads // block)), grid_y=one, grid_z=one, block_x=np.int32(block),
+        block_y=one, block_z=one, shared_mem_bytes=np.int32(shared),
+    )  # fmt: skip
+    return list(results)
 
 
 def architecture() -> str:
@@ -116,9 +104,5 @@ def _places() -> Iterator[str]:
     spec = importlib.util.find_spec("nvidia")
     for folder in (spec.submodule_search_locations or ()) if spec else ():
         yield from sorted(map(str, pathlib.Path(folder).glob("**/libnvrtc.so.*")), reverse=True)
-    yield from (
-        "libnvrtc.so.13",
-        "libnvrtc.so.12",
-        "libnvrtc.so",
-        "/usr/local/cuda/lib64/libnvrtc.so",
-    )
+    yield from ("libnvrtc.so.13", "libnvrtc.so.12", "libnvrtc.so")
+    yield "/usr/local/cuda/lib64/libnvrtc.so"

@@ -107,7 +107,9 @@ def why_not(call: Op, module: ir.Module) -> str | None:
     """What `call` takes, leads to or returns that a kernel cannot hold; None if all of it fits."""
     functions = {text(f, "sym_name"): f.operation for f in module.body.operations}
     for value in (*call.operands, *call.results):
-        if not _holds_numbers(value.type):
+        array = ir.RankedTensorType(value.type)
+        real = isinstance(array.element_type, ir.FloatType | ir.IntegerType)
+        if not (real and array.has_static_shape and size_of(value.type) > 0):
             return f"values of {value.type}"
     try:
         count, wide = _count(text(call, "callee"), functions, {})
@@ -120,13 +122,6 @@ def why_not(call: Op, module: ir.Module) -> str | None:
 
 class _DoesNotFit(Exception):
     pass
-
-
-def _holds_numbers(kind: ir.Type) -> bool:
-    """Whether these are real numbers, integers or booleans, at least one of them."""
-    array = ir.RankedTensorType(kind)
-    real = isinstance(array.element_type, ir.FloatType | ir.IntegerType)
-    return real and array.has_static_shape and size_of(kind) > 0
 
 
 def text(op: Op, attribute: str) -> str:
@@ -155,10 +150,8 @@ def _count(name: str, functions: Mapping[str, Op], counted: dict[str, _Counts]) 
 
 
 def calls_within(name: str, what: str, module: ir.Module) -> list[Op]:
-    """In a function and all it calls: the calls of functions whose name begins with `what`.
-
-    Without those that are given nothing, which are done before the program runs.
-    """
+    """In a function and all it calls: the calls of functions whose name begins with `what`; those
+    that are given nothing are done before the program runs."""
     functions = {text(f, "sym_name"): f.operation for f in module.body.operations}
     calls_found, open_ = [], [name]
     for name in open_:

@@ -8,38 +8,25 @@ from jaxquad._core import Number, write_file
 from jaxquad.records import AXES
 
 from ._firmware import firmware_named, joined_lines, number_text, Parameter
-from ._parameters import check_ranges, find_parameter, PARAMETERS, store_parameters
+from ._parameters import check_ranges, PARAMETERS, store_parameters
 
 
 class ParameterChange(NamedTuple):
-    """One parameter, from what flew to what is proposed, as the firmware stores both.
-
-    **Arguments:**
-
-    - `parameter`: its row of `jq.autopilot.PARAMETERS`.
-    - `old`, `new`: the values.
-    - `reason`: why it changes; may be empty.
-    """
+    """One parameter, from what flew to what is proposed, as the firmware stores both."""
 
     parameter: Parameter
     old: float
     new: float
-    reason: str = ""
+    reason: str = ""  # why it changes
 
 
 class WordChange(NamedTuple):
-    """A parameter of Betaflight that holds a word, such as pid_type.
-
-    **Arguments:**
-
-    - `name`: as the CLI calls it; `old`, `new`: its words.
-    - `reason`: why it changes; may be empty.
-    """
+    """A parameter of Betaflight that holds a word, such as pid_type."""
 
     name: str
     old: str
     new: str
-    reason: str = ""
+    reason: str = ""  # why it changes
 
 
 def propose_changes(
@@ -54,18 +41,15 @@ def propose_changes(
 ) -> tuple[ParameterChange, ...]:
     """What changes between two sets of parameters once both are stored by the firmware.
 
+    The changes are in the order of the firmware's table, without those that rounding undoes.
+
     **Arguments:**
 
-    - `firmware`: "betaflight", "px4", "ardupilot" or "crazyflie".
     - `old`: what flew, by name; `new`: what is wanted. Names that are in `old` alone stay.
     - `share`: how much of the way to go, above 0 and at most 1: 1/3 for a first flight.
     - `reasons`: by name.
     - `beyond`: names that may lie beyond their documented range.
     - `at_once`: names that go all of the way at any share, such as a notch that is switched on.
-
-    **Returns:**
-
-    The changes, in the order of the firmware's table; without those that rounding undoes.
 
     **Raises:**
 
@@ -85,14 +69,11 @@ def propose_changes(
     outside = {name: value for name, value in stored.items() if name not in beyond}
     if said := check_ranges(firmware, outside):
         raise ValueError(f"{' '.join(said)} Allow it with beyond=, or change it.")
-    before = store_parameters(firmware, {name: old[name] for name in new})
-    why = reasons or {}
-    names = [name for name in PARAMETERS[firmware] if stored.get(name) != before.get(name)]
+    before, why = store_parameters(firmware, {name: old[name] for name in new}), reasons or {}
     return tuple(
-        ParameterChange(
-            find_parameter(firmware, name), before[name], stored[name], why.get(name, "")
-        )
-        for name in names
+        ParameterChange(row, before[name], stored[name], why.get(name, ""))
+        for name, row in PARAMETERS[firmware].items()
+        if stored.get(name) != before.get(name)
     )
 
 
@@ -109,19 +90,16 @@ def parameter_file(
 ) -> str:
     """The text to load: Betaflight's CLI, PX4's .params, ArduPilot's .param, Crazyflie's YAML.
 
+    The other value of each parameter is in a comment where the format allows it.
+
     **Arguments:**
 
-    - `changes`: of `propose_changes`.
     - `revert`: whether to write the old values, to go back to what flew.
     - `version`: of Betaflight, whose names differ: until 4.5 d is d_min, and the maximum d.
-    - `raised`: of Betaflight until 4.5, the axes on which d_min is in use; on others d is d.
     - `profile`: of Betaflight, the PID profile that is changed; None is the one in use.
+    - `raised`: of Betaflight until 4.5, the axes on which d_min is in use; on others d is d.
     - `title`: comment; its lines begin the file.
     - `words`: of Betaflight, what changes beside numbers; set last.
-
-    **Returns:**
-
-    The text, with the other value of each parameter in a comment where the format allows it.
 
     **Raises:**
 
@@ -149,18 +127,11 @@ def change_table(changes: Sequence[ParameterChange], words: Sequence[WordChange]
 
 
 class ParameterFiles(NamedTuple):
-    """Where a staged proposal was written.
+    """Where a staged proposal was written."""
 
-    **Arguments:**
-
-    - `stages`: a file for each share of the way, the smallest first.
-    - `revert`: back to what flew, from any of them.
-    - `table`: old, new, unit, range and reason, for each stage.
-    """
-
-    stages: tuple[Path, ...]
-    revert: Path
-    table: Path
+    stages: tuple[Path, ...]  # a file for each share of the way, the smallest first
+    revert: Path  # back to what flew, from any of them
+    table: Path  # old, new, unit, range and reason, for each stage
 
 
 def write_parameter_files(
@@ -181,12 +152,9 @@ def write_parameter_files(
 
     **Arguments:**
 
-    - `folder`: is made where it is missing.
     - `stem`: begins the files' names; the share in percent follows.
     - `shares`: of the way, each in a file of its own.
     - the others: as in `propose_changes` and `parameter_file`.
-
-    **Returns:** the `ParameterFiles`.
 
     **Raises:**
 

@@ -2,8 +2,9 @@
 
 import functools as ft
 import operator
-from collections.abc import Callable, Sequence
-from typing import NamedTuple, Protocol, runtime_checkable
+from collections.abc import Sequence
+from types import ModuleType
+from typing import ClassVar, NamedTuple, Protocol, runtime_checkable
 
 import equinox as eqx
 import jax
@@ -48,14 +49,27 @@ class Filter(Protocol):
 _PT2, _PT3 = 1.553773974, 1.961459177  # cutoff of each pole over that of the whole, at -3 dB
 
 
-def first_order(cutoff_hz: Float[Array, "..."], rate_hz: float) -> Section:
+def _first_order(cutoff_hz: Float[Array, "..."], rate_hz: float) -> Section:
     """x += k (u - x) with k = w/(w + 1), w = 2 pi cutoff/rate; PX4's and ArduPilot's alpha is k."""
     w = 2 * np.pi * cutoff_hz / rate_hz
     k = w / (w + 1)
     return Section(k, jnp.zeros_like(k), k - 1)
 
 
-class PT1(eqx.Module):
+class _LowPass(eqx.Module):
+    cutoff_hz: Float[Array, "..."] = per_member(rank=1, converter=as_float)
+    kind: ClassVar[str]
+    may_be_off: ClassVar[bool] = False  # with a cutoff of 0
+
+    def __check_init__(self):
+        if not self.may_be_off:
+            require_positive("cutoff_hz", self.cutoff_hz, "leave the filter out to switch it off")
+
+    def in_words(self) -> str:
+        return f"{self.kind} {_listed(self.cutoff_hz)} Hz"
+
+
+class PT1(_LowPass):
     """A first-order low-pass by backward differences: Betaflight's pt1, PX4's AlphaFilter.
 
     ArduPilot's FLTT, FLTE and FLTD are the same. A cutoff of 0 lets everything pass.
@@ -65,59 +79,42 @@ class PT1(eqx.Module):
     - `cutoff_hz`: one value, one per axis, or `[axes, *ensemble]`; 0 is off.
     """
 
-    cutoff_hz: Float[Array, "..."] = per_member(rank=1, converter=as_float)
+    kind = "pt1"
+    may_be_off = True
 
     def sections(self, rate_hz: float) -> tuple[Section, ...]:
         on = self.cutoff_hz > 0
-        section = first_order(jnp.where(on, self.cutoff_hz, 1.0), rate_hz)
+        section = _first_order(jnp.where(on, self.cutoff_hz, 1.0), rate_hz)
         b0 = jnp.where(on, section.b0, 1.0)
         return (section._replace(b0=b0, a1=b0 - 1),)
 
-    def in_words(self) -> str:
-        return f"pt1 {_listed(self.cutoff_hz)} Hz"
 
-
-class PT2(eqx.Module):
+class PT2(_LowPass):
     """Two equal first-order low-passes, together -3 dB at `cutoff_hz`: Betaflight's pt2."""
 
-    cutoff_hz: Float[Array, "..."] = per_member(rank=1, converter=as_float)
-
-    def __check_init__(self):
-        require_positive("cutoff_hz", self.cutoff_hz, "leave the filter out to switch it off")
+    kind = "pt2"
 
     def sections(self, rate_hz: float) -> tuple[Section, ...]:
-        return (first_order(_PT2 * self.cutoff_hz, rate_hz),) * 2
-
-    def in_words(self) -> str:
-        return f"pt2 {_listed(self.cutoff_hz)} Hz"
+        return (_first_order(_PT2 * self.cutoff_hz, rate_hz),) * 2
 
 
-class PT3(eqx.Module):
+class PT3(_LowPass):
     """Three equal first-order low-passes, together -3 dB at `cutoff_hz`: Betaflight's pt3."""
 
-    cutoff_hz: Float[Array, "..."] = per_member(rank=1, converter=as_float)
-
-    def __check_init__(self):
-        require_positive("cutoff_hz", self.cutoff_hz, "leave the filter out to switch it off")
+    kind = "pt3"
 
     def sections(self, rate_hz: float) -> tuple[Section, ...]:
-        return (first_order(_PT3 * self.cutoff_hz, rate_hz),) * 3
-
-    def in_words(self) -> str:
-        return f"pt3 {_listed(self.cutoff_hz)} Hz"
+        return (_first_order(_PT3 * self.cutoff_hz, rate_hz),) * 3
 
 
-class Butterworth(eqx.Module):
+class Butterworth(_LowPass):
     """The second-order Butterworth low-pass by the bilinear transform, exact at its cutoff.
 
     It is PX4's, ArduPilot's and the Crazyflie's LowPassFilter2p, and Betaflight's biquad (quality
     1/sqrt(2)) and state-variable low-pass.
     """
 
-    cutoff_hz: Float[Array, "..."] = per_member(rank=1, converter=as_float)
-
-    def __check_init__(self):
-        require_positive("cutoff_hz", self.cutoff_hz, "leave the filter out to switch it off")
+    kind = "Butterworth 2"
 
     def sections(self, rate_hz: float) -> tuple[Section, ...]:
         _require_below_nyquist("cutoff_hz", self.cutoff_hz, rate_hz)
@@ -126,9 +123,6 @@ class Butterworth(eqx.Module):
         b0 = w**2 / c
         a1, a2 = 2 * (w**2 - 1) / c, (1 - np.sqrt(2.0) * w + w**2) / c
         return (Section(b0, 2 * b0, a1, b0, a2),)
-
-    def in_words(self) -> str:
-        return f"Butterworth 2 {_listed(self.cutoff_hz)} Hz"
 
 
 class Notch(eqx.Module):
@@ -286,62 +280,25 @@ def run_sections(
     return tuple(after), sample
 
 
-def run_between(
-    groups: Sequence[Sequence[Section]],
-    memories: Sequence[Memory],
-    before: Array,
-    sample: Array,
-    count: int,
-) -> tuple[tuple[Memory, ...], tuple[Array, ...]]:
-    """`count` samples on the straight line from `before` (left out) to `sample`, through groups.
-
-    Each group of sections takes what the one before it gives. Returns what the groups remember,
-    and the last sample of each.
-    """
-
-    def advance(memories: Sequence[Memory], part: Array):
-        now, after, passed = before + part * (sample - before), [], []
-        for sections, memory in zip(groups, memories, strict=True):
-            memory, now = run_sections(sections, memory, now)
-            after.append(memory)
-            passed.append(now)
-        return tuple(after), tuple(passed)
-
-    parts = jnp.arange(1, count + 1, dtype=sample.dtype) / count
-    if count <= _UNROLLED:
-        passed = (sample,) * len(groups)
-        for k in range(count):
-            memories, passed = advance(memories, parts[k])
-        return tuple(memories), passed
-    memories, passed = jax.lax.scan(advance, tuple(memories), parts)
-    return memories, tuple(x[-1] for x in passed)
-
-
-_UNROLLED = 2
-
-
 Values = Array | np.ndarray
 
 
 def _response(sections: Sequence[Section], frequency_hz: Array, rate_hz: float) -> Array:
-    back, parts = _section_responses(sections, frequency_hz, rate_hz)
-    return jnp.asarray(ft.reduce(operator.mul, parts, 0 * back + 1))
+    _, parts = _section_responses(sections, frequency_hz, rate_hz)
+    return jnp.asarray(ft.reduce(operator.mul, parts))
 
 
 def _delay_ms(sections: Sequence[Section], frequency_hz: Array, rate_hz: float) -> Array:
     """Section by section: the phase of each stays within half a turn, that of a chain does not."""
-    back, parts = _section_responses(sections, frequency_hz, rate_hz)
-    phase: Values = np.zeros(back.shape)
-    hertz = np.asarray(frequency_hz) if isinstance(back, np.ndarray) else frequency_hz
-    for part in parts:
-        phase = phase + (np.angle(part) if isinstance(part, np.ndarray) else jnp.angle(part))
-    return jnp.asarray(-1e3 * phase / (2 * np.pi * hertz))
+    xp, parts = _section_responses(sections, frequency_hz, rate_hz)
+    phase = ft.reduce(operator.add, map(xp.angle, parts))
+    return jnp.asarray(-1e3 * phase / (2 * np.pi * xp.asarray(frequency_hz)))
 
 
 def _section_responses(
     sections: Sequence[Section], frequency_hz: Array, rate_hz: float
-) -> tuple[Values, list[Values]]:
-    """1/z, and the response of each section.
+) -> tuple[ModuleType, list[Values]]:
+    """Ones, and the response of each section, and what has computed them.
 
     NumPy computes it unless something is traced: XLA would compile for each number of frequencies.
     """
@@ -352,18 +309,17 @@ def _section_responses(
             "response."
         )
     if all(map(is_concrete, (*numbers, frequency_hz))):
-        back = np.exp(-2j * np.pi * np.asarray(frequency_hz) / rate_hz)
-        return back, [_rational(section, back, np.asarray) for section in sections]
-    turn = 2 * np.pi * frequency_hz / rate_hz
-    back = jax.lax.complex(jnp.cos(turn), -jnp.sin(turn))
-    return back, [_rational(section, back, jnp.asarray) for section in sections]
-
-
-def _rational(section: Section, back: Values, convert: Callable[[Array], Values]) -> Values:
-    b0, b1, a1, b2, a2 = (
-        0.0 if x is None else convert(x).reshape(()).astype(back.dtype) for x in section
-    )
-    return (b0 + back * (b1 + back * b2)) / (1 + back * (a1 + back * a2))
+        xp, back = np, np.exp(-2j * np.pi * np.asarray(frequency_hz) / rate_hz)
+    else:
+        turn = 2 * np.pi * frequency_hz / rate_hz
+        xp, back = jnp, jax.lax.complex(jnp.cos(turn), -jnp.sin(turn))
+    parts = [0 * back + 1]
+    for section in sections:
+        b0, b1, a1, b2, a2 = (
+            0.0 if x is None else xp.asarray(x).reshape(()).astype(back.dtype) for x in section
+        )
+        parts.append((b0 + back * (b1 + back * b2)) / (1 + back * (a1 + back * a2)))
+    return xp, parts
 
 
 def _require_below_nyquist(name: str, value: Array, rate_hz: float) -> None:

@@ -29,26 +29,18 @@ HOVER = 0.3  # of the throttle, where a log does not hold it
 
 
 class Parameter(NamedTuple):
-    """A parameter of a firmware, as its documentation has it.
-
-    **Arguments:**
-
-    - `name`, `unit`: as the firmware calls them.
-    - `default`: of the firmware.
-    - `low`, `high`: of the documented range; an infinity where none is documented.
-    - `integer`: whether the firmware stores a whole number; else it is a single-precision one.
-    - `field`, `axis`: of the law that it sets: ("p", 0); -1 for all axes. "angle.p" is a field of
-      the angle loop, "gyro" the cutoff of the only Butterworth low-pass of the gyro.
-    """
+    """A parameter of a firmware, as its documentation has it."""
 
     name: str
     unit: str
     default: float
-    low: float
+    low: float  # of the documented range; an infinity where none is documented
     high: float
-    integer: bool = False
+    integer: bool = False  # whether the firmware stores a whole number; else single precision
+    # Of the law that it sets: "angle.p" is a field of the angle loop, "gyro" the cutoff of the only
+    # Butterworth low-pass of the gyro.
     field: str = ""
-    axis: int = -1
+    axis: int = -1  # of that field; -1 for all
 
     @property
     def range_text(self) -> str:
@@ -83,22 +75,13 @@ class FilterOption(NamedTuple):
 
 
 class FilterChoice(NamedTuple):
-    """The options of one filter of a loop.
+    """The options of one filter of a loop."""
 
-    **Arguments:**
-
-    - `stage`: whether it acts on the gyro, and so on all terms, or on the derivative alone.
-    - `shared`: whether it acts on all axes.
-    - `rate_hz`: at which it runs.
-    - `options`: in the order of their cutoffs.
-    - `flown`: which of them flew.
-    """
-
-    stage: Stage
-    shared: bool
-    rate_hz: float
-    options: tuple[FilterOption, ...]
-    flown: int
+    stage: Stage  # the gyro, and so all terms, or the derivative alone
+    shared: bool  # whether it acts on all axes
+    rate_hz: float  # at which it runs
+    options: tuple[FilterOption, ...]  # in the order of their cutoffs
+    flown: int  # which of them flew
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -118,31 +101,19 @@ class LowPass(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class OuterLoop:
-    """The gain of an axis' angle loop, and how late it acts.
+    """The gain of an axis' angle loop, and how late it acts."""
 
-    **Attributes:**
-
-    - `name`: of the parameter; `value`: as the firmware stores it; `unit`: of it, in 1/s.
-    - `late`: s from the angle to the rate's set-point.
-    - `closed`: whether it was closed in the flight.
-    - `smooth`: filters of the rate's set-point.
-    """
-
-    name: str
-    value: float
-    unit: float
-    late: float
-    closed: bool
-    smooth: FilterChain = FilterChain()
+    name: str  # of the parameter
+    value: float  # as the firmware stores it
+    unit: float  # of it, in 1/s
+    late: float  # s from the angle to the rate's set-point
+    closed: bool  # whether it was closed in the flight
+    smooth: FilterChain = FilterChain()  # filters of the rate's set-point
 
     def path(self, omega: Float[np.ndarray, " frequencies"]) -> Complex[np.ndarray, " frequencies"]:
         """From the rate to minus the set-point, per 1/s of gain."""
         smooth = np.asarray(self.smooth.response(omega / (2 * np.pi)))
         return smooth * np.exp(-1j * omega * self.late) / (1j * omega)
-
-    def gain(self, value: float) -> float:
-        """In 1/s."""
-        return self.unit * value
 
     @classmethod
     def of(
@@ -156,24 +127,15 @@ class OuterLoop:
 
 
 class Channels(NamedTuple):
-    """Names of channels of an axis; a mix is a weighted sum of some. Empty: not logged.
+    """Names of channels of an axis; a mix is a weighted sum of some. Empty: not logged."""
 
-    **Attributes:**
-
-    - `unfiltered`: the gyro before its filters, of roll, pitch and yaw.
-    - `terms`: P, I, D and F of the command; `output`: their sum.
-    - `mixed`: what the motors made of the output.
-    - `motors`: their commands; `stick`: the throttle that filters and TPA follow.
-    - `slewed`: the share that a slew limiter leaves of P and D.
-    """
-
-    unfiltered: Sequence[str] = ()
-    terms: Sequence[str] = ()
-    motors: Sequence[str] = ()
-    output: Mapping[str, float] = {}
-    stick: Mapping[str, float] = {}
-    mixed: Mapping[str, float] = {}
-    slewed: Mapping[str, float] = {}
+    unfiltered: Sequence[str] = ()  # the gyro before its filters, of roll, pitch and yaw
+    terms: Sequence[str] = ()  # P, I, D and F of the command
+    motors: Sequence[str] = ()  # their commands
+    output: Mapping[str, float] = {}  # the sum of the terms
+    stick: Mapping[str, float] = {}  # the throttle that filters and TPA follow
+    mixed: Mapping[str, float] = {}  # what the motors made of the output
+    slewed: Mapping[str, float] = {}  # the share that a slew limiter leaves of P and D
 
 
 class Firmware(abc.ABC):
@@ -181,38 +143,23 @@ class Firmware(abc.ABC):
 
     Subclasses have `log`, `parameters` and the methods that are abstract; all others have defaults
     for what a firmware does not have. `register` makes one known.
-
-    **Attributes:**
-
-    - `log`: what its logs mean; its `name` is that of the firmware.
-    - `parameters`: by name. Those with the `fields` "p", "i" and "d" of an axis are tuned.
-    - `fields`: of the rate law, its P, I and D gains.
-    - `unit`: of the law's command; `suffix`: of parameter files.
-    - `motor_shares`: relative thrust of a motor of a quad X per unit of output, of three axes.
-    - `follows_throttle`: whether the law changes with the throttle.
-    - `averages_gyro`: whether the unfiltered rate is the mean over its sample.
-    - `thrust_curve`: the parameter that inverts the curve of thrust; `keeps_throttle`: whether it
-      inverts it for the axes alone, so that the motors get the throttle itself.
-    - `weighs_setpoint`: whether feed-forward of the set-point can stand for its weight.
-    - `notches`: the parameters of static notches, a centre and a second one each.
-    - `words`: whether some of its parameters are words; `has_adrc`: whether it can fly Betaflight's
-      proposed ADRC.
     """
 
-    log: FirmwareLog
-    parameters: Mapping[str, Parameter]
-    fields: tuple[str, str, str] = ("p", "i", "d")
-    unit: str = "command"
-    suffix: str = "param"
+    log: FirmwareLog  # what its logs mean; its `name` is that of the firmware
+    parameters: Mapping[str, Parameter]  # by name
+    fields: tuple[str, str, str] = ("p", "i", "d")  # of the rate law, which are tuned
+    unit: str = "command"  # of the law's command
+    suffix: str = "param"  # of parameter files
+    # Relative thrust of a motor of a quad X per unit of output, of three axes.
     motor_shares: tuple[float, float, float] = (1.0, 1.0, 1.0)
-    follows_throttle: bool = False
-    averages_gyro: bool = False
-    thrust_curve: str = ""
-    keeps_throttle: bool = False
-    weighs_setpoint: bool = False
-    notches: tuple[tuple[str, str], ...] = ()
-    words: bool = False
-    has_adrc: bool = False
+    follows_throttle: bool = False  # whether the law changes with the throttle
+    averages_gyro: bool = False  # whether the unfiltered rate is the mean over its sample
+    thrust_curve: str = ""  # the parameter that inverts the curve of thrust
+    keeps_throttle: bool = False  # whether for the axes alone: motors get the throttle itself
+    weighs_setpoint: bool = False  # whether feed-forward of the set-point can stand for its weight
+    notches: tuple[tuple[str, str], ...] = ()  # static ones: the parameters of centre and width
+    words: bool = False  # whether some of its parameters are words
+    has_adrc: bool = False  # whether it can fly Betaflight's proposed ADRC
 
     @abc.abstractmethod
     def flown_loop(
@@ -236,7 +183,7 @@ class Firmware(abc.ABC):
     ) -> Sequence[str]:
         """The gyro before its filters that flew, where `channels` cannot know it.
 
-        `names` are those of all channels, `median` gives that of one, 0 where it is not logged.
+        `names` are all logged ones, `median` gives that of a channel, 0 where it is not logged.
         """
         return []
 
@@ -382,9 +329,7 @@ _FIRMWARES: dict[str, Firmware] = {}
 def register(firmware: Firmware) -> None:
     """Make a firmware known: to `jq.read` and `jq.propose`, and to `jq.workflows.autopilot`.
 
-    **Arguments:**
-
-    - `firmware`: of a subclass of `Firmware`. One of the same name is replaced.
+    One of the same name is replaced.
     """
     register_log(firmware.log)
     _FIRMWARES[firmware.log.name] = firmware

@@ -11,26 +11,28 @@ from jaxquad._core import as_float, Number, pick_gain, require_positive
 from jaxquad.control import AdaptiveLADRC, LADRC, PID, ScheduledLADRC
 from jaxquad.records import AXES
 
-from ._firmware import Firmware, firmware_named
+from ._firmware import firmware_named
+from ._parameters import names_by_field
 
 
 class RateGains(NamedTuple):
-    """A rate PID, u = kp e + ki int e - kd y', of rates in rad/s.
+    """A rate PID, u = kp e + ki int e - kd y', of rates in rad/s."""
 
-    **Arguments:**
-
-    - `kp`, `ki`, `kd`: in units of u per rad/s, per rad and per rad/s^2.
-    """
-
-    kp: float
-    ki: float
-    kd: float
+    kp: float  # in units of u per rad/s
+    ki: float  # per rad
+    kd: float  # per rad/s^2
 
 
-def _names(firmware: Firmware, axis: str) -> list[str]:
-    """The parameters of P, I and D."""
-    rows, k = firmware.parameters.values(), AXES.index(axis)
-    return [next(x.name for x in rows if x.field == f and x.axis == k) for f in firmware.fields]
+def _names(firmware: str, axis: str) -> list[str]:
+    """The parameters of P, I and D. Raises ValueError for an unknown axis."""
+    names = names_by_field(firmware, _number(axis))
+    return [names[field] for field in firmware_named(firmware).fields]
+
+
+def _number(axis: str) -> int:
+    if axis not in AXES:
+        raise ValueError(f"axis is {axis!r}: give one of {', '.join(AXES)}.")
+    return AXES.index(axis)
 
 
 def rate_parameters(
@@ -52,10 +54,9 @@ def rate_parameters(
 
     - `ValueError`: the axis is unknown, or `torque_per_unit` is not above 0.
     """
-    _require_axis(axis)
+    names = _names(firmware, axis)
     require_positive("torque_per_unit", torque_per_unit, "give the plant's gain")
-    kind = firmware_named(firmware)
-    triples = zip(_names(kind, axis), gains, kind.si_scales(axis), strict=True)
+    triples = zip(names, gains, firmware_named(firmware).si_scales(axis), strict=True)
     return {name: gain * scale / torque_per_unit for name, gain, scale in triples}
 
 
@@ -71,20 +72,17 @@ def rate_gains(
 
     - `ValueError`: the axis is unknown, or a parameter is missing.
     """
-    _require_axis(axis)
-    kind = firmware_named(firmware)
-    names = _names(kind, axis)
+    names = _names(firmware, axis)
     missing = [name for name in names if name not in values]
     if missing:
         raise ValueError(f"the parameters lack {', '.join(missing)}: give P, I and D of the axis.")
-    pairs = zip(names, kind.si_scales(axis), strict=True)
+    pairs = zip(names, firmware_named(firmware).si_scales(axis), strict=True)
     return RateGains(*(values[name] / scale * torque_per_unit for name, scale in pairs))
 
 
 def motor_share(firmware: str, axis: str) -> float:
     """Relative thrust of a motor of a quad X per unit of the output that moves it."""
-    _require_axis(axis)
-    return float(firmware_named(firmware).motor_shares[AXES.index(axis)])
+    return float(firmware_named(firmware).motor_shares[_number(axis)])
 
 
 def torque_per_unit(
@@ -108,23 +106,12 @@ def torque_per_unit(
     return float(4 * lever * motor_share(firmware, axis) * thrust)
 
 
-def _require_axis(axis: str) -> None:
-    if axis not in AXES:
-        raise ValueError(f"axis is {axis!r}: give one of {', '.join(AXES)}.")
-
-
 class Cascade(NamedTuple):
-    """An angle P around a rate PI: r = p (angle error), u = rate_p e + rate_i int e.
+    """An angle P around a rate PI: r = p (angle error), u = rate_p e + rate_i int e."""
 
-    **Arguments:**
-
-    - `p`: in 1/s.
-    - `rate_p`, `rate_i`: in units of u per rad/s and per rad.
-    """
-
-    p: Float[Array, "..."]
-    rate_p: Float[Array, "..."]
-    rate_i: Float[Array, "..."]
+    p: Float[Array, "..."]  # in 1/s
+    rate_p: Float[Array, "..."]  # in units of u per rad/s
+    rate_i: Float[Array, "..."]  # in units of u per rad
 
 
 def cascade_of(
@@ -157,20 +144,13 @@ def pid_of(cascade: Cascade) -> tuple[Array, Array, Array]:
 
 
 class LADRCAsPID(NamedTuple):
-    """A second-order LADRC as a PID behind a second-order low-pass of the measurement.
-
-    **Arguments:**
-
-    - `kp`, `ki`, `kd`: of the PID.
-    - `frequency`: natural frequency of the low-pass in rad/s.
-    - `damping`: its damping ratio.
-    """
+    """A second-order LADRC as a PID behind a second-order low-pass of the measurement."""
 
     kp: Float[Array, "..."]
     ki: Float[Array, "..."]
     kd: Float[Array, "..."]
-    frequency: Float[Array, "..."]
-    damping: Float[Array, "..."]
+    frequency: Float[Array, "..."]  # natural one of the low-pass in rad/s
+    damping: Float[Array, "..."]  # its damping ratio
 
 
 def ladrc_as_pid(
@@ -211,11 +191,11 @@ def cascade_parameters(
 
     - `ValueError`: the firmware cannot express the controller; the message says what of it.
     """
-    _require_axis(axis)
+    number = _number(axis)
     if reasons := find_inexpressible(firmware, controller):
         raise ValueError(" ".join(reasons))
     assert isinstance(controller, PID)
-    at = lambda gain: pick_gain(gain, AXES.index(axis) if gain.size > 1 else 0, None)
+    at = lambda gain: pick_gain(gain, number if gain.size > 1 else 0, None)
     cascade = cascade_of(at(controller.kp), at(controller.ki), at(controller.kd))
     gains = RateGains(float(cascade.rate_p), float(cascade.rate_i), 0.0)
     rate = rate_parameters(firmware, axis, gains, torque_per_unit=torque_per_unit)
@@ -230,27 +210,25 @@ def find_inexpressible(firmware: str, controller: object) -> tuple[str, ...]:
     - `controller`: a `jq.PID` of the angle. A `LADRC` is never expressible: see `ladrc_as_pid`.
     """
     kind = firmware_named(firmware)
-    name = kind.log.title
+    name, reasons = kind.log.title, []
     if isinstance(controller, LADRC | ScheduledLADRC | AdaptiveLADRC):
         why = kind.no_ladrc()
         return (f"{name} cannot run a LADRC of the angle: {why}. Use ladrc_as_pid.",)
     if not isinstance(controller, PID):
         return (f"A {type(controller).__name__} is not known: give a jq.PID.",)
-    reasons = []
     if np.any(np.asarray(controller.derivative_weight) != 0):
         reasons.append(
             f"{name} takes its rate feedback from the measurement alone: derivative_weight must "
             "be 0."
         )
     if np.any(np.asarray(controller.proportional_weight) != 1):
+        instead = (
+            " A feed-forward of (weight - 1) times P does the same, and is negative below 1, "
+            "beyond the documented range."
+        )
         reasons.append(
             f"{name} has no weight of the set-point: proportional_weight must be 1."
-            + (
-                " A feed-forward of (weight - 1) times P does the same, and is negative below 1, "
-                "beyond the documented range."
-                if kind.weighs_setpoint
-                else ""
-            )
+            f"{instead if kind.weighs_setpoint else ''}"
         )
     if np.any(np.asarray(controller.feedforward) != 0):
         reasons.append(f"{name} feeds no angular acceleration forward: feedforward must be 0.")

@@ -28,7 +28,7 @@ from jaxquad._core import (
 )
 from jaxquad.control import LinearController, Member, Reference, Setpoint, Transform
 
-from ._filters import FilterChain, Memory, rest_of, run_between, Section
+from ._filters import FilterChain, Memory, rest_of, run_sections, Section
 
 
 DEGREES = 180 / np.pi  # per radian
@@ -75,8 +75,7 @@ class FirmwareLoop(eqx.Module):
     def init(self, like: Signal) -> LoopState:
         """At rest; shaped as the measurement `like` and the ensemble of the gains."""
         zero = jnp.zeros(signal_shape(like, self.ensemble), like.dtype)
-        terms = {name: zero for name in "PIDF"}
-        return LoopState(self.rest(zero), zero, zero, terms)
+        return LoopState(self.rest(zero), zero, zero, dict.fromkeys("PIDF", zero))
 
     def step(
         self, state: LoopState, reference: Reference, measurement: Signal
@@ -100,7 +99,8 @@ class FirmwareLoop(eqx.Module):
 
     def tunable(self) -> dict[str, Transform | None]:
         """The gains of P, I and D that are not 0."""
-        return dict.fromkeys(name for name, gain in self.gains().items() if _all_set(gain))
+        gains = self.gains().items()
+        return dict.fromkeys(name for name, gain in gains if np.all(np.asarray(gain) != 0))
 
     @abc.abstractmethod
     def gains(self) -> dict[str, Array]:
@@ -299,10 +299,6 @@ def _derivative(law: FirmwareLoop) -> LinearController:
     )
 
 
-def _all_set(gain: Array) -> bool:
-    return bool(np.all(np.asarray(gain) != 0))
-
-
 def require_gains(dt: float, gains: Mapping[str, Array], limits: Mapping[str, Array]) -> None:
     """Raises ValueError for gains that are not finite, limits below 0, shapes that do not fit."""
     require_sample_interval(dt)
@@ -326,25 +322,38 @@ def samples_between(chain: FilterChain, dt: float) -> int:
     return round(count)
 
 
+_UNROLLED = 2  # samples of the gyro, up to which a loop costs more than it saves
+
+
 def filter_gyro(
-    chain: FilterChain, dt: float, memory: Mapping[str, PyTree], rate: Signal, *more: Section
+    chain: FilterChain, dt: float, memory: Memories, rate: Signal, *more: Section
 ) -> tuple[dict[str, PyTree], tuple[Signal, Signal]]:
     """The filtered rate at this sample, and it through the sections `more` at the gyro's rate.
 
     Between two samples of the loop the rate is taken as straight.
     """
-    groups = chain.sections(), more
+    sections, before = chain.sections(), memory["rate"]
     count = samples_between(chain, dt) if chain.filters or more else 1
-    memories, (smooth, further) = run_between(
-        groups, (memory["gyro"], memory["derivative"]), memory["rate"], rate, count
-    )
-    return {"gyro": memories[0], "derivative": memories[1], "rate": rate}, (smooth, further)
+
+    def advance(memories: tuple[Memory, Memory], part: Array):
+        gyro, smooth = run_sections(sections, memories[0], before + part * (rate - before))
+        derivative, further = run_sections(more, memories[1], smooth)
+        return (gyro, derivative), (smooth, further)
+
+    memories, passed = (memory["gyro"], memory["derivative"]), (rate, rate)
+    parts = jnp.arange(1, count + 1, dtype=rate.dtype) / count
+    if count <= _UNROLLED:
+        for k in range(count):
+            memories, passed = advance(memories, parts[k])
+    else:
+        memories, (smooth, further) = jax.lax.scan(advance, memories, parts)
+        passed = smooth[-1], further[-1]
+    return {"gyro": memories[0], "derivative": memories[1], "rate": rate}, passed
 
 
 def gyro_rest(chain: FilterChain, zero: Signal, *more: Section) -> dict[str, PyTree]:
     """What `filter_gyro` remembers at rest."""
-    derivative: Memory = rest_of(more, zero)
-    return {"gyro": chain.init(zero), "derivative": derivative, "rate": zero}
+    return {"gyro": chain.init(zero), "derivative": rest_of(more, zero), "rate": zero}
 
 
 def split_reference(reference: Reference, before: Signal, dt: float) -> tuple[Signal, Signal]:

@@ -21,16 +21,16 @@ Law = TypeVar("Law", bound=FirmwareLoop)
 
 
 class _Tables(Mapping[str, Mapping[str, Parameter]]):
-    def __getitem__(self, name: str) -> Mapping[str, Parameter]:
-        if name not in firmware_names():
-            raise KeyError(name)
-        return firmware_named(name).parameters
-
     def __iter__(self) -> Iterator[str]:
         return iter(firmware_names())
 
     def __len__(self) -> int:
         return len(firmware_names())
+
+    def __getitem__(self, name: str) -> Mapping[str, Parameter]:
+        if name not in firmware_names():
+            raise KeyError(name)
+        return firmware_named(name).parameters
 
 
 PARAMETERS: Mapping[str, Mapping[str, Parameter]] = _Tables()
@@ -50,11 +50,7 @@ def find_parameter(firmware: str, name: str) -> Parameter:
 
 
 def store_parameters(firmware: str, values: Mapping[str, Number]) -> dict[str, float]:
-    """What the firmware stores of these values: whole numbers, or single precision.
-
-    **Arguments:**
-
-    - `values`: by the parameters' names.
+    """What the firmware stores of values by their names: whole numbers, or single precision.
 
     **Raises:**
 
@@ -74,8 +70,8 @@ def check_ranges(firmware: str, values: Mapping[str, Number]) -> tuple[str, ...]
     beyond = []
     for name, value in values.items():
         row = find_parameter(firmware, name)
+        unit = f" {row.unit}" if row.unit else ""
         if not row.low * (1 - 1e-6) <= value <= row.high * (1 + 1e-6):
-            unit = f" {row.unit}" if row.unit else ""
             beyond.append(
                 f"{name} is {value:g}{unit}, beyond its documented range of {row.low:g} to "
                 f"{row.high:g}{unit}."
@@ -89,11 +85,10 @@ def firmware_of(law: FirmwareLoop) -> str:
 
 
 def list_parameters(law: FirmwareLoop, *, axes: Sequence[str] = AXES) -> dict[str, float]:
-    """The parameters that a law amounts to, not rounded.
+    """The parameters that a law amounts to, not rounded: gains, filters, those of an angle loop.
 
-    Gains and filters of a law, and the angle loop's where it has one; parameters of all axes, such
-    as a gyro filter, too. Not listed: Betaflight's filters, because their parameters are ranges
-    over the throttle.
+    Parameters of all axes, such as a gyro filter, are listed, too. Not listed: Betaflight's
+    filters, because their parameters are ranges over the throttle.
 
     **Arguments:**
 
@@ -199,7 +194,6 @@ def flown_loop(
 
     **Arguments:**
 
-    - `firmware`: "betaflight", "px4", "ardupilot", or one that is registered.
     - `values`, `version`: as `jq.records.read_settings` returns them.
     - `throttle`: 0 to 1, at which Betaflight's dynamic cutoffs and ArduPilot's notches are.
     - `tracked_hz`: as in `ardupilot_loop`.
@@ -216,12 +210,7 @@ def flown_loop(
 def change_filters(
     firmware: str, values: Mapping[str, str], parameters: Mapping[str, Number]
 ) -> dict[str, str]:
-    """The values of a log as they would be with other filters.
-
-    **Arguments:**
-
-    - `firmware`, `values`: as in `flown_loop`.
-    - `parameters`: new cutoffs and notches by their names in `PARAMETERS`.
+    """The values of a log as they would be with other cutoffs and notches, by their names.
 
     **Raises:**
 

@@ -2,7 +2,7 @@
 
 import dataclasses
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +23,7 @@ from ._flight_channels import FlightChannels, FlownAutopilot, IdentifiedPlant
 from ._gyro_noise import GyroNoise
 from ._law_check import LoopCheck
 from ._over_throttle import ThrottleVerdict
-from ._page import pilot_page, write_pilot_page
+from ._page import pilot_page, PilotPage, write_pilot_page
 from ._parameters import find_parameter
 from ._rate_loops import PlantSource
 from ._stages import DesignSettings, FilterVerdict, Kind, limits_text, Stage, WAYS
@@ -215,14 +215,7 @@ class AutopilotProposal:
 
         **Returns:** their paths.
         """
-        return _write(Path(folder), self, [self])
-
-    def provenance(self, settings: DesignSettings) -> Provenance:
-        """Of a result with these settings."""
-        stated = {k: v for k, v in settings.content().items() if v is not None}
-        log = self.identification.path
-        words = ["jaxquad", "autopilot", str(log), *settings.words()]
-        return provenance(log, command=shlex.join(words), settings=stated)
+        return _write_axes(Path(folder), self, [self])
 
     def write_curve(self, folder: Path) -> list[Path]:
         """The thrust curve's parameter and what flew of it, never in a file with gains."""
@@ -360,7 +353,7 @@ class AxesProposal:
 
         **Returns:** their paths.
         """
-        return _write(Path(folder), self, [*self.axes.values()])
+        return _write_axes(Path(folder), self, [*self.axes.values()])
 
     def __str__(self) -> str:
         parts = [str(one) for one in self.axes.values()]
@@ -370,17 +363,32 @@ class AxesProposal:
         return "\n\n".join(parts)
 
 
-def _write(
+def _write_axes(
     folder: Path, result: AutopilotProposal | AxesProposal, axes: Sequence[AutopilotProposal]
 ) -> list[Path]:
-    """The page, the JSON, the thrust curve and one parameter file of all axes for each stage."""
-    announce("parameter files")
-    flown, origin = axes[0].flown, axes[0].provenance(result.settings)
-    content = result.content() | {"provenance": origin.content()}
-    stored = write_json(folder / "autopilot.json", content)
-    curve = next((paths for paths in (one.write_curve(folder) for one in axes) if paths), [])
-    files = result.parameters.write(folder)
-    announce("the page")
+    """With the thrust curve, and one parameter file of all axes for each stage."""
+    flown = axes[0].flown
     overview = f"{flown.firmware} {'.'.join(map(str, flown.version))}, rate loops".strip()
-    pages = [pilot_page(one, origin, overview) for one in axes]
-    return [write_pilot_page(folder / "autopilot.html", *pages), stored, *curve, *files]
+
+    def files() -> list[Path]:
+        curves = (one.write_curve(folder) for one in axes)
+        return [*next((paths for paths in curves if paths), []), *result.parameters.write(folder)]
+
+    pages = lambda origin: [pilot_page(one, origin, overview) for one in axes]
+    log, settings = axes[0].identification.path, result.settings
+    return write_result(folder, log, settings, result.content(), files, pages)
+
+
+def write_result(
+    folder: Path, log: Path, settings: DesignSettings, content: Mapping[str, object],
+    files: Callable[[], Sequence[Path]], pages: Callable[[Provenance], Sequence[PilotPage]],
+) -> list[Path]:  # fmt: skip
+    """The page, the JSON with where it is from, and what `files` writes."""
+    announce("parameter files")
+    stated = {k: v for k, v in settings.content().items() if v is not None}
+    words = ["jaxquad", "autopilot", str(log), *settings.words()]
+    origin = provenance(log, command=shlex.join(words), settings=stated)
+    with_origin = {**content, "provenance": origin.content()}
+    stored, written = write_json(folder / "autopilot.json", with_origin), files()
+    announce("the page")
+    return [write_pilot_page(folder / "autopilot.html", *pages(origin)), stored, *written]

@@ -3,7 +3,7 @@
 import dataclasses
 import functools as ft
 import itertools
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -13,7 +13,7 @@ from jaxquad._core import announce
 
 from ._files import propose_changes
 from ._filter_bank import filter_choices, FilterBank, noise_growth, Picks, shared_change
-from ._firmware import FilterChoice, firmware_named, OuterLoop
+from ._firmware import FilterChoice, firmware_named, OuterLoop, Parameter
 from ._flight_channels import FlownAutopilot
 from ._gyro_noise import gyro_noise, GyroNoise, NoNoise
 from ._parameters import (
@@ -284,6 +284,32 @@ _ROUNDS, _DRAWN, _BEST, _KEPT = 14, 140, 18, 0.3  # of the search with filters
 _WIDTH, _NARROWEST = (0.35, 0.25), (0.02, 0.3)  # of gains in ln, of filters in options
 
 
+def best_on_grid(
+    score: Callable[[Gains], Float[np.ndarray, " designs"]], middle: np.ndarray, half: np.ndarray,
+    bounds: tuple[np.ndarray, np.ndarray], points: int,
+) -> np.ndarray:  # fmt: skip
+    """The best of a grid of designs around `middle`, whose logarithms this and `bounds` are."""
+    axes = [
+        np.clip(np.linspace(m - h, m + h, points), low, high)
+        for m, h, low, high in zip(middle, half, *bounds, strict=True)
+    ]
+    grid = np.stack([x.ravel() for x in np.meshgrid(*axes, indexing="ij")], axis=1)
+    return grid[np.argmin(score(np.exp(grid)))]
+
+
+def stored_near(
+    values: np.ndarray, rows: Sequence[Parameter], bounds: tuple[np.ndarray, np.ndarray]
+) -> Gains:
+    """The whole numbers, or numbers of three digits, around some values, within their bounds."""
+    around = []
+    for value, row, low, high in zip(values, rows, *bounds, strict=True):
+        step = 1.0 if row.integer else 10 ** (np.floor(np.log10(value)) - 2)
+        pair = np.round(np.array([np.floor(value / step), np.ceil(value / step)]) * step, 12)
+        inside = (pair >= low * (1 - 1e-9)) & (pair <= high * (1 + 1e-9))
+        around.append(np.unique(pair[inside] if inside.any() else pair))
+    return np.array(list(itertools.product(*around)))
+
+
 class _Search:
     """Designs by their score: what is beyond a limit comes after all that keep them."""
 
@@ -317,12 +343,8 @@ class _Search:
             middle, half = np.log(near[self.free]), np.full(low.size, _AROUND)
             points_each, levels = _POINTS_AROUND, _LEVELS_AROUND
         for _ in range(levels):
-            axes = [
-                np.clip(np.linspace(m - h, m + h, points_each), a, b)
-                for m, h, a, b in zip(middle, half, low, high, strict=True)
-            ]
-            points = np.stack([x.ravel() for x in np.meshgrid(*axes, indexing="ij")], axis=1)
-            middle, half = points[np.argmin(self.score(np.exp(points)))], _NARROWED * half
+            middle = best_on_grid(self.score, middle, half, (low, high), points_each)
+            half = _NARROWED * half
         return self._stored(np.exp(middle), None)
 
     def gains_and_filters(
@@ -388,13 +410,7 @@ class _Search:
         self, free: Float[np.ndarray, " free"], picks: Int[np.ndarray, " choices"] | None
     ) -> OneGains:
         """The best of the whole numbers, or numbers of three digits, around some gains."""
-        around = []
-        for value, row, least, most in zip(free, self.rows, self.low, self.high, strict=True):
-            step = 1.0 if row.integer else 10 ** (np.floor(np.log10(value)) - 2)
-            pair = np.round(np.array([np.floor(value / step), np.ceil(value / step)]) * step, 12)
-            inside = (pair >= least * (1 - 1e-9)) & (pair <= most * (1 + 1e-9))
-            around.append(np.unique(pair[inside] if inside.any() else pair))
-        near = np.array(list(itertools.product(*around)))
+        near = stored_near(free, self.rows, (self.low, self.high))
         same = None if picks is None else np.tile(picks, (len(near), 1))
         stored = self.flown.copy()
         stored[self.free] = near[np.argmin(self.score(near, same))]

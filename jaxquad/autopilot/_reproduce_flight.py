@@ -47,18 +47,16 @@ class FlownController(Protocol):
 class Reproduction(eqx.Module):
     """The response from set-point to rate: measured, and predicted of a controller and a plant.
 
-    Both have relative standard errors (of magnitude, and in rad); those of the measured one are
-    the noise of the record, those of the predicted one the covariance of the fit. `scale` is the
-    factor on the controller's gains with which the prediction comes nearest, 1 if they are those
-    that flew.
+    Both have relative standard errors (of magnitude, and in rad).
     """
 
     omega: Frequencies  # rad/s
     measured: Response
-    measured_error: Frequencies
+    measured_error: Frequencies  # by the noise of the record
     predicted: Response
-    predicted_error: Frequencies
+    predicted_error: Frequencies  # by the covariance of the fit
     used: Bool[np.ndarray, " frequencies"]
+    # The factor on the controller's gains with which the prediction comes nearest, 1 if they flew.
     scale: float
     scale_error: float  # standard error
     plant_misfit: float = 1.0  # of the plant's fit, relative to its errors
@@ -85,8 +83,7 @@ class Reproduction(eqx.Module):
         if error.size < _FEWEST or np.median(error) > _BLIND or self.scale_error > _VAGUE:
             return "unknown"
         near = self.ratio <= MISFIT or self.misfit <= _CLOSE
-        off = abs(self.scale - 1)
-        steady = off <= max(_CLOSE, 3 * self.scale_error)
+        steady = abs(self.scale - 1) <= max(_CLOSE, 3 * self.scale_error)
         return "flown" if near and steady else "not flown"
 
     @property
@@ -121,6 +118,9 @@ class Reproduction(eqx.Module):
 
     def to_dict(self) -> dict[str, object]:
         """All numbers as JSON holds them."""
+        parts = lambda x, error: {
+            "magnitude": np.abs(x), "phase_rad": np.angle(x), "error": error,
+        }  # fmt: skip
         content = {
             "kind": self.kind,
             "verdict": self.verdict,
@@ -131,8 +131,8 @@ class Reproduction(eqx.Module):
             "gain_scale_standard_error": self.scale_error,
             "omega": self.omega,
             "used": self.used.tolist(),
-            "measured": _parts(self.measured, self.measured_error),
-            "predicted": _parts(self.predicted, self.predicted_error),
+            "measured": parts(self.measured, self.measured_error),
+            "predicted": parts(self.predicted, self.predicted_error),
         }
         return plain_content(content)
 
@@ -142,10 +142,6 @@ class Reproduction(eqx.Module):
     @property
     def _off(self) -> Response:
         return self.measured / self.predicted - 1
-
-
-def _parts(response: Response, error: Frequencies) -> dict[str, object]:
-    return {"magnitude": np.abs(response), "phase_rad": np.angle(response), "error": error}
 
 
 def reproduce_flight(
@@ -161,9 +157,9 @@ def reproduce_flight(
 ) -> Reproduction:
     """Compare the closed loop that a controller and an identified plant predict with a record.
 
-    The check before any gain is changed: a plant, gains and filters that do not reproduce the
-    response that was flown are no basis for others. The errors of both count as independent, which
-    is cautious where the plant is of the same record. Source: docs/autopilots.md.
+    A plant, gains and filters that do not reproduce the response that was flown are no basis for
+    others. The errors of both count as independent, which is cautious where the plant is of the
+    same record. Its `verdict` is in words. Source: docs/autopilots.md.
 
     **Arguments:**
 
@@ -179,10 +175,6 @@ def reproduce_flight(
     - `axis`: of the controller.
     - `band`: (low, high) in rad/s; by default where the response is coherent.
 
-    **Returns:**
-
-    A `jq.autopilot.Reproduction`; its `verdict` is in words.
-
     **Raises:**
 
     - `ValueError`: the controller has no linear form, or the record no reference.
@@ -192,72 +184,51 @@ def reproduce_flight(
             f"the controller is a {type(controller).__name__}: give one with a method linear(), "
             "such as jq.autopilot.BetaflightPID"
         )
-    law = controller.linear(axis)
-    response = flown if isinstance(flown, FrequencyResponse) else _set_point_response(flown, band)
-    omega = np.asarray(response.omega)
-    inside = np.asarray(usable(response, band, 0.6))[:, 0, 0]
-    like = dataclasses.replace(response, dt=law.dt, hold=law.dt)
+    if not isinstance(flown, FrequencyResponse):
+        records = [flown] if isinstance(flown, Record) else list(flown)
+        if not records or not all(x.reference_names for x in records):
+            raise ValueError(
+                "the record has no reference: give the set-point of the rate loop as references="
+            )
+        closed = [
+            select(x, inputs=x.reference_names[0], outputs=x.output_names[0]) for x in records
+        ]
+        low, high = band or (2 * np.pi * 0.7, 2 * np.pi * min(60.0, records[0].sample_rate / 8))
+        lines = np.geomspace(low, high, 50)
+        flown = frequency_response(closed, lines, estimator=LocalPolynomial())
+    law, omega = controller.linear(axis), np.asarray(flown.omega)
+    used = np.asarray(usable(flown, band, 0.6))[:, 0, 0]
+    like = dataclasses.replace(flown, dt=law.dt, hold=law.dt)
     factor = np.pi / 180 if unit == "deg/s" else 1.0
     of_plant = lambda model: model if plant is None else plant(model)
-    at = lambda model: factor * _only(model_response(as_sampled(of_plant(model), like), omega))
-    slopes, by_gain, predicted = _slopes(fit, at, law, omega)
-    predicted = predicted * filter_response(filters, omega)
-    spread = np.real(np.einsum("pf,pq,qf->f", slopes.conj(), fit.relative_covariance, slopes))
-    errors = _only(np.asarray(response.random_error)), np.sqrt(np.maximum(spread, 0.0) / 2)
-    measured = _only(np.asarray(response.response))
-    scale, doubt = _scale(measured / predicted - 1, by_gain, errors, inside)
-    compared = omega, measured, errors[0], predicted, errors[1], inside
-    return Reproduction(*compared, 1 + scale, doubt, float(np.sqrt(fit.chi_squared)))
-
-
-def _only(pairs: np.ndarray) -> np.ndarray:
-    """Of the first output and input."""
-    return pairs[:, 0, 0]
-
-
-def _set_point_response(
-    record: Record | Sequence[Record], band: tuple[float, float] | None
-) -> FrequencyResponse:
-    records = [record] if isinstance(record, Record) else list(record)
-    if not records or not all(x.reference_names for x in records):
-        raise ValueError(
-            "the record has no reference: give the set-point of the rate loop as references="
-        )
-    closed = [select(x, inputs=x.reference_names[0], outputs=x.output_names[0]) for x in records]
-    low, high = band or (2 * np.pi * 0.7, 2 * np.pi * min(60.0, records[0].sample_rate / 8))
-    omega = np.geomspace(low, high, 50)
-    return frequency_response(closed, omega, estimator=LocalPolynomial())
-
-
-def _slopes(
-    fit: Fit, at: Callable[[PyTree], Response], law: LinearController, omega: Frequencies
-) -> tuple[Complex[np.ndarray, "parameters frequencies"], Response, Response]:
-    """Slopes of ln T by relative changes of the parameters, and of all gains; T itself."""
+    at = lambda model: factor * model_response(as_sampled(of_plant(model), like), omega)[:, 0, 0]
+    # Slopes of ln T by relative changes of the parameters, and of all gains.
     plants = [at(fit.model)]
     for k in range(len(fit.names)):
         moved = np.array(fit.values, float)
         moved[k] += _CHANGE * fit.units[k]
         plants.append(at(fit.parameters.replace(fit.model, moved)))
-    loops = np.asarray(predict_loop(law, np.stack(plants), omega))
     louder = dataclasses.replace(
         law,
         C=(1 + _CHANGE) * law.C,
         reference_through=(1 + _CHANGE) * law.reference_through,
         measurement_through=(1 + _CHANGE) * law.measurement_through,
     )
-    by_gain = np.asarray(predict_loop(louder, plants[0], omega)) / loops[0]
-    return (loops[1:] / loops[0] - 1) / _CHANGE, (by_gain - 1) / _CHANGE, loops[0]
-
-
-def _scale(
-    off: Response, slope: Response, errors: tuple[Frequencies, Frequencies], used: np.ndarray
-) -> tuple[float, float]:
-    """The relative change of all gains nearest to the misfit, and its standard error."""
-    if not used.any():
-        return 0.0, float("inf")
-    weight = 1 / (errors[0] ** 2 + errors[1] ** 2)[used]
-    slope, off = slope[used], off[used]
-    information = float(np.sum(weight * np.abs(slope) ** 2))
-    change = float(np.sum(weight * np.real(slope.conj() * off))) / information
-    left = np.mean(weight * np.abs(off - change * slope) ** 2) / 2
-    return change, float(np.sqrt(max(left, 1.0) / information))
+    loops = np.asarray(predict_loop(law, np.stack(plants), omega))
+    by_gain = (np.asarray(predict_loop(louder, plants[0], omega)) / loops[0] - 1) / _CHANGE
+    slopes = (loops[1:] / loops[0] - 1) / _CHANGE
+    spread = np.real(np.einsum("pf,pq,qf->f", slopes.conj(), fit.relative_covariance, slopes))
+    predicted = loops[0] * filter_response(filters, omega)
+    measured = np.asarray(flown.response)[:, 0, 0]
+    errors = np.asarray(flown.random_error)[:, 0, 0], np.sqrt(np.maximum(spread, 0.0) / 2)
+    # The relative change of all gains nearest to the misfit, and its standard error.
+    scale, doubt = 0.0, float("inf")
+    if used.any():
+        weight = 1 / (errors[0] ** 2 + errors[1] ** 2)[used]
+        slope, off = by_gain[used], (measured / predicted - 1)[used]
+        information = float(np.sum(weight * np.abs(slope) ** 2))
+        scale = float(np.sum(weight * np.real(slope.conj() * off))) / information
+        left = np.mean(weight * np.abs(off - scale * slope) ** 2) / 2
+        doubt = float(np.sqrt(max(left, 1.0) / information))
+    compared = omega, measured, errors[0], predicted, errors[1], used
+    return Reproduction(*compared, 1 + scale, doubt, float(np.sqrt(fit.chi_squared)))

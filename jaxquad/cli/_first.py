@@ -109,59 +109,59 @@ def design(declared: argparse.ArgumentParser) -> Run:
     force = "overwrite another signal; without it, that is kept, and CSV-2 written"
     file = ("CSV", "by default sweep.csv or multisine.csv")
     shell.add_output(declared, "the guidelines", file=file, force=force, quiet=False)
-    return _design
 
+    def run(options: argparse.Namespace) -> int:
+        import numpy as np
 
-def _design(options: argparse.Namespace) -> int:
-    import numpy as np
+        from jaxquad._core import write_file
+        from jaxquad.excitation import check_guidelines, harmonics, multisine, sweep
 
-    from jaxquad._core import write_file
-    from jaxquad.excitation import check_guidelines, harmonics, multisine, sweep
-
-    (low, high), rate, duration = options.band, options.rate, options.duration
-    is_sweep = options.kind == "sweep"
-    if is_sweep and options.lines is not None:
-        raise ValueError("--lines is for a multisine: leave it out, or design a multisine")
-    if not 0 < low < high:
-        raise ValueError(f"--band is {low:g} {high:g}: give two frequencies above 0, rising")
-    if not rate > 0:
-        raise ValueError(f"--rate is {rate:g}: give a rate above 0 Hz")
-    band = 2 * np.pi * low, 2 * np.pi * high
-    if is_sweep:
-        duration = 5 / low if duration is None else duration
-        signal = sweep(*band, duration=duration, sample_rate=rate, amplitude=options.amplitude)
-    else:
-        period = np.ceil(rate / low - 1e-9) / rate
-        duration = 10 * period if duration is None else duration
-        if not duration > 0:
-            raise ValueError(f"--duration is {duration:g}: give a time above 0 s")
-        signal = multisine(
-            harmonics(*band, period=period, lines=options.lines), period=period,
-            periods=max(1, round(duration / period)), sample_rate=rate,
-            amplitude=options.amplitude,
-        )  # fmt: skip
-    radian = lambda hertz: None if hertz is None else 2 * np.pi * hertz
-    check = check_guidelines(
-        signal,
-        omega_bandwidth=radian(options.bandwidth),
-        omega_180=radian(options.phase_crossover),
-    )
-    rows = (f"{t:.9g},{u:.9g}\n" for t, u in zip(signal.time, signal.signal, strict=True))
-    content = f"time,signal\n{''.join(rows)}"
-    wanted = options.out or Path(f"{options.kind}.csv")
-    numbered = (wanted.with_stem(f"{wanted.stem}-{number}") for number in count(2))
-    out = next(  # another signal is kept
-        path
-        for path in chain([wanted], numbered)
-        if options.force or not path.exists() or path.read_bytes() == content.encode()
-    )
-    write_file(out, content)
-    if options.json:
-        rules = [rule._asdict() for rule in check]
-        shell.print_json(
-            {"file": str(out), "samples": signal.time.size, "ok": check.ok, "rules": rules}
+        (low, high), rate, duration = options.band, options.rate, options.duration
+        is_sweep = options.kind == "sweep"
+        if is_sweep and options.lines is not None:
+            raise ValueError("--lines is for a multisine: leave it out, or design a multisine")
+        if not 0 < low < high:
+            raise ValueError(f"--band is {low:g} {high:g}: give two frequencies above 0, rising")
+        if not rate > 0:
+            raise ValueError(f"--rate is {rate:g}: give a rate above 0 Hz")
+        band = 2 * np.pi * low, 2 * np.pi * high
+        if is_sweep:
+            duration = 5 / low if duration is None else duration
+            signal = sweep(*band, duration=duration, sample_rate=rate, amplitude=options.amplitude)
+        else:
+            period = np.ceil(rate / low - 1e-9) / rate
+            duration = 10 * period if duration is None else duration
+            if not duration > 0:
+                raise ValueError(f"--duration is {duration:g}: give a time above 0 s")
+            signal = multisine(
+                harmonics(*band, period=period, lines=options.lines), period=period,
+                periods=max(1, round(duration / period)), sample_rate=rate,
+                amplitude=options.amplitude,
+            )  # fmt: skip
+        radian = lambda hertz: None if hertz is None else 2 * np.pi * hertz
+        check = check_guidelines(
+            signal,
+            omega_bandwidth=radian(options.bandwidth),
+            omega_180=radian(options.phase_crossover),
         )
-    else:
-        hertz = f"{low:g} to {high:g} Hz ({band[0]:.3g} to {band[1]:.3g} rad/s)"
-        print(f"{signal.time.size} samples, {signal.time[-1]:.4g} s, {hertz}\n{check}\n{out}")
-    return 0 if check.ok else _BELOW_GUIDELINE
+        rows = (f"{t:.9g},{u:.9g}\n" for t, u in zip(signal.time, signal.signal, strict=True))
+        content = f"time,signal\n{''.join(rows)}"
+        wanted = options.out or Path(f"{options.kind}.csv")
+        numbered = (wanted.with_stem(f"{wanted.stem}-{number}") for number in count(2))
+        out = next(  # another signal is kept
+            path
+            for path in chain([wanted], numbered)
+            if options.force or not path.exists() or path.read_bytes() == content.encode()
+        )
+        write_file(out, content)
+        if options.json:
+            rules = [rule._asdict() for rule in check]
+            shell.print_json(
+                {"file": str(out), "samples": signal.time.size, "ok": check.ok, "rules": rules}
+            )
+        else:
+            hertz = f"{low:g} to {high:g} Hz ({band[0]:.3g} to {band[1]:.3g} rad/s)"
+            print(f"{signal.time.size} samples, {signal.time[-1]:.4g} s, {hertz}\n{check}\n{out}")
+        return 0 if check.ok else _BELOW_GUIDELINE
+
+    return run

@@ -1,6 +1,8 @@
 """Controllers (LADRC, PID, adaptive LADRC), observers and estimators of the inertia."""
 
+from ._estimator import NoProbe as NoProbe, ProbeTones as ProbeTones
 from ._ladrc import LADRC as LADRC, LADRCLaw as LADRCLaw
+from ._lock_in import LockInInertia as LockInInertia
 from ._observers import (
     CurrentObserver as CurrentObserver,
     EulerObserver as EulerObserver,
@@ -33,21 +35,18 @@ from ._protocols import (
     Transform as Transform,
     Tunable as Tunable,
 )
+from ._regression import (
+    paper_inertia as paper_inertia,
+    RecursiveInertia as RecursiveInertia,
+    WindowedInertia as WindowedInertia,
+)
 from ._scheduled import (
     AdaptiveLADRC as AdaptiveLADRC,
-    ScheduledLADRC as ScheduledLADRC,
-    ScheduledPID as ScheduledPID,
-)
-from .inertia import (
     certainty_equivalence as certainty_equivalence,
     Falling as Falling,
     FuzzyMap as FuzzyMap,
     InertiaMap as InertiaMap,
-    LockInInertia as LockInInertia,
-    NoProbe as NoProbe,
-    paper_inertia as paper_inertia,
     printed_map as printed_map,
-    ProbeTones as ProbeTones,
-    RecursiveInertia as RecursiveInertia,
-    WindowedInertia as WindowedInertia,
+    ScheduledLADRC as ScheduledLADRC,
+    ScheduledPID as ScheduledPID,
 )

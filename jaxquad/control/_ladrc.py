@@ -34,7 +34,16 @@ from ._observers import (
     list_range,
     slowness_in_words,
 )
-from ._protocols import LinearController, Member, Observer, Reference, Setpoint, Transform
+from ._protocols import (
+    Gain,
+    LinearController,
+    Member,
+    Observer,
+    Reference,
+    Setpoint,
+    Signal,
+    Transform,
+)
 
 
 Placement = Literal["discrete", "continuous"]
@@ -43,46 +52,25 @@ Placement = Literal["discrete", "continuous"]
 class LADRCGains(eqx.Module):
     """The gains on errors of the angle, of the rate and of the observer, half gains included."""
 
-    proportional: Float[Array, "..."] = per_member(rank=1)  # 1/s^2; order 1: 1/s
-    derivative: Float[Array, "..."] | None = per_member(rank=1)  # 1/s; None for order 1
+    proportional: Gain = per_member(rank=1)  # 1/s^2; order 1: 1/s
+    derivative: Gain | None = per_member(rank=1)  # 1/s; None for order 1
     correction: Float[Array, "states ..."] = per_member(rank=2)  # of the observer's prediction
-
-
-def feedback_gains(
-    wc: Float[Array, "..."], dt: float, order: int, placement: Placement
-) -> tuple[Float[Array, "..."], Float[Array, "..."] | None]:
-    """kp and kd that place the poles of u0/s^2 (order 1: u0/s) at -wc; order 1 has no kd.
-
-    "discrete": at exp(-wc dt) exactly, with u0 held over the sample. "continuous": kp = wc^2 and
-    kd = 2 wc, so at -wc only as dt goes to 0. Source: docs/control.md.
-    """
-    if placement == "continuous":
-        return (wc, None) if order == 1 else (wc**2, 2 * wc)
-    off = -jnp.expm1(-wc * dt)  # 1 - exp(-wc dt) without cancellation
-    if order == 1:
-        return off / dt, None
-    return (off / dt) ** 2, off * (4 - off) / (2 * dt)
-
-
-def fastest_feedback(order: int, placement: Placement) -> float:
-    """The highest wc dt: Nyquist's, or where the held feedback turns unstable."""
-    return jnp.pi if placement == "discrete" else 2.0 / order
 
 
 class LADRCState(NamedTuple):
     """What a LADRC remembers from the last sample."""
 
     estimate: Float[Array, "states axes *ensemble"]  # [y, y', f], order 1 [y, f]
-    command: Float[Array, " axes *ensemble"]  # as applied
-    b0: Float[Array, " axes *ensemble"]  # in force
+    command: Signal  # as applied
+    b0: Signal  # in force
 
 
 class LADRCLaw(eqx.Module):
     """A `LADRC` with its gains computed, for a loop to run sample by sample."""
 
     gains: LADRCGains
-    b0: Float[Array, "..."] = per_member(rank=1)
-    limit: Float[Array, "..."] = per_member(rank=1)
+    b0: Gain = per_member(rank=1)
+    limit: Gain = per_member(rank=1)
     observer: Observer
     dt: float = eqx.field(static=True)
 
@@ -95,33 +83,25 @@ class LADRCLaw(eqx.Module):
         """The trailing shape of the gains, () for one controller."""
         return ensemble_shape(self)
 
-    def init(
-        self,
-        like: Float[Array, " axes *ensemble"],
-        measurement: Float[Array, " axes *ensemble"] | None = None,
-    ) -> LADRCState:
+    def init(self, like: Signal, measurement: Signal | None = None) -> LADRCState:
         zero = jnp.zeros(signal_shape(like, self.ensemble), like.dtype)
         first = zero if measurement is None else zero + align(measurement, zero)
         estimate = jnp.stack([first] + [zero] * (len(self.gains.correction) - 1))
         return LADRCState(estimate, zero, zero + broadcast_gain(self.b0, zero))
 
     def step(
-        self, state: LADRCState, reference: Reference, measurement: Float[Array, " axes *ensemble"]
-    ) -> tuple[LADRCState, Float[Array, " axes *ensemble"]]:
+        self, state: LADRCState, reference: Reference, measurement: Signal
+    ) -> tuple[LADRCState, Signal]:
         return self._advance(state, state.estimate[-1], reference, measurement, self.b0)
 
     def step_with(
-        self,
-        state: LADRCState,
-        reference: Reference,
-        measurement: Float[Array, " axes *ensemble"],
-        b0: Float[Array, "..."],
-    ) -> tuple[LADRCState, Float[Array, " axes *ensemble"]]:
+        self, state: LADRCState, reference: Reference, measurement: Signal, b0: Gain
+    ) -> tuple[LADRCState, Signal]:
         # f = y'' - b0 u: another b0 moves the disturbance, so that y'' and u stay as they are.
         unknown = state.estimate[-1] + (state.b0 - broadcast_gain(b0, measurement)) * state.command
         return self._advance(state, unknown, reference, measurement, b0)
 
-    def applied(self, state: LADRCState, achieved: Float[Array, " axes *ensemble"]) -> LADRCState:
+    def applied(self, state: LADRCState, achieved: Signal) -> LADRCState:
         return state._replace(command=achieved)
 
     def signals(self, state: LADRCState) -> dict[str, Array]:
@@ -145,66 +125,13 @@ class LADRCLaw(eqx.Module):
         """The wanted b0 u in rad/s^2; order 1 in rad/s."""
         ahead = isinstance(reference, Setpoint)
         angle = reference.angle if ahead else reference
-        drive = (
-            broadcast_gain(self.gains.proportional, angle) * (angle - estimate[0]) - estimate[-1]
-        )
+        gain = broadcast_gain(self.gains.proportional, angle)
+        drive = gain * (angle - estimate[0]) - estimate[-1]
         if self.gains.derivative is None:
             return drive + reference.rate if ahead else drive
         error = reference.rate - estimate[1] if ahead else -estimate[1]
         drive = drive + broadcast_gain(self.gains.derivative, angle) * error
         return drive + reference.acceleration if ahead else drive
-
-
-def linear_ladrc(
-    gains: LADRCGains, b0: Float[Array, ""], observer: Observer, dt: float
-) -> LinearController:
-    """The law without its limit; the state is the observer's prediction."""
-    states = len(gains.correction)
-    unit, zero = jnp.eye(states, dtype=b0.dtype), jnp.zeros(states, b0.dtype)
-    transition = jnp.stack(observer.predict(list(unit), zero, dt))
-    drive = jnp.stack(observer.predict(list(zero), jnp.ones_like(b0), dt))
-    rows = (gains.proportional, gains.derivative, jnp.ones_like(b0))
-    feedback = jnp.stack([x for x in rows if x is not None])
-    keep = unit.at[:, 0].add(-gains.correction)
-    # b0 u = kp r - late x - direct y
-    late = _dot(feedback, keep) if observer.current else feedback
-    direct = _dot(feedback, gains.correction) if observer.current else jnp.zeros_like(b0)
-    return LinearController(
-        A=_dot(transition, keep) - drive[:, None] * late[None],
-        reference_in=drive * gains.proportional,
-        measurement_in=_dot(transition, gains.correction) - drive * direct,
-        C=-late / b0,
-        reference_through=gains.proportional / b0,
-        measurement_through=-direct / b0,
-        dt=dt,
-    )
-
-
-def continuous_ladrc(
-    wc: Float[Array, ""],
-    wo: Float[Array, ""],
-    b0: Float[Array, ""],
-    order: int,
-    factors: tuple[Float[Array, ""], Float[Array, ""]],
-) -> tuple[TransferFunction, TransferFunction]:
-    """Feedback and feedforward of u = feedforward r - feedback y; docs/control.md."""
-    l = factors[1] * continuous_gains(wo, order)
-    one, zero = jnp.ones_like(b0), jnp.zeros_like(b0)
-    if order == 1:
-        kp = factors[0] * wc
-        back = [kp * l[0] + l[1], kp * l[1]]
-        below = [one, l[0] + kp, zero]
-    else:
-        kp, kd = factors[0] * wc**2, factors[0] * 2 * wc
-        back = [kp * l[0] + kd * l[1] + l[2], kp * l[1] + kd * l[2], kp * l[2]]
-        below = [one, l[0] + kd, l[1] + kd * l[0] + kp, zero]
-    ahead = kp * jnp.concatenate([one[None], l])
-    below = jnp.stack(below)
-    return TransferFunction(jnp.stack(back) / b0, below), TransferFunction(ahead / b0, below)
-
-
-def _dot(a: Array, b: Array) -> Array:
-    return jnp.dot(a, b, precision="highest")
 
 
 class LADRC(eqx.Module):
@@ -241,23 +168,29 @@ class LADRC(eqx.Module):
         order, placement or observer is unknown.
     """
 
-    wc: Float[Array, "..."] = per_member(rank=1, converter=as_float)  # rad/s
-    wo: Float[Array, "..."] = per_member(rank=1, converter=as_float)  # rad/s
-    b0: Float[Array, "..."] = per_member(
-        rank=1, converter=as_float
-    )  # rad/s^2 (order 1: rad/s) per unit
+    wc: Gain = per_member(rank=1, converter=as_float)  # rad/s
+    wo: Gain = per_member(rank=1, converter=as_float)  # rad/s
+    b0: Gain = per_member(rank=1, converter=as_float)  # rad/s^2 (order 1: rad/s) per unit
     order: int = eqx.field(static=True, default=2)
     observer: Observer = CurrentObserver()
     placement: Placement = eqx.field(static=True, default="discrete")
-    feedback_factor: Float[Array, "..."] = per_member(rank=1, converter=as_float, default=1.0)
-    observer_factor: Float[Array, "..."] = per_member(rank=1, converter=as_float, default=1.0)
-    limit: Float[Array, "..."] = per_member(
-        rank=1, converter=as_float, default=float("inf")
-    )  # of |u|
+    feedback_factor: Gain = per_member(rank=1, converter=as_float, default=1.0)
+    observer_factor: Gain = per_member(rank=1, converter=as_float, default=1.0)
+    limit: Gain = per_member(rank=1, converter=as_float, default=float("inf"))  # of |u|
     dt: float = eqx.field(static=True, default=0.002)  # s
 
     def __check_init__(self):
-        _require_choices(self)
+        if self.order not in (1, 2):
+            raise ValueError(
+                f"order is {self.order}, but it must be 1 or 2: the plant's, from command to angle."
+            )
+        if self.placement not in ("discrete", "continuous"):
+            raise ValueError(f'placement is {self.placement!r}: choose "discrete" or "continuous".')
+        if not isinstance(self.observer, Observer):
+            raise ValueError(
+                f"observer is {self.observer!r}: choose CurrentObserver(), PredictiveObserver() or "
+                "EulerObserver(), or give an object with the methods of jq.control.Observer."
+            )
         require_sample_interval(self.dt)
         for name, gain in _gains(self).items():
             if name == "limit":
@@ -267,14 +200,27 @@ class LADRC(eqx.Module):
                     name, gain, _REMEDIES.get(name, "1 keeps the gains, 0.5 halves them")
                 )
         require_common_shape(_gains(self))
-        require_below_sampling("wc", self.wc, fastest_feedback(self.order, self.placement), self.dt)
+        # Nyquist's, or where the held feedback turns unstable.
+        fastest = jnp.pi if self.placement == "discrete" else 2.0 / self.order
+        require_below_sampling("wc", self.wc, fastest, self.dt)
         require_below_sampling("wo", self.wo, self.observer.fastest, self.dt)
 
     @property
     def gains(self) -> LADRCGains:
-        """Of the feedback and of the observer, with the half-gain factors in them."""
-        kp, kd = feedback_gains(self.wc, self.dt, self.order, self.placement)
-        correction = self.observer.correction(self.wo, self.dt, self.order)
+        """Of the feedback and of the observer, with the half-gain factors in them.
+
+        The feedback places the poles of u0/s^2 (order 1: u0/s) at -wc; order 1 has no kd.
+        "discrete": at exp(-wc dt) exactly, with u0 held over the sample. "continuous": kp = wc^2
+        and kd = 2 wc, so at -wc only as dt goes to 0. Source: docs/control.md.
+        """
+        wc, dt = self.wc, self.dt
+        if self.placement == "continuous":
+            kp, kd = (wc, None) if self.order == 1 else (wc**2, 2 * wc)
+        else:
+            off = -jnp.expm1(-wc * dt)  # 1 - exp(-wc dt) without cancellation
+            kp = off / dt if self.order == 1 else (off / dt) ** 2
+            kd = None if self.order == 1 else off * (4 - off) / (2 * dt)
+        correction = self.observer.correction(self.wo, dt, self.order)
         return LADRCGains(
             multiply_gains(kp, self.feedback_factor),
             None if kd is None else multiply_gains(kd, self.feedback_factor),
@@ -290,17 +236,13 @@ class LADRC(eqx.Module):
         """The same law with its gains computed: what to run in a loop, once outside of it."""
         return LADRCLaw(self.gains, self.b0, self.limit, self.observer, self.dt)
 
-    def init(
-        self,
-        like: Float[Array, " axes *ensemble"],
-        measurement: Float[Array, " axes *ensemble"] | None = None,
-    ) -> LADRCState:
+    def init(self, like: Signal, measurement: Signal | None = None) -> LADRCState:
         """At rest at angle 0, or at `measurement` in rad; shaped as `like` and the ensemble."""
         return self.prepared().init(like, measurement)
 
     def step(
-        self, state: LADRCState, reference: Reference, measurement: Float[Array, " axes *ensemble"]
-    ) -> tuple[LADRCState, Float[Array, " axes *ensemble"]]:
+        self, state: LADRCState, reference: Reference, measurement: Signal
+    ) -> tuple[LADRCState, Signal]:
         """One sample: the command to hold until the next one.
 
         `reference` is a `Setpoint`, or angles in rad without feed-forward.
@@ -308,12 +250,8 @@ class LADRC(eqx.Module):
         return self.prepared().step(state, reference, measurement)
 
     def step_with(
-        self,
-        state: LADRCState,
-        reference: Reference,
-        measurement: Float[Array, " axes *ensemble"],
-        b0: Float[Array, "..."],
-    ) -> tuple[LADRCState, Float[Array, " axes *ensemble"]]:
+        self, state: LADRCState, reference: Reference, measurement: Signal, b0: Gain
+    ) -> tuple[LADRCState, Signal]:
         """As `step`, with another `b0` from this sample on.
 
         The estimate of f = y'' - b0 u changes with b0, so that an unsaturated command and the
@@ -321,7 +259,7 @@ class LADRC(eqx.Module):
         """
         return self.prepared().step_with(state, reference, measurement, b0)
 
-    def applied(self, state: LADRCState, achieved: Float[Array, " axes *ensemble"]) -> LADRCState:
+    def applied(self, state: LADRCState, achieved: Signal) -> LADRCState:
         """The state with the command that the drive really gave since the last `step`."""
         return self.prepared().applied(state, achieved)
 
@@ -330,13 +268,32 @@ class LADRC(eqx.Module):
         return self.prepared().signals(state)
 
     def linear(self, axis: int = 0, member: Member = None) -> LinearController:
-        """One axis without its limit, exactly; `member` picks one member of an ensemble."""
+        """One axis without its limit, exactly; `member` picks one member of an ensemble.
+
+        The state is the observer's prediction.
+        """
         at = lambda gain: pick_gain(gain, axis, member)
-        all_gains = self.gains
-        correction = jnp.stack([at(row) for row in all_gains.correction])
-        slope = None if all_gains.derivative is None else at(all_gains.derivative)
-        gains = LADRCGains(at(all_gains.proportional), slope, correction)
-        return linear_ladrc(gains, at(self.b0), self.observer, self.dt)
+        gains, b0, dt, observer = self.gains, at(self.b0), self.dt, self.observer
+        proportional, correction = at(gains.proportional), jnp.stack([*map(at, gains.correction)])
+        slope = [] if gains.derivative is None else [at(gains.derivative)]
+        unit, zero = jnp.eye(len(correction), dtype=b0.dtype), jnp.zeros(len(correction), b0.dtype)
+        transition = jnp.stack(observer.predict(list(unit), zero, dt))
+        drive = jnp.stack(observer.predict(list(zero), jnp.ones_like(b0), dt))
+        feedback = jnp.stack([proportional, *slope, jnp.ones_like(b0)])
+        keep = unit.at[:, 0].add(-correction)
+        dot = lambda a, b: jnp.dot(a, b, precision="highest")
+        # b0 u = kp r - late x - direct y
+        late = dot(feedback, keep) if observer.current else feedback
+        direct = dot(feedback, correction) if observer.current else jnp.zeros_like(b0)
+        return LinearController(
+            A=dot(transition, keep) - drive[:, None] * late[None],
+            reference_in=drive * proportional,
+            measurement_in=dot(transition, correction) - drive * direct,
+            C=-late / b0,
+            reference_through=proportional / b0,
+            measurement_through=-direct / b0,
+            dt=dt,
+        )
 
     def tunable(self) -> dict[str, Transform | None]:
         """The bandwidths and the gain of the plant."""
@@ -348,14 +305,16 @@ class LADRC(eqx.Module):
         The feedback can hold an observer that diverges as soon as the command stays at its limit.
         Only half-gain factors bring that about.
         """
-        return "" if _full_gains(self) else instability_in_words(self._error, self._named_gains)
+        if self._has_full_gains:
+            return ""
+        return instability_in_words(self._error, self._named_gains)
 
     def observer_slowness(self) -> str:
         """Why the observer alone is slower than the feedback; empty if it is not.
 
         After each saturation the feedback would act on an estimate that is still wrong.
         """
-        if _full_gains(self):
+        if self._has_full_gains:
             return ""
         return slowness_in_words(self._error, self.wc, self.dt, self._named_gains)
 
@@ -369,6 +328,10 @@ class LADRC(eqx.Module):
             return jnp.zeros(())
         full = dataclasses.replace(self, observer_factor=jnp.ones(()))
         return barrier(self._error, full._error, self.wc, self.dt)
+
+    @property
+    def _has_full_gains(self) -> bool:
+        return not np.any(np.asarray(self.observer_factor) != 1)
 
     @property
     def _error(self) -> Float[Array, "... states states"]:
@@ -388,8 +351,19 @@ class LADRC(eqx.Module):
         prefilter of the reference.
         """
         at = lambda gain: pick_gain(gain, axis, member)
-        factors = at(self.feedback_factor), at(self.observer_factor)
-        return continuous_ladrc(at(self.wc), at(self.wo), at(self.b0), self.order, factors)
+        wc, b0, half = at(self.wc), at(self.b0), at(self.feedback_factor)
+        l = at(self.observer_factor) * continuous_gains(at(self.wo), self.order)
+        one, zero = jnp.ones_like(b0), jnp.zeros_like(b0)
+        if self.order == 1:
+            kp = half * wc
+            back = [kp * l[0] + l[1], kp * l[1]]
+            below = [one, l[0] + kp, zero]
+        else:
+            kp, kd = half * wc**2, half * 2 * wc
+            back = [kp * l[0] + kd * l[1] + l[2], kp * l[1] + kd * l[2], kp * l[2]]
+            below = [one, l[0] + kd, l[1] + kd * l[0] + kp, zero]
+        ahead, below = kp * jnp.concatenate([one[None], l]), jnp.stack(below)
+        return TransferFunction(jnp.stack(back) / b0, below), TransferFunction(ahead / b0, below)
 
 
 _REMEDIES = {
@@ -399,26 +373,8 @@ _REMEDIES = {
 }
 
 
-def _full_gains(ladrc: LADRC) -> bool:
-    return not np.any(np.asarray(ladrc.observer_factor) != 1)
-
-
 def _gains(ladrc: LADRC) -> dict[str, Array]:
     return {
         "wc": ladrc.wc, "wo": ladrc.wo, "b0": ladrc.b0, "feedback_factor": ladrc.feedback_factor,
         "observer_factor": ladrc.observer_factor, "limit": ladrc.limit,
     }  # fmt: skip
-
-
-def _require_choices(ladrc: LADRC) -> None:
-    if ladrc.order not in (1, 2):
-        raise ValueError(
-            f"order is {ladrc.order}, but it must be 1 or 2: the plant's, from command to angle."
-        )
-    if ladrc.placement not in ("discrete", "continuous"):
-        raise ValueError(f'placement is {ladrc.placement!r}: choose "discrete" or "continuous".')
-    if not isinstance(ladrc.observer, Observer):
-        raise ValueError(
-            f"observer is {ladrc.observer!r}: choose CurrentObserver(), PredictiveObserver() or "
-            "EulerObserver(), or give an object with the methods of jq.control.Observer."
-        )

@@ -26,19 +26,22 @@ from jaxquad._core import (
     signal_shape,
 )
 
-from ._protocols import AntiWindup, LinearController, Member, Reference, Setpoint, Transform
+from ._protocols import (
+    AntiWindup,
+    Gain,
+    LinearController,
+    Member,
+    Reference,
+    Setpoint,
+    Signal,
+    Transform,
+)
 
 
 class Clamping(eqx.Module):
     """Anti-windup that stops the integral while it drives a saturated command beyond its limit."""
 
-    def __call__(
-        self,
-        growth: Float[Array, " axes *ensemble"],
-        wanted: Float[Array, " axes *ensemble"],
-        bounded: Float[Array, " axes *ensemble"],
-        dt: float,
-    ) -> Float[Array, " axes *ensemble"]:
+    def __call__(self, growth: Signal, wanted: Signal, bounded: Signal, dt: float) -> Signal:
         return jnp.where((wanted - bounded) * growth > 0, jnp.zeros_like(growth), growth)
 
 
@@ -56,23 +59,14 @@ class BackCalculation(eqx.Module):
     - `ValueError`: the time is not above 0.
     """
 
-    time: Float[Array, "..."] = per_member(
-        rank=1, converter=as_float
-    )  # s; usually between kd/kp and kp/ki
+    time: Gain = per_member(rank=1, converter=as_float)  # s; usually between kd/kp and kp/ki
 
     def __check_init__(self):
         require_positive("The tracking time", self.time, "give seconds, usually kd/kp to kp/ki")
 
-    def __call__(
-        self,
-        growth: Float[Array, " axes *ensemble"],
-        wanted: Float[Array, " axes *ensemble"],
-        bounded: Float[Array, " axes *ensemble"],
-        dt: float,
-    ) -> Float[Array, " axes *ensemble"]:
-        follow = -jnp.expm1(
-            -dt / broadcast_gain(self.time, bounded)
-        )  # a sample's part, whatever the time
+    def __call__(self, growth: Signal, wanted: Signal, bounded: Signal, dt: float) -> Signal:
+        share = -dt / broadcast_gain(self.time, bounded)
+        follow = -jnp.expm1(share)  # a sample's part, whatever the time
         return growth + follow * (bounded - wanted)
 
 
@@ -80,7 +74,7 @@ Transition = Float[Array, "2 2 ..."]
 Filtered = tuple[Array, Array]  # the filtered angle in rad and its rate in rad/s
 
 
-def butterworth(bandwidth: Float[Array, "..."], dt: float) -> Transition:
+def butterworth(bandwidth: Gain, dt: float) -> Transition:
     """What is left after `dt` of a second-order Butterworth filter's error, and of its rate.
 
     Of v'' + sqrt(2) w v' + w^2 v = w^2 y with w = `bandwidth` in rad/s: exp(A dt), in closed form.
@@ -92,9 +86,7 @@ def butterworth(bandwidth: Float[Array, "..."], dt: float) -> Transition:
     return jnp.stack([jnp.stack(row) for row in rows])
 
 
-def filtered(
-    transition: Transition, before: Filtered, measurement: Float[Array, " axes *ensemble"]
-) -> Filtered:
+def filtered(transition: Transition, before: Filtered, measurement: Signal) -> Filtered:
     """A sample later, exactly for a measurement that was held over the sample before it."""
     (aa, ar), (ra, rr) = [[broadcast_gain(gain, measurement) for gain in row] for row in transition]
     away, rate = before[0] - measurement, before[1]
@@ -104,8 +96,8 @@ def filtered(
 class PIDState(NamedTuple):
     """What a PID remembers from the last sample."""
 
-    integral: Float[Array, " axes *ensemble"]  # units of the command; see `PIDLaw`
-    rate: Float[Array, " axes *ensemble"]  # filtered, without the sample to come, rad/s
+    integral: Signal  # units of the command; see `PIDLaw`
+    rate: Signal  # filtered, without the sample to come, rad/s
     started: Float[Array, ""]  # 0 before the first sample, then 1
     filtered: Filtered | None = None  # of the measurement, where it is filtered
 
@@ -116,7 +108,7 @@ class PIDLaw(eqx.Module):
     Without that filter the state's integral is ahead by half a sample, by the trapezoidal rule.
     """
 
-    gains: Mapping[str, Float[Array, "..."]] = per_member(rank=1)
+    gains: Mapping[str, Gain] = per_member(rank=1)
     transition: Transition | None = per_member(rank=3)
     anti_windup: AntiWindup | None
     dt: float = eqx.field(static=True)
@@ -126,19 +118,15 @@ class PIDLaw(eqx.Module):
         """The trailing shape of the gains, () for one controller."""
         return ensemble_shape(self)
 
-    def init(
-        self,
-        like: Float[Array, " axes *ensemble"],
-        measurement: Float[Array, " axes *ensemble"] | None = None,
-    ) -> PIDState:
+    def init(self, like: Signal, measurement: Signal | None = None) -> PIDState:
         zero = jnp.zeros(signal_shape(like, self.ensemble), like.dtype)
         first = zero if measurement is None else zero + align(measurement, zero)
         smooth = None if self.transition is None else (first, zero)
         return PIDState(zero, zero, jnp.zeros((), like.dtype), smooth)
 
     def step(
-        self, state: PIDState, reference: Reference, measurement: Float[Array, " axes *ensemble"]
-    ) -> tuple[PIDState, Float[Array, " axes *ensemble"]]:
+        self, state: PIDState, reference: Reference, measurement: Signal
+    ) -> tuple[PIDState, Signal]:
         reference = match_reference(reference, measurement, state.integral)
         gain = lambda name: broadcast_gain(self.gains[name], measurement)
         angle = reference.angle if isinstance(reference, Setpoint) else reference
@@ -181,51 +169,6 @@ class PIDLaw(eqx.Module):
         return memory, rate if smooth is None else rate - smooth[1]
 
 
-def linear_pid(gains: Mapping[str, Float[Array, ""]], dt: float) -> LinearController:
-    """A PID of one axis without its limit.
-
-    The states are the integral, the filtered rate and, of a filtered measurement, the filter's.
-    """
-    if "measurement_filter" in gains:
-        return _behind_a_filter(gains, dt)
-    kp, ki, kd = gains["kp"], gains["ki"], gains["kd"]
-    keep = jnp.exp(-dt * gains["filter"])
-    sharp = (1 - keep) / dt
-    weight = gains["derivative_weight"]
-    one, zero = jnp.ones_like(kp), jnp.zeros_like(kp)
-    half = 0.5 * dt * ki
-    back = (keep - 1) * sharp  # what a sample of the angle leaves in the filter
-    return LinearController(
-        A=jnp.stack([jnp.stack([one, zero]), jnp.stack([zero, keep])]),
-        reference_in=jnp.stack([2 * half, back * weight]),
-        measurement_in=jnp.stack([-2 * half, -back]),
-        C=jnp.stack([one, kd]),
-        reference_through=kp * gains["proportional_weight"] + half + kd * sharp * weight,
-        measurement_through=-kp - half - kd * sharp,
-        dt=dt,
-    )
-
-
-def _behind_a_filter(gains: Mapping[str, Float[Array, ""]], dt: float) -> LinearController:
-    kp, ki, kd = gains["kp"], gains["ki"], gains["kd"]
-    transition = butterworth(gains["measurement_filter"], dt)
-    entry = jnp.array([1.0, 0.0], kp.dtype) - transition[:, 0]  # of the measurement
-    bare = linear_pid({k: x for k, x in gains.items() if k != "measurement_filter"}, dt)
-    on_filter = jnp.stack([kp + dt * ki, kd])  # u = ... - on_filter (v, v')
-    none, zeros = jnp.zeros((2, 2), kp.dtype), jnp.zeros(2, kp.dtype)
-    grown = none.at[0, 0].set(-dt * ki)  # of the integral, by v
-    dot = lambda a, b: jnp.dot(a, b, precision="highest")
-    return LinearController(
-        A=jnp.block([[bare.A, dot(grown, transition)], [none, transition]]),
-        reference_in=jnp.concatenate([bare.reference_in, zeros]),
-        measurement_in=jnp.concatenate([dot(grown, entry), entry]),
-        C=jnp.concatenate([bare.C, -dot(on_filter, transition)]),
-        reference_through=bare.reference_through + 0.5 * dt * ki,
-        measurement_through=-dot(on_filter, entry),
-        dt=dt,
-    )
-
-
 class PID(eqx.Module):
     """PID control with two degrees of freedom, a filtered derivative and anti-windup, sampled.
 
@@ -257,23 +200,17 @@ class PID(eqx.Module):
         `dt` is not above 0.
     """
 
-    kp: Float[Array, "..."] = per_member(rank=1, converter=as_float)  # per rad
-    ki: Float[Array, "..."] = per_member(rank=1, converter=as_float)  # per rad s
-    kd: Float[Array, "..."] = per_member(rank=1, converter=as_float)  # per rad/s
-    filter: Float[Array, "..."] = per_member(
-        rank=1, converter=as_float, default=125.0
-    )  # rad/s: 20 Hz
-    proportional_weight: Float[Array, "..."] = per_member(rank=1, converter=as_float, default=1.0)
-    derivative_weight: Float[Array, "..."] = per_member(rank=1, converter=as_float, default=0.0)
-    feedforward: Float[Array, "..."] = per_member(
-        rank=1, converter=as_float, default=0.0
-    )  # per rad/s^2
-    measurement_filter: Float[Array, "..."] | None = per_member(  # rad/s
+    kp: Gain = per_member(rank=1, converter=as_float)  # per rad
+    ki: Gain = per_member(rank=1, converter=as_float)  # per rad s
+    kd: Gain = per_member(rank=1, converter=as_float)  # per rad/s
+    filter: Gain = per_member(rank=1, converter=as_float, default=125.0)  # rad/s: 20 Hz
+    proportional_weight: Gain = per_member(rank=1, converter=as_float, default=1.0)
+    derivative_weight: Gain = per_member(rank=1, converter=as_float, default=0.0)
+    feedforward: Gain = per_member(rank=1, converter=as_float, default=0.0)  # per rad/s^2
+    measurement_filter: Gain | None = per_member(  # rad/s
         rank=1, converter=as_float_or_none, default=None
     )
-    limit: Float[Array, "..."] = per_member(
-        rank=1, converter=as_float, default=float("inf")
-    )  # of |u|
+    limit: Gain = per_member(rank=1, converter=as_float, default=float("inf"))  # of |u|
     anti_windup: AntiWindup | None = Clamping()  # None: the integral winds up
     dt: float = eqx.field(static=True, default=0.002)  # s
 
@@ -306,11 +243,7 @@ class PID(eqx.Module):
         transition = None if smooth is None else butterworth(smooth, self.dt)
         return PIDLaw(_gains(self), transition, self.anti_windup, self.dt)
 
-    def init(
-        self,
-        like: Float[Array, " axes *ensemble"],
-        measurement: Float[Array, " axes *ensemble"] | None = None,
-    ) -> PIDState:
+    def init(self, like: Signal, measurement: Signal | None = None) -> PIDState:
         """With an empty integral; shaped as `like` and the ensemble of the gains.
 
         A filter of the measurement starts at rest at angle 0, or at `measurement` in rad.
@@ -318,8 +251,8 @@ class PID(eqx.Module):
         return self.prepared().init(like, measurement)
 
     def step(
-        self, state: PIDState, reference: Reference, measurement: Float[Array, " axes *ensemble"]
-    ) -> tuple[PIDState, Float[Array, " axes *ensemble"]]:
+        self, state: PIDState, reference: Reference, measurement: Signal
+    ) -> tuple[PIDState, Signal]:
         """One sample: the command to hold until the next one.
 
         `reference` is a `Setpoint`, or angles in rad without feed-forward. The first sample starts
@@ -328,9 +261,42 @@ class PID(eqx.Module):
         return self.prepared().step(state, reference, measurement)
 
     def linear(self, axis: int = 0, member: Member = None) -> LinearController:
-        """One axis without its limit, exactly; `member` picks one of an ensemble."""
+        """One axis without its limit, exactly; `member` picks one of an ensemble.
+
+        The states are the integral, the filtered rate and, of a filtered measurement, the filter's.
+        """
         gains = {name: pick_gain(gain, axis, member) for name, gain in _gains(self).items()}
-        return linear_pid(gains, self.dt)
+        kp, ki, kd = gains["kp"], gains["ki"], gains["kd"]
+        keep = jnp.exp(-self.dt * gains["filter"])
+        sharp, half = (1 - keep) / self.dt, 0.5 * self.dt * ki
+        weight, one, zero = gains["derivative_weight"], jnp.ones_like(kp), jnp.zeros_like(kp)
+        back = (keep - 1) * sharp  # what a sample of the angle leaves in the filter
+        bare = LinearController(
+            A=jnp.stack([jnp.stack([one, zero]), jnp.stack([zero, keep])]),
+            reference_in=jnp.stack([2 * half, back * weight]),
+            measurement_in=jnp.stack([-2 * half, -back]),
+            C=jnp.stack([one, kd]),
+            reference_through=kp * gains["proportional_weight"] + half + kd * sharp * weight,
+            measurement_through=-kp - half - kd * sharp,
+            dt=self.dt,
+        )
+        if self.measurement_filter is None:
+            return bare
+        transition = butterworth(gains["measurement_filter"], self.dt)
+        entry = jnp.array([1.0, 0.0], kp.dtype) - transition[:, 0]  # of the measurement
+        on_filter = jnp.stack([kp + self.dt * ki, kd])  # u = ... - on_filter (v, v')
+        none, zeros = jnp.zeros((2, 2), kp.dtype), jnp.zeros(2, kp.dtype)
+        grown = none.at[0, 0].set(-self.dt * ki)  # of the integral, by v
+        dot = lambda a, b: jnp.dot(a, b, precision="highest")
+        return LinearController(
+            A=jnp.block([[bare.A, dot(grown, transition)], [none, transition]]),
+            reference_in=jnp.concatenate([bare.reference_in, zeros]),
+            measurement_in=jnp.concatenate([dot(grown, entry), entry]),
+            C=jnp.concatenate([bare.C, -dot(on_filter, transition)]),
+            reference_through=bare.reference_through + 0.5 * self.dt * ki,
+            measurement_through=-dot(on_filter, entry),
+            dt=self.dt,
+        )
 
     def tunable(self) -> dict[str, Transform | None]:
         """The gains of the three terms, their filters and the weight, where they are not 0."""
@@ -360,8 +326,8 @@ def _gains(pid: PID) -> dict[str, Array]:
 class PDState(NamedTuple):
     """The last measurement and the filtered derivative of the measurements."""
 
-    measurement: Float[Array, " axes *ensemble"]
-    rate: Float[Array, " axes *ensemble"]
+    measurement: Signal
+    rate: Signal
     started: Float[Array, ""]  # 0 before the first sample, then 1
 
 
@@ -383,8 +349,8 @@ class PD(eqx.Module):
     - `ValueError`: `dt` or `bandwidth` is not positive.
     """
 
-    proportional: Float[Array, "..."] = per_member(rank=1, converter=as_float)  # per rad
-    derivative: Float[Array, "..."] = per_member(rank=1, converter=as_float)  # per rad/s
+    proportional: Gain = per_member(rank=1, converter=as_float)  # per rad
+    derivative: Gain = per_member(rank=1, converter=as_float)  # per rad/s
     bandwidth: float = eqx.field(static=True, default=125.0)  # 20 Hz
     dt: float = eqx.field(static=True, default=0.002)
 
@@ -397,17 +363,14 @@ class PD(eqx.Module):
         """The trailing shape of the gains, () for one controller."""
         return ensemble_shape(self)
 
-    def init(self, like: Float[Array, " axes *ensemble"]) -> PDState:
+    def init(self, like: Signal) -> PDState:
         """At rest; shaped as the measurement `like` and the ensemble of the gains."""
         zero = jnp.zeros(signal_shape(like, self.ensemble), like.dtype)
         return PDState(zero, zero, jnp.zeros((), like.dtype))
 
     def step(
-        self,
-        state: PDState,
-        reference: Reference,
-        measurement: Float[Array, " axes *ensemble"],
-    ) -> tuple[PDState, Float[Array, " axes *ensemble"]]:
+        self, state: PDState, reference: Reference, measurement: Signal
+    ) -> tuple[PDState, Signal]:
         """One sample: the command to hold until the next one.
 
         **Raises:**
@@ -422,10 +385,8 @@ class PD(eqx.Module):
         keep = jnp.exp(jnp.asarray(-self.bandwidth * self.dt, measurement.dtype))
         slope = (measurement - state.measurement) * (state.started / self.dt)
         rate = keep * state.rate + (1 - keep) * slope
-        gain, damping = (
-            broadcast_gain(self.proportional, measurement),
-            broadcast_gain(self.derivative, measurement),
-        )
+        gain = broadcast_gain(self.proportional, measurement)
+        damping = broadcast_gain(self.derivative, measurement)
         command = gain * (reference - measurement) - damping * rate
         return PDState(measurement, rate, jnp.ones_like(state.started)), command
 

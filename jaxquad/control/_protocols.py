@@ -9,22 +9,19 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
 
+Signal = Float[Array, " axes *ensemble"]  # of each axis and each member
+Gain = Float[Array, "..."]  # one number, one for each axis, or `[axes, *ensemble]`
+
+
 class Setpoint(NamedTuple):
-    """A reference with its derivatives, for feed-forward.
+    """A reference with its derivatives, for feed-forward."""
 
-    **Arguments:**
-
-    - `angle`: rad.
-    - `rate`: rad/s.
-    - `acceleration`: rad/s^2.
-    """
-
-    angle: Float[Array, " axes *ensemble"]
-    rate: Float[Array, " axes *ensemble"]
-    acceleration: Float[Array, " axes *ensemble"]
+    angle: Signal  # rad
+    rate: Signal  # rad/s
+    acceleration: Signal  # rad/s^2
 
 
-Reference = Setpoint | Float[Array, " axes *ensemble"]  # angles in rad have no feed-forward
+Reference = Setpoint | Signal  # angles in rad have no feed-forward
 Member = int | tuple[int | Array, ...] | Array | None  # None where there is no ensemble
 
 
@@ -73,7 +70,7 @@ class ScheduledController(Protocol):
 class Transform(Protocol):
     """Unbounded coordinates for an array that is not free in every direction."""
 
-    def forward(self, z: Float[Array, "..."]) -> Float[Array, "..."]:
+    def forward(self, z: Gain) -> Gain:
         """The array at any coordinates `z` of its shape, differentiable."""
         ...
 
@@ -161,19 +158,15 @@ class Observer(Protocol):
         """The highest wo dt."""
         ...
 
-    def gains(self, wo: Float[Array, "..."], dt: float, order: int) -> Float[Array, "states ..."]:
+    def gains(self, wo: Gain, dt: float, order: int) -> Float[Array, "states ..."]:
         """The gains as textbooks print them for this form; `wo` in rad/s, `dt` in s."""
         ...
 
-    def correction(
-        self, wo: Float[Array, "..."], dt: float, order: int
-    ) -> Float[Array, "states ..."]:
+    def correction(self, wo: Gain, dt: float, order: int) -> Float[Array, "states ..."]:
         """What multiplies the error of the predicted y."""
         ...
 
-    def predict(
-        self, estimate: Sequence[Float[Array, "..."]], drive: Float[Array, "..."], dt: float
-    ) -> list[Float[Array, "..."]]:
+    def predict(self, estimate: Sequence[Gain], drive: Gain, dt: float) -> list[Gain]:
         """The states one sample later."""
         ...
 
@@ -185,28 +178,15 @@ class AntiWindup(Protocol):
     `growth` is what the error asks for, `wanted` the command before its limit, `bounded` after it.
     """
 
-    def __call__(
-        self,
-        growth: Float[Array, " axes *ensemble"],
-        wanted: Float[Array, " axes *ensemble"],
-        bounded: Float[Array, " axes *ensemble"],
-        dt: float,
-    ) -> Float[Array, " axes *ensemble"]: ...
+    def __call__(self, growth: Signal, wanted: Signal, bounded: Signal, dt: float) -> Signal: ...
 
 
 class InertiaEstimate(NamedTuple):
-    """An estimate of the inertia with its uncertainty.
+    """An estimate of the inertia with its uncertainty."""
 
-    **Arguments:**
-
-    - `inertia`: kg m^2; the nominal one before any excitation.
-    - `deviation`: kg m^2, one standard deviation.
-    - `trusted`: 1 where excited and precise enough, else 0.
-    """
-
-    inertia: Float[Array, " axes *ensemble"]
-    deviation: Float[Array, " axes *ensemble"]
-    trusted: Float[Array, " axes *ensemble"]
+    inertia: Signal  # kg m^2; the nominal one before any excitation
+    deviation: Signal  # kg m^2, one standard deviation
+    trusted: Signal  # 1 where excited and precise enough, else 0
 
 
 @runtime_checkable
@@ -216,16 +196,11 @@ class InertiaEstimator(Protocol):
     An estimator made for one sample interval says so by an attribute `dt` in s.
     """
 
-    def init(self, like: Float[Array, " axes *ensemble"]) -> PyTree:
+    def init(self, like: Signal) -> PyTree:
         """The state before the first sample, for measurements shaped as `like`."""
         ...
 
-    def update(
-        self,
-        state: PyTree,
-        command: Float[Array, " axes *ensemble"],
-        measurement: Float[Array, " axes *ensemble"],
-    ) -> PyTree:
+    def update(self, state: PyTree, command: Signal, measurement: Signal) -> PyTree:
         """The state after one more sample.
 
         `command` is what the plant received since the last sample, `measurement` the angle in rad
@@ -242,7 +217,7 @@ class InertiaEstimator(Protocol):
 class ProbingEstimator(InertiaEstimator, Protocol):
     """An `InertiaEstimator` with a test signal of its own."""
 
-    def probe(self, state: PyTree) -> Float[Array, " axes *ensemble"]:
+    def probe(self, state: PyTree) -> Signal:
         """The test signal to add to the next command."""
         ...
 

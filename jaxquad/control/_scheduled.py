@@ -1,35 +1,314 @@
-"""Controllers whose gains follow from an inertia: given, or estimated in flight."""
+"""Maps from an inertia to b0, and controllers whose gains follow one: given, or as estimated."""
 
 import dataclasses
 import functools as ft
 import math
 from collections.abc import Callable, Collection
-from typing import NamedTuple, Protocol, runtime_checkable
+from typing import NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Float, PyTree
+import numpy as np
+from jaxtyping import Array, ArrayLike, Bool, Float, PyTree
 
 from jaxquad._compile import hasty_options, Jit
 from jaxquad._core import (
     as_float,
     broadcast_gain,
     ensemble_shape,
+    is_concrete,
     multiply_gains,
+    on_host,
+    per_member,
     require_all_positive,
+    require_common_shape,
+    require_finite,
     require_positive,
     signal_shape,
 )
 
 from ._ladrc import LADRC, LADRCLaw, LADRCState
 from ._pid import PID
-from ._protocols import InertiaEstimator, ProbingEstimator, Reference, Transform, Tunable
+from ._protocols import (
+    Gain,
+    InertiaEstimator,
+    ProbingEstimator,
+    Reference,
+    Signal,
+    Transform,
+    Tunable,
+)
 
 
 InertiaToGain = Callable[[Array], Array]  # kg m^2 to b0 in rad/s^2 per unit of command
 
 
-class ScheduledLADRC(eqx.Module):
+def _require_rising(name: str, values: Array) -> None:
+    rises = not is_concrete(values) or np.all(np.diff(np.asarray(values)) > 0)
+    if values.ndim != 1 or values.size < 2 or not rises:
+        raise ValueError(f"{name} are {values}: give two or more that rise.")
+
+
+class FuzzyMap(eqx.Module):
+    """b0' = b0 + db0(delta) by fuzzy inference, delta = J / nominal.
+
+    A triangular set stands on each of the `centres`, reaching to its neighbours, the outer ones
+    level beyond; "if delta is P_i then db0 is P_j" gives each set one of the `increments`, and
+    defuzzification is the weighted average. The memberships sum to 1, so that this is the straight
+    line between (centre, increment) points, and nothing else.
+    Source: Eq. (25) of the paper and its text; docs/equations.md.
+
+    **Arguments:**
+
+    - `nominal`: the inertia in kg m^2 at which delta is 1; `b0`: in rad/s^2 per unit of command.
+        Both are scalars, one value per axis, or `[axes, *ensemble]`.
+    - `centres`: of the sets, two or more values of delta that rise.
+    - `increments`: of b0, one for each set.
+
+    **Raises:**
+
+    - `ValueError`: the centres do not rise, or an increment leaves no b0 above 0.
+    """
+
+    nominal: Gain = per_member(rank=1, converter=as_float)  # kg m^2
+    b0: Gain = per_member(rank=1, converter=as_float)  # rad/s^2 per unit of command
+    centres: Float[Array, " sets"] = eqx.field(converter=as_float)  # of delta
+    increments: Float[Array, " sets"] = eqx.field(converter=as_float)  # of b0
+
+    def __check_init__(self):
+        require_positive("nominal", self.nominal, "give the inertia at which delta is 1")
+        require_positive("b0", self.b0, "give that of the controller")
+        require_finite("increments", self.increments)
+        _require_rising("centres", self.centres)
+        if self.increments.shape != self.centres.shape:
+            raise ValueError(
+                f"increments have the shape {self.increments.shape}: give one for each of the "
+                f"{self.centres.size} sets."
+            )
+        if is_concrete(self.b0) and is_concrete(self.increments):
+            least = np.min(self.b0) + np.min(self.increments)
+            require_positive("b0 + increment", least, "raise b0 or the lowest increment")
+
+    @property
+    def ensemble(self) -> tuple[int, ...]:
+        """The trailing shape of the map, () for one controller."""
+        return ensemble_shape({"nominal": self.nominal, "b0": self.b0}, rank=1)
+
+    def memberships(self, delta: Signal) -> Float[Array, " sets axes *ensemble"]:
+        """Of each set, from 0 to 1."""
+        centres = self.centres.astype(delta.dtype)
+        inside = jnp.clip(delta, centres[0], centres[-1])
+        rise = [jnp.ones_like(delta)]
+        for k in range(len(self.centres) - 1):
+            rise.append((inside - centres[k]) / (centres[k + 1] - centres[k]))
+        fall = [1 - up for up in rise[1:]] + [jnp.ones_like(delta)]
+        return jnp.stack(
+            [jnp.clip(jnp.minimum(a, b), 0, 1) for a, b in zip(rise, fall, strict=True)]
+        )
+
+    def __call__(self, inertia: Signal) -> Signal:
+        """b0 in rad/s^2 per unit of command at an `inertia` in kg m^2."""
+        require_common_shape({"inertia": inertia, "nominal": self.nominal, "b0": self.b0})
+        delta = inertia / broadcast_gain(self.nominal, inertia)
+        P = self.memberships(delta)
+        increments = self.increments.astype(P.dtype).reshape((-1,) + (1,) * inertia.ndim)
+        db0 = jnp.sum(P * increments, axis=0) / jnp.sum(P, axis=0)  # the average weight method
+        return broadcast_gain(self.b0, inertia) + db0
+
+    def tunable(self) -> dict[str, Transform | None]:
+        """b0; the increments may cross 0, so they need `jq.identify.Real`."""
+        return {"b0": None}
+
+
+def printed_map(nominal: Gain | float, *, b0: float = 3.0) -> FuzzyMap:
+    """The map with the ranges that the paper prints, to show what they do; not for use.
+
+    Eight sets over 1 < delta < 22 and 0 <= db0 <= 24 can only raise b0, while the paper's own b0
+    falls from 3 to 1.6, which is delta = 1.875. There this map says 4.0, past the stability limit
+    of LADRC(10, 30) on the Hover: the ITAE of a step over 10 s grows from 1.4 to 21. At delta = 22
+    it says 27, and the loop diverges.
+    """
+    return FuzzyMap(nominal, b0, np.linspace(1.0, 22.0, 8), np.linspace(0.0, 24.0, 8))
+
+
+_SHARPNESS = 20.0
+_FLATTEST = 0.05  # nepers from row to row at the start of a tune: a flat start has no gradient
+
+
+class Falling(eqx.Module):
+    """Coordinates for an array whose rows fall from one to the next: a `Transform`.
+
+    The first row is its own coordinate; each further row is softplus(20 z) / 20 below the last.
+    """
+
+    def forward(self, z: Float[Array, "rows ..."]) -> Float[Array, "rows ..."]:
+        drops = jax.nn.softplus(_SHARPNESS * z[1:]) / _SHARPNESS
+        return z[:1] - jnp.concatenate([jnp.zeros_like(z[:1]), jnp.cumsum(drops, axis=0)])
+
+    def inverse(self, values: Float[np.ndarray, "rows ..."]) -> Float[np.ndarray, "rows ..."]:
+        """Coordinates of the falling rows nearest to `values`; rows fall by 0.05 at least."""
+        drops = np.maximum(values[:-1] - values[1:], _FLATTEST)
+        return np.concatenate([values[:1], np.log(np.expm1(_SHARPNESS * drops)) / _SHARPNESS])
+
+
+class InertiaMap(eqx.Module):
+    """From an inertia to the controller's gain b0: piecewise linear in ln J -> ln b0.
+
+    Straight between `knots`, constant beyond the first and the last. Slope -1 is b0 = KT / J, which
+    `certainty_equivalence` makes. Triangular fuzzy sets with averaged outputs are such a map, too:
+    see `jq.control.FuzzyMap`. Source: Eq. (25) of the paper, docs/equations.md, with another map.
+
+    **Arguments:**
+
+    - `nominal`: the design's inertia in kg m^2, a scalar, one value per axis, or
+        `[axes, *ensemble]`.
+    - `knots`: ln(J / nominal), two or more values that rise.
+    - `values`: ln b0 at each knot, `[knots]`, `[knots, axes]` or `[knots, axes, *ensemble]`.
+
+    **Raises:**
+
+    - `ValueError`: the knots do not rise, or the shapes do not fit.
+    """
+
+    nominal: Gain = per_member(rank=1, converter=as_float)  # kg m^2; axes *ensemble
+    knots: Float[Array, " knots"] = eqx.field(converter=as_float)  # ln(J / nominal)
+    values: Float[Array, " knots ..."] = per_member(
+        rank=2, converter=as_float
+    )  # ln b0; axes *ensemble
+
+    def __check_init__(self):
+        require_positive("nominal", self.nominal, "give the design's inertia in kg m^2")
+        require_finite("knots", self.knots)
+        require_finite("values", self.values)
+        _require_rising("knots", self.knots)
+        if self.values.ndim == 0 or self.values.shape[0] != self.knots.size:
+            raise ValueError(
+                f"values have the shape {self.values.shape}: give one for each of the "
+                f"{self.knots.size} knots, (knots,), (knots, axes) or (knots, axes, members)."
+            )
+
+    @property
+    def ensemble(self) -> tuple[int, ...]:
+        """The trailing shape of the map, () for one controller."""
+        return ensemble_shape({"nominal": self.nominal, "values": self.values[0]}, rank=1)
+
+    def __call__(self, inertia: Signal) -> Signal:
+        """b0 in rad/s^2 per unit of command at an `inertia` in kg m^2."""
+        require_common_shape(
+            {"inertia": inertia, "nominal": self.nominal, "values": self.values[0]}
+        )
+        nominal = broadcast_gain(self.nominal, inertia)
+        x = jnp.log(jnp.maximum(inertia / nominal, 1e-6))
+        # Constant beyond the knots, without a search: a sum of clipped ramps.
+        knots, rows = self.knots.astype(x.dtype), [broadcast_gain(row, x) for row in self.values]
+        y = jnp.broadcast_to(rows[0], x.shape)
+        for k in range(len(rows) - 1):
+            share = jnp.clip((x - knots[k]) / (knots[k + 1] - knots[k]), 0, 1)
+            y = y + (rows[k + 1] - rows[k]) * share
+        return jnp.exp(y)
+
+    def tunable(self) -> dict[str, Transform | None]:
+        """The values, which keep falling."""
+        return {"values": Falling()}
+
+    @property
+    def falls(self) -> Bool[Array, ""]:
+        """Whether more inertia never raises b0, as for a plant of gain KT / J it should be."""
+        return jnp.all(jnp.diff(self.values, axis=0) <= 0)
+
+
+def certainty_equivalence(
+    torque_gain: Float[ArrayLike, "..."],
+    nominal: Float[ArrayLike, "..."],
+    *,
+    span: tuple[float, float] = (0.2, 5.0),
+    knots: int = 6,
+    factor: float = 1.0,
+) -> InertiaMap:
+    """The map b0 = `factor` KT / J: the estimate is used as if it were the true inertia.
+
+    **Arguments:**
+
+    - `torque_gain`: KT in N m per unit of command; `nominal`: in kg m^2. Both are scalars, one
+        value per axis, or `[axes, *ensemble]`.
+    - `span`: the lowest and the highest J / nominal; b0 is constant beyond.
+    - `knots`: how many.
+    - `factor`: with a lag in the loop a value above 1 is better, about 1.8 for 20 ms.
+
+    **Returns:**
+
+    An `InertiaMap`.
+
+    **Raises:**
+
+    - `ValueError`: a value is not positive, or the span is not one.
+    """
+    torque_gain, nominal = as_float(torque_gain), as_float(nominal)
+    require_positive("torque_gain", torque_gain, "give N m per unit of command, L Kf of the Hover")
+    require_positive("factor", as_float(factor), "1 is certainty equivalence")
+    low, high = span
+    if not 0 < low < high < float("inf") or knots < 2:
+        raise ValueError(
+            f"span is {span} times the nominal inertia in {knots} knots: give 0 < low < high and "
+            "2 knots or more."
+        )
+    places = np.linspace(np.log(low), np.log(high), knots)
+    top = on_host(_log_gain(torque_gain, nominal, as_float(factor)))
+    return InertiaMap(nominal, places, top[None] - places.reshape((-1,) + (1,) * top.ndim))
+
+
+@eqx.filter_jit  # as one program
+def _log_gain(torque_gain: Gain, nominal: Gain, factor: Float[Array, ""]) -> Gain:
+    """ln b0 at the nominal inertia."""
+    return jnp.log(factor * multiply_gains(torque_gain, 1 / nominal))
+
+
+class _ScheduledByMap(eqx.Module):
+    ladrc: eqx.AbstractVar[LADRC | LADRCLaw]
+    map: eqx.AbstractVar[InertiaToGain]
+
+    @property
+    def dt(self) -> float:
+        return self.ladrc.dt
+
+    @property
+    def ensemble(self) -> tuple[int, ...]:
+        return ensemble_shape(self)
+
+    def scheduled_at(self, inertia: Float[ArrayLike, "..."]) -> LADRC:
+        """As `jq.control.ScheduledController`; one value per axis, or `[axes, *ensemble]`.
+
+        **Raises:** ValueError for an inertia that is not above 0 or does not fit the axes of the
+        map, and for a controller that has been prepared.
+        """
+        if isinstance(self.ladrc, LADRCLaw):
+            raise ValueError(
+                "A prepared controller has no wc and wo: schedule the one that it was made of."
+            )
+        return dataclasses.replace(self.ladrc, b0=gain_at(self.map, inertia))
+
+    def tunable(self) -> dict[str, Transform | None]:
+        """The bandwidths of the `ladrc`, whose b0 the map gives, and what the map says."""
+        of_ladrc = {k: x for k, x in tunable_of("ladrc", self.ladrc).items() if k != "ladrc.b0"}
+        return of_ladrc | tunable_of("map", self.map)
+
+    # Of a prepared controller nothing is said of its observer.
+
+    def observer_instability(self) -> str:
+        return "" if isinstance(self.ladrc, LADRCLaw) else self.ladrc.observer_instability()
+
+    def observer_slowness(self) -> str:
+        return "" if isinstance(self.ladrc, LADRCLaw) else self.ladrc.observer_slowness()
+
+    def observer_barrier(self, free: Collection[str]) -> Float[Array, ""]:
+        if isinstance(self.ladrc, LADRCLaw):
+            return jnp.zeros(())
+        names = [name.removeprefix("ladrc.") for name in free if name.startswith("ladrc.")]
+        return self.ladrc.observer_barrier(names)
+
+
+class ScheduledLADRC(_ScheduledByMap):
     """A `LADRC` whose b0 is `map(inertia)` of an inertia in kg m^2 that it is given.
 
     The `ladrc`'s own b0 has no effect. A loop flies and analyses `scheduled_at(inertia)`; exported
@@ -44,44 +323,6 @@ class ScheduledLADRC(eqx.Module):
 
     ladrc: LADRC
     map: InertiaToGain
-
-    @property
-    def dt(self) -> float:
-        return self.ladrc.dt
-
-    @property
-    def ensemble(self) -> tuple[int, ...]:
-        """The trailing shape of all gains, () for one controller."""
-        return ensemble_shape(self)
-
-    def scheduled_at(self, inertia: Float[ArrayLike, "..."]) -> LADRC:
-        """The LADRC at this `inertia`, with b0 fixed.
-
-        **Arguments:**
-
-        - `inertia`: in kg m^2, one value per axis, or `[axes, *ensemble]`.
-
-        **Raises:**
-
-        - `ValueError`: the inertia is not above 0, or does not fit the axes of the map.
-        """
-        return dataclasses.replace(self.ladrc, b0=gain_at(self.map, inertia))
-
-    def tunable(self) -> dict[str, Transform | None]:
-        """The bandwidths of the `ladrc` and what its map says."""
-        return tunable_bandwidths("ladrc", self.ladrc) | tunable_of("map", self.map)
-
-    def observer_instability(self) -> str:
-        """As `LADRC.observer_instability`."""
-        return self.ladrc.observer_instability()
-
-    def observer_slowness(self) -> str:
-        """As `LADRC.observer_slowness`."""
-        return self.ladrc.observer_slowness()
-
-    def observer_barrier(self, free: Collection[str]) -> Float[Array, ""]:
-        """As `LADRC.observer_barrier`."""
-        return self.ladrc.observer_barrier(names_within("ladrc", free))
 
 
 class ScheduledPID(eqx.Module):
@@ -110,22 +351,10 @@ class ScheduledPID(eqx.Module):
         return ensemble_shape(self)
 
     def scheduled_at(self, inertia: Float[ArrayLike, "..."]) -> PID:
-        """The PID at this `inertia`, with its gains fixed.
-
-        **Arguments:**
-
-        - `inertia`: in kg m^2, one value per axis, or `[axes, *ensemble]`.
-
-        **Raises:**
-
-        - `ValueError`: the inertia is not above 0, or does not fit the axes of the map.
-        """
-        per_gain, pid = 1 / gain_at(self.map, inertia), self.pid
-        return dataclasses.replace(
-            pid, kp=multiply_gains(pid.kp, per_gain), ki=multiply_gains(pid.ki, per_gain),
-            kd=multiply_gains(pid.kd, per_gain),
-            feedforward=multiply_gains(pid.feedforward, per_gain),
-        )  # fmt: skip
+        """As `ScheduledLADRC.scheduled_at`."""
+        per_gain, names = 1 / gain_at(self.map, inertia), ("kp", "ki", "kd", "feedforward")
+        scaled = {name: multiply_gains(getattr(self.pid, name), per_gain) for name in names}
+        return dataclasses.replace(self.pid, **scaled)
 
     def tunable(self) -> dict[str, Transform | None]:
         """What the `pid` and its map say, but not kd where the map is tuned.
@@ -148,9 +377,7 @@ def gain_at(map: InertiaToGain, inertia: Float[ArrayLike, "..."]) -> Array:
 
 
 @ft.partial(Jit, options=hasty_options)  # a tune evaluates it for each ensemble that it draws
-def _evaluate_map(
-    map: InertiaToGain, inertia: Float[Array, "..."], shape: tuple[int, ...]
-) -> Array:
+def _evaluate_map(map: InertiaToGain, inertia: Gain, shape: tuple[int, ...]) -> Array:
     return map(jnp.broadcast_to(inertia, shape))
 
 
@@ -160,16 +387,6 @@ def tunable_of(owner: str, part: object) -> dict[str, Transform | None]:
     return {f"{owner}.{name}": transform for name, transform in transforms.items()}
 
 
-def tunable_bandwidths(owner: str, ladrc: object) -> dict[str, Transform | None]:
-    """What a LADRC says, without its b0, which a map gives."""
-    return {k: x for k, x in tunable_of(owner, ladrc).items() if k != f"{owner}.b0"}
-
-
-def names_within(owner: str, names: Collection[str]) -> list[str]:
-    """The names of what is in the field `owner`, as seen from there."""
-    return [name.removeprefix(f"{owner}.") for name in names if name.startswith(f"{owner}.")]
-
-
 class AdaptiveLADRCState(NamedTuple):
     """What an adaptive LADRC remembers from the last sample."""
 
@@ -177,13 +394,7 @@ class AdaptiveLADRCState(NamedTuple):
     estimator: PyTree
 
 
-@runtime_checkable
-class _Sampled(Protocol):
-    @property
-    def dt(self) -> float: ...
-
-
-class AdaptiveLADRC(eqx.Module):
+class AdaptiveLADRC(_ScheduledByMap):
     """A `LADRC` of order 2 whose b0 follows the inertia that an estimator finds in flight.
 
     b0 starts as the `ladrc`'s. While the estimate is trusted, b0 moves towards `map(inertia)` by a
@@ -207,7 +418,7 @@ class AdaptiveLADRC(eqx.Module):
 
     ladrc: LADRC | LADRCLaw
     estimator: InertiaEstimator
-    map: Callable[[Array], Array]  # kg m^2 to rad/s^2 per unit of command
+    map: InertiaToGain
     settling: float = eqx.field(static=True, default=0.5)  # s
 
     def __check_init__(self):
@@ -222,7 +433,7 @@ class AdaptiveLADRC(eqx.Module):
                 f"The ladrc is of order {self.ladrc.order}, but b0 = KT/J is the gain to an angle: "
                 "take order=2."
             )
-        made_for = self.estimator.dt if isinstance(self.estimator, _Sampled) else self.dt
+        made_for = getattr(self.estimator, "dt", self.dt)
         if not math.isclose(made_for, self.dt, rel_tol=1e-6):
             raise ValueError(
                 f"The estimator was made for samples of {made_for} s, the ladrc for {self.dt} s: "
@@ -230,16 +441,7 @@ class AdaptiveLADRC(eqx.Module):
             )
 
     @property
-    def dt(self) -> float:
-        return self.ladrc.dt
-
-    @property
-    def ensemble(self) -> tuple[int, ...]:
-        """The trailing shape of all gains, () for one controller."""
-        return ensemble_shape(self)
-
-    @property
-    def limit(self) -> Float[Array, "..."]:
+    def limit(self) -> Gain:
         """Of the command, either sign: that of the `ladrc`."""
         return self.ladrc.limit
 
@@ -249,60 +451,20 @@ class AdaptiveLADRC(eqx.Module):
             return self
         return AdaptiveLADRC(self.ladrc.prepared(), self.estimator, self.map, self.settling)
 
-    def scheduled_at(self, inertia: Float[ArrayLike, "..."]) -> LADRC:
-        """The LADRC that it is while its estimate is `inertia`, for a linear analysis.
-
-        **Arguments:**
-
-        - `inertia`: in kg m^2, one value per axis, or `[axes, *ensemble]`.
-
-        **Raises:**
-
-        - `ValueError`: the inertia is not above 0 or does not fit the axes of the map, or the
-            controller has been prepared.
-        """
-        if isinstance(self.ladrc, LADRCLaw):
-            raise ValueError(
-                "A prepared controller has no wc and wo: schedule the one that it was made of."
-            )
-        return dataclasses.replace(self.ladrc, b0=gain_at(self.map, inertia))
-
-    def tunable(self) -> dict[str, Transform | None]:
-        """The bandwidths of the `ladrc` and what the map says."""
-        return tunable_bandwidths("ladrc", self.ladrc) | tunable_of("map", self.map)
-
-    def observer_instability(self) -> str:
-        """As `LADRC.observer_instability`; a prepared controller is not looked at."""
-        return "" if isinstance(self.ladrc, LADRCLaw) else self.ladrc.observer_instability()
-
-    def observer_slowness(self) -> str:
-        """As `LADRC.observer_slowness`; a prepared controller is not looked at."""
-        return "" if isinstance(self.ladrc, LADRCLaw) else self.ladrc.observer_slowness()
-
-    def observer_barrier(self, free: Collection[str]) -> Float[Array, ""]:
-        """As `LADRC.observer_barrier`."""
-        if isinstance(self.ladrc, LADRCLaw):
-            return jnp.zeros(())
-        return self.ladrc.observer_barrier(names_within("ladrc", free))
-
-    def init(
-        self,
-        like: Float[Array, " axes *ensemble"],
-        measurement: Float[Array, " axes *ensemble"] | None = None,
-    ) -> AdaptiveLADRCState:
+    def init(self, like: Signal, measurement: Signal | None = None) -> AdaptiveLADRCState:
         """At rest at angle 0, or at `measurement` in rad; shaped as `like` and the ensemble."""
         full = jnp.zeros(signal_shape(like, self.ensemble), like.dtype)
         return AdaptiveLADRCState(self.ladrc.init(full, measurement), self.estimator.init(full))
 
     def step(
-        self,
-        state: AdaptiveLADRCState,
-        reference: Reference,
-        measurement: Float[Array, " axes *ensemble"],
-    ) -> tuple[AdaptiveLADRCState, Float[Array, " axes *ensemble"]]:
+        self, state: AdaptiveLADRCState, reference: Reference, measurement: Signal
+    ) -> tuple[AdaptiveLADRCState, Signal]:
         """One sample: the command to hold until the next one, with the test signal in it."""
         memory = self.estimator.update(state.estimator, state.ladrc.command, measurement)
-        b0 = self._adapt(state.ladrc.b0, memory)
+        estimate = self.estimator.estimate(memory)
+        share = estimate.trusted * -math.expm1(-self.dt / self.settling)
+        inertia = jnp.where(estimate.trusted > 0, estimate.inertia, jnp.ones_like(estimate.inertia))
+        b0 = state.ladrc.b0 + share * (self.map(inertia) - state.ladrc.b0)
         ladrc, command = self.ladrc.step_with(state.ladrc, reference, measurement, b0)
         if isinstance(self.estimator, ProbingEstimator):
             limit = broadcast_gain(self.ladrc.limit, command)
@@ -310,17 +472,7 @@ class AdaptiveLADRC(eqx.Module):
             ladrc = self.ladrc.applied(ladrc, command)
         return AdaptiveLADRCState(ladrc, memory), command
 
-    def _adapt(
-        self, b0: Float[Array, " axes *ensemble"], memory: PyTree
-    ) -> Float[Array, " axes *ensemble"]:
-        estimate = self.estimator.estimate(memory)
-        share = estimate.trusted * -math.expm1(-self.dt / self.settling)
-        inertia = jnp.where(estimate.trusted > 0, estimate.inertia, jnp.ones_like(estimate.inertia))
-        return b0 + share * (self.map(inertia) - b0)
-
-    def applied(
-        self, state: AdaptiveLADRCState, achieved: Float[Array, " axes *ensemble"]
-    ) -> AdaptiveLADRCState:
+    def applied(self, state: AdaptiveLADRCState, achieved: Signal) -> AdaptiveLADRCState:
         """What the drive really gave since the last `step`, for ladrc and estimator."""
         return state._replace(ladrc=self.ladrc.applied(state.ladrc, achieved))
 

@@ -1,11 +1,4 @@
-from ._curve_parameters import (
-    actuator as actuator,
-    B0Law as B0Law,
-    B0Schedule as B0Schedule,
-    curve_of_parameter as curve_of_parameter,
-    CurveFirmware as CurveFirmware,
-    FirmwareValue as FirmwareValue,
-)
+from ._fit_batch import BatchFit as BatchFit, fit_batch as fit_batch
 from ._gain_over_throttle import (
     gain_over_throttle as gain_over_throttle,
     throttle_levels as throttle_levels,
@@ -20,13 +13,18 @@ from ._known_filters import (
     without_filters as without_filters,
 )
 from ._thrust_curve import (
+    actuator as actuator,
+    B0Law as B0Law,
+    B0Schedule as B0Schedule,
+    curve_of_parameter as curve_of_parameter,
+    CurveFirmware as CurveFirmware,
+    FirmwareValue as FirmwareValue,
     GainBand as GainBand,
     GainOverThrottle as GainOverThrottle,
     PlantsOverThrottle as PlantsOverThrottle,
     ScaledB0 as ScaledB0,
     ThrottleLevels as ThrottleLevels,
 )
-from .batch._fit_batch import BatchFit as BatchFit, fit_batch as fit_batch
 from .frequency_domain._cost import (
     coherence_weight as coherence_weight,
     CoherenceWeighted as CoherenceWeighted,

@@ -19,9 +19,8 @@ from jaxquad.spectra import (
     LocalPolynomial,
 )
 
-from ._curve_parameters import relative_slope
 from ._known_filters import KnownFilter, without_filters
-from ._thrust_curve import GainOverThrottle, ThrottleLevels
+from ._thrust_curve import GainOverThrottle, relative_slope, ThrottleLevels
 from .frequency_domain._cost import usable
 from .frequency_domain._fit import fit, guess_lagged_integrator
 

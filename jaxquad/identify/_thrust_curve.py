@@ -1,7 +1,7 @@
 """The gain over the throttle by the thrust curve t = f x^2 + (1 - f) x, and b0."""
 
 from collections.abc import Mapping
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -10,19 +10,115 @@ from jaxtyping import ArrayLike, Float
 
 from jaxquad._core import plain_content
 
-from ._curve_parameters import (
-    actuator,
-    B0_POWERS,
-    B0Law,
-    B0Schedule,
-    curve_parameter,
-    CurveFirmware,
-    FirmwareValue,
-    parameter_of_curve,
-)
 from .frequency_domain._result import counted, Fit
 from .uncertainty._derived import draw_models
-from .uncertainty._verdict import Combination, UndeterminedError
+from .uncertainty._verdict import Combination, reach_of_interval, UndeterminedError
+
+
+CurveFirmware = Literal["px4", "ardupilot", "betaflight", "betaflight 2025.12"]
+_PARAMETERS: Mapping[str, tuple[str, float, float, float]] = {  # name, factor on f, least, most
+    "px4": ("THR_MDL_FAC", 1.0, 0.0, 1.0),
+    "ardupilot": ("MOT_THST_EXPO", 1.0, -1.0, 1.0),
+    "betaflight": ("thrust_linear", 100.0, 0.0, 150.0),
+    "betaflight 2025.12": ("thrust_linear", 100.0, 0.0, 150.0),
+}
+
+
+def actuator(throttle: Float[ArrayLike, "..."], curve: float) -> Float[np.ndarray, "..."]:
+    """The motor's command x, 0 to 1, of a firmware that inverts t = curve x^2 + (1 - curve) x."""
+    t = np.asarray(throttle, float)
+    if curve == 0:
+        return t
+    half = (1 - curve) / (2 * curve)
+    return np.asarray(-half + np.sign(curve) * np.sqrt(half**2 + t / curve))
+
+
+def relative_slope(
+    throttle: Float[ArrayLike, "..."], curve: float, flown: float
+) -> Float[np.ndarray, "..."]:
+    """The gain over the throttle, relative to that of the `flown` curve being right."""
+    x = actuator(throttle, flown)
+    return np.asarray((1 - curve + 2 * curve * x) / (1 - flown + 2 * flown * x))
+
+
+class FirmwareValue(NamedTuple):
+    """A parameter of a firmware that straightens the thrust curve, with its 95 % interval."""
+
+    name: str
+    value: float  # within the documented range
+    standard_error: float
+    interval: tuple[float, float]  # not cut to the range
+
+    def __str__(self) -> str:
+        low, high = self.interval
+        return f"{self.name} {self.value:.3g} (95 %: {low:.3g} .. {high:.3g})"
+
+    def content(self) -> dict[str, object]:
+        """All of it, for JSON."""
+        content: dict[str, object] = dict(self._asdict())
+        content["interval_95"] = content.pop("interval")
+        return content
+
+
+def _parameter(firmware: CurveFirmware) -> tuple[str, float, float, float]:
+    if firmware not in _PARAMETERS:
+        raise ValueError(f"firmware is {firmware!r}: use one of {', '.join(_PARAMETERS)}")
+    return _PARAMETERS[firmware]
+
+
+def _cubic(curve: float) -> float:
+    """e of t (1 + e (1 - t)^2) nearest to the inverse of the thrust curve."""
+    t = (np.arange(1000) + 0.5) / 1000
+    shape = t * (1 - t) ** 2
+    return float(shape @ (actuator(t, curve) - t) / (shape @ shape))
+
+
+def curve_of_parameter(firmware: CurveFirmware, value: float | int) -> float:
+    """f of the thrust curve that a firmware inverts with this value of its parameter.
+
+    It is the inverse of `GainOverThrottle.firmware_value`.
+
+    **Arguments:**
+
+    - `firmware`: as there.
+    - `value`: of THR_MDL_FAC, MOT_THST_EXPO or thrust_linear.
+
+    **Returns:** -1 to 1; for thrust_linear beyond what a curve of this family can be, the nearest.
+
+    **Raises:**
+
+    - `ValueError`: for another firmware.
+    """
+    share = float(value) / _parameter(firmware)[1]
+    if firmware == "betaflight 2025.12":
+        curves = np.linspace(0.0, 1.0, 201)
+        return float(np.interp(share, [_cubic(float(curve)) for curve in curves], curves))
+    return float(np.clip(share, -1.0, 1.0))
+
+
+B0Law = Literal["FIXED", "SQRT", "LINEAR", "QUADRATIC"]
+B0_POWERS: Mapping[B0Law, float] = {"FIXED": 0.0, "SQRT": 0.5, "LINEAR": 1.0, "QUADRATIC": 2.0}
+
+
+class B0Schedule(NamedTuple):
+    """How Betaflight's proposed ADRC scales b0 over the throttle.
+
+    **Arguments:**
+
+    - `law`: adrc_b0_law.
+    - `hover`: adrc_hover_throttle, 0 to 1, where the scale is 1.
+    - `low`, `high`: adrc_b0_scale_min and adrc_b0_scale_max, as factors.
+    """
+
+    law: B0Law
+    hover: float
+    low: float = 1.0
+    high: float = 3.0
+
+    def scale(self, throttle: Float[ArrayLike, "..."]) -> Float[np.ndarray, "..."]:
+        """The factor on b0 at a throttle of 0 to 1."""
+        scale = (np.asarray(throttle) / self.hover) ** B0_POWERS[self.law]
+        return np.asarray(np.clip(scale, self.low, self.high))
 
 
 Levels = Float[np.ndarray, " levels"]
@@ -80,7 +176,7 @@ class ThrottleLevels(NamedTuple):
         """In words, for gains at other throttles; empty where there are several levels."""
         if self.throttle.size > 1:
             return ""
-        return _two_more_levels(float(self.throttle[0]), float(self.seconds[0]))
+        return _advise_flight(float(self.throttle[0]), 0.2, float(self.seconds[0]), _AS_WELL)
 
 
 class PlantsOverThrottle(NamedTuple):
@@ -98,6 +194,12 @@ class _Line(NamedTuple):
     weights: Float[np.ndarray, "2 levels"]  # (a, b) is this times the gains
     misfit: float  # chi^2
     probability: float  # that the family has a larger one
+
+    @property
+    def widening(self) -> float:
+        """Of errors by the curve, where the curve itself does not fit."""
+        levels = self.weights.shape[1]
+        return 1.0 if self.probability >= 0.05 else float(np.sqrt(self.misfit / (levels - 2)))
 
 
 class GainOverThrottle(eqx.Module):
@@ -205,7 +307,7 @@ class GainOverThrottle(eqx.Module):
         wide = lambda x: np.broadcast_to(np.asarray(x, float), (plants,))
         change = line.weights @ (np.asarray(models.gain) - self.gain[:, None])
         rows = self._rows(np.atleast_1d(throttle))
-        gain = rows @ (line.ends[:, None] + self._widening(line) * change)
+        gain = rows @ (line.ends[:, None] + line.widening * change)
         return PlantsOverThrottle(gain, wide(models.lag), wide(models.delay))
 
     def firmware_value(self, firmware: CurveFirmware) -> FirmwareValue:
@@ -222,10 +324,15 @@ class GainOverThrottle(eqx.Module):
         - `UndeterminedError`: the record holds too little of the curve; says what to fly.
         - `ValueError`: for another firmware.
         """
-        name, curve = curve_parameter(firmware), self.curve
+        (name, factor, least, most), curve = _parameter(firmware), self.curve
         if curve is None or _reach(curve) > _SHARP:
             raise UndeterminedError(f"{name}: {self.what_to_fly()}")
-        return parameter_of_curve(firmware, curve)
+        convert = _cubic if firmware == "betaflight 2025.12" else float
+        slope = (convert(curve.value + 1e-4) - convert(curve.value - 1e-4)) / 2e-4
+        value, error = factor * convert(curve.value), factor * abs(slope) * curve.standard_error
+        reach = reach_of_interval(curve.degrees_of_freedom) * error
+        interval = (value - reach, value + reach)
+        return FirmwareValue(name, float(np.clip(value, least, most)), error, interval)
 
     def adrc_b0(self, hover: float, *, largest: float = 3.0) -> ScaledB0:
         """adrc_b0 and the law over the throttle of Betaflight's proposed ADRC.
@@ -268,15 +375,15 @@ class GainOverThrottle(eqx.Module):
         if curve is None:
             return (
                 f"the log holds one level of throttle ({first:.2f}), which shows no curve: "
-                f"{_two_more_levels(first, seconds)}"
+                f"{_advise_flight(first, 0.2, seconds, _AS_WELL)}"
             )
         reach = _reach(curve)
         if reach <= _SHARP:
             return f"the log holds enough of the thrust curve ({first:.2f} .. {last:.2f} throttle)"
         wanted = (last - first) * reach / _SHARP
         if wanted <= 0.6:
-            lower, upper = _levels_around((first + last) / 2, wanted)
-            advice = f"fly from {lower:.2f} to {upper:.2f}, {_same_excitation(seconds)}"
+            words = "from {:.2f} to {:.2f}"
+            advice = _advise_flight((first + last) / 2, wanted, seconds, words)
         else:
             advice = (
                 f"fly from 0.20 to 0.80, with {wanted / 0.6:.1f} times the amplitude or "
@@ -394,14 +501,8 @@ class GainOverThrottle(eqx.Module):
         line = self._line()
         slope = np.concatenate([by_gain, [by_lag, 0.0]]) * self.fit.units
         error = float(np.sqrt(slope @ self.fit.relative_covariance @ slope))
-        error *= 1.0 if line is None else self._widening(line)
+        error *= 1.0 if line is None else line.widening
         return Combination(name, value, error, self.fit.freedom_of(slope))
-
-    def _widening(self, line: _Line) -> float:
-        """Of errors by the curve, where the curve itself does not fit."""
-        if line.probability >= 0.05:
-            return 1.0
-        return float(np.sqrt(line.misfit / (self.throttle.size - 2)))
 
     def _by_curve(self, throttle: float, *, over_lag: bool) -> Combination:
         """The gain at a throttle, or gain / lag."""
@@ -429,20 +530,14 @@ class GainOverThrottle(eqx.Module):
             )
 
 
-def _levels_around(middle: float, span: float) -> tuple[float, float]:
-    """A range of throttle of this span that can be flown."""
+def _advise_flight(middle: float, span: float, seconds: float, words: str) -> str:
     lower = float(np.clip(middle - span / 2, 0.15, 0.85 - min(span, 0.7)))
-    return lower, min(lower + span, 0.85)
-
-
-def _two_more_levels(throttle: float, seconds: float) -> str:
-    lower, upper = _levels_around(throttle, 0.2)
-    return f"fly {lower:.2f} and {upper:.2f} as well, {_same_excitation(seconds)}"
-
-
-def _same_excitation(seconds: float) -> str:
     turns = ", in turns of about 8 s, as the vehicle sinks or climbs" if seconds > 10 else ""
-    return f"with the same excitation for {seconds:.0f} s at each{turns}"
+    levels = words.format(lower, min(lower + span, 0.85))
+    return f"fly {levels}, with the same excitation for {seconds:.0f} s at each{turns}"
+
+
+_AS_WELL = "{:.2f} and {:.2f} as well"
 
 
 def _reach(number: Combination) -> float:

@@ -1,7 +1,14 @@
 from ._attitude import (
     Attitude as Attitude,
     DecoupledAxes as DecoupledAxes,
+    euler_acceleration as euler_acceleration,
+    euler_from_quaternion as euler_from_quaternion,
+    euler_rates as euler_rates,
+    euler_rates_matrix as euler_rates_matrix,
     LinearAxis as LinearAxis,
+    quaternion_derivative as quaternion_derivative,
+    quaternion_from_euler as quaternion_from_euler,
+    rotation_matrix as rotation_matrix,
 )
 from ._convert import (
     from_control as from_control,
@@ -19,22 +26,7 @@ from ._multirotor import (
     QUANSER_HOVER as QUANSER_HOVER,
     quanser_hover as quanser_hover,
 )
-from ._protocols import (
-    evaluate_response as evaluate_response,
-    is_optional as is_optional,
-    Model as Model,
-    parameter_units as parameter_units,
-    with_arrays as with_arrays,
-)
-from ._rotation import (
-    euler_acceleration as euler_acceleration,
-    euler_from_quaternion as euler_from_quaternion,
-    euler_rates as euler_rates,
-    euler_rates_matrix as euler_rates_matrix,
-    quaternion_derivative as quaternion_derivative,
-    quaternion_from_euler as quaternion_from_euler,
-    rotation_matrix as rotation_matrix,
-)
+from ._response import arctan2 as arctan2, sincos as sincos
 from ._simulate_linear import (
     free_responses as free_responses,
     matrix_exponential as matrix_exponential,
@@ -51,8 +43,13 @@ from ._state_space import (
 )
 from ._transfer_function import (
     AttitudeAxis as AttitudeAxis,
+    Convertible as Convertible,
+    evaluate_response as evaluate_response,
     imaginary as imaginary,
+    is_optional as is_optional,
     LaggedIntegrator as LaggedIntegrator,
+    Model as Model,
+    parameter_units as parameter_units,
     TransferFunction as TransferFunction,
+    with_arrays as with_arrays,
 )
-from ._vector_functions import arctan2 as arctan2, sincos as sincos

@@ -1,8 +1,9 @@
-"""Attitude dynamics: a rigid body that turns about all axes, and axes without coupling."""
+"""Rotations; attitude dynamics of a rigid body about all axes, and of axes without coupling."""
 
 from collections.abc import Sequence
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
@@ -18,6 +19,103 @@ from jaxquad._core import (
     require_positive,
     require_vector,
 )
+
+from ._response import arctan2, sincos
+
+
+Vector = Float[Array, " 3 *ensemble"]  # of each member of an ensemble
+PerAxis = Float[Array, "3 ..."]  # or `[3, *ensemble]`
+Axes = Float[Array, "axes ..."]
+Four = Float[Array, " 4 *ensemble"]  # of a quaternion, or of four motors
+
+
+def euler_rates_matrix(euler: Vector) -> Float[Array, " 3 3 *ensemble"]:
+    """The W of `rate = W @ euler_rates`, for ZYX Euler angles in rad.
+
+    Source: Eq. (1), where the matrix itself is not printed. W is no rotation: its determinant is
+    cos(pitch), so it has no inverse at a pitch of 90 degrees.
+    """
+    (s_phi, s_theta, _), (c_phi, c_theta, _) = jnp.sin(euler), jnp.cos(euler)
+    zero, one = jnp.zeros_like(s_phi), jnp.ones_like(s_phi)
+    return jnp.stack(
+        [
+            jnp.stack([one, zero, -s_theta]),
+            jnp.stack([zero, c_phi, s_phi * c_theta]),
+            jnp.stack([zero, -s_phi, c_phi * c_theta]),
+        ]
+    )
+
+
+def euler_rates(euler: Vector, rate: Vector) -> Vector:
+    """Derivatives of the Euler angles, rad/s, at a body `rate` in rad/s: Eq. (1), solved."""
+    phi, theta, _ = euler
+    p, q, r = rate
+    (s_phi, c_phi), (s_theta, c_theta) = sincos(phi), sincos(theta)
+    heading = (s_phi * q + c_phi * r) / c_theta
+    return jnp.stack([p + s_theta * heading, c_phi * q - s_phi * r, heading])
+
+
+def euler_acceleration(euler: Vector, rate: Vector, rate_derivative: Vector) -> Vector:
+    """Second derivatives of the Euler angles, rad/s^2.
+
+    Source: Eq. (8), corrected: its right side is `rate_derivative`, and the left side follows as
+    inv(W) (rate_derivative - dW/dt euler_rates), which is the time derivative of inv(W) rate.
+    """
+    tangent = (euler_rates(euler, rate), rate_derivative)
+    return jax.jvp(euler_rates, (euler, rate), tangent)[1]
+
+
+def quaternion_from_euler(euler: Vector) -> Four:
+    """Unit quaternion, scalar first, that turns body into earth vectors; angles ZYX in rad."""
+    (s_phi, s_theta, s_psi), (c_phi, c_theta, c_psi) = jnp.sin(euler / 2), jnp.cos(euler / 2)
+    return jnp.stack(
+        [
+            c_phi * c_theta * c_psi + s_phi * s_theta * s_psi,
+            s_phi * c_theta * c_psi - c_phi * s_theta * s_psi,
+            c_phi * s_theta * c_psi + s_phi * c_theta * s_psi,
+            c_phi * c_theta * s_psi - s_phi * s_theta * c_psi,
+        ]
+    )
+
+
+def euler_from_quaternion(quaternion: Four) -> Vector:
+    """ZYX Euler angles in rad of a unit `quaternion`, with a finite gradient at every attitude."""
+    w, x, y, z = quaternion
+    limit = 1 - jnp.finfo(quaternion.dtype).eps  # arcsin has an infinite slope at 1
+    sine = jnp.clip(2 * (w * y - z * x), -limit, limit)
+    ahead = [1 - 2 * (x * x + y * y), jnp.sqrt((1 - sine) * (1 + sine)), 1 - 2 * (y * y + z * z)]
+    return _angles(jnp.stack([2 * (w * x + y * z), sine, 2 * (w * z + x * y)]), jnp.stack(ahead))
+
+
+@jax.custom_jvp
+def _angles(y: Float[Array, "*shape"], x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+    return jnp.asarray(arctan2(y, x))
+
+
+@_angles.defjvp
+def _angles_jvp(primals, tangents):
+    (y, x), (dy, dx) = primals, tangents
+    return _angles(y, x), (x * dy - y * dx) / (x * x + y * y)
+
+
+def quaternion_derivative(quaternion: Four, rate: Vector) -> Four:
+    """Time derivative, 1/s, of a body-to-earth `quaternion` at a body `rate` in rad/s."""
+    scalar, vector = quaternion[:1], quaternion[1:]
+    along = -jnp.sum(vector * rate, axis=0, keepdims=True)
+    across = scalar * rate + jnp.cross(vector, rate, axis=0)
+    return jnp.concatenate([along, across]) / 2
+
+
+def rotation_matrix(quaternion: Four) -> Float[Array, " 3 3 *ensemble"]:
+    """The matrix that turns body into earth vectors, from a unit `quaternion`."""
+    w, x, y, z = quaternion
+    return jnp.stack(
+        [
+            jnp.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)]),
+            jnp.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)]),
+            jnp.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]),
+        ]
+    )
 
 
 _CREEP = 0.01  # rad/s, at which the torque reaches 76 % of its level
@@ -50,15 +148,11 @@ class Attitude(eqx.Module):
     - `ValueError`: an inertia is not positive, or a value is not finite.
     """
 
-    inertia: Float[Array, "3 ..."] = per_member(rank=1, converter=as_float)
-    damping: Float[Array, "3 ..."] = per_member(rank=1, converter=as_float, default=(0.0,) * 3)
+    inertia: PerAxis = per_member(rank=1, converter=as_float)
+    damping: PerAxis = per_member(rank=1, converter=as_float, default=(0.0,) * 3)
     rotor_inertia: Float[Array, "..."] = per_member(rank=0, converter=as_float, default=0.0)
-    stiffness: Float[Array, "3 ..."] | None = per_member(
-        rank=1, converter=as_float_or_none, default=None
-    )
-    coulomb: Float[Array, "3 ..."] | None = per_member(
-        rank=1, converter=as_float_or_none, default=None
-    )
+    stiffness: PerAxis | None = per_member(rank=1, converter=as_float_or_none, default=None)
+    coulomb: PerAxis | None = per_member(rank=1, converter=as_float_or_none, default=None)
 
     def __check_init__(self):
         require_vector("inertia", self.inertia, 3)
@@ -74,11 +168,8 @@ class Attitude(eqx.Module):
             require_nonnegative("coulomb", self.coulomb, "friction acts against the motion")
 
     def acceleration(
-        self,
-        rate: Float[Array, " 3 *ensemble"],
-        torque: Float[Array, " 3 *ensemble"],
-        spin: Float[Array, "*ensemble"] | float = 0.0,
-    ) -> Float[Array, " 3 *ensemble"]:
+        self, rate: Vector, torque: Vector, spin: Float[Array, "*ensemble"] | float = 0.0
+    ) -> Vector:
         """Angular acceleration in rad/s^2 under a body `torque` in N m.
 
         `spin` is O1 - O2 + O3 - O4 in rad/s, front and back rotors anticlockwise seen from above;
@@ -93,7 +184,7 @@ class Attitude(eqx.Module):
             torque = torque + _friction(self.coulomb, rate)
         return (torque - damping * rate - jnp.cross(rate, momentum, axis=0)) / inertia
 
-    def restoring_torque(self, euler: Float[Array, " 3 *ensemble"]) -> Float[Array, " 3 *ensemble"]:
+    def restoring_torque(self, euler: Vector) -> Vector:
         """Body torque in N m of the stiffness at Euler angles in rad."""
         if self.stiffness is None:
             return jnp.zeros_like(euler)
@@ -158,16 +249,12 @@ class DecoupledAxes(eqx.Module):
         shapes do not match.
     """
 
-    torque_gain: Float[Array, "axes ..."] = per_member(rank=1, converter=_per_axis)
-    inertia: Float[Array, "axes ..."] = per_member(rank=1, converter=_per_axis)
-    lag: Float[Array, "axes ..."] | None = per_member(
-        rank=1, converter=_per_axis_or_none, default=None
-    )
-    damping: Float[Array, "axes ..."] = per_member(rank=1, converter=_per_axis, default=0.0)
-    stiffness: Float[Array, "axes ..."] = per_member(rank=1, converter=_per_axis, default=0.0)
-    coulomb: Float[Array, "axes ..."] | None = per_member(
-        rank=1, converter=_per_axis_or_none, default=None
-    )
+    torque_gain: Axes = per_member(rank=1, converter=_per_axis)
+    inertia: Axes = per_member(rank=1, converter=_per_axis)
+    lag: Axes | None = per_member(rank=1, converter=_per_axis_or_none, default=None)
+    damping: Axes = per_member(rank=1, converter=_per_axis, default=0.0)
+    stiffness: Axes = per_member(rank=1, converter=_per_axis, default=0.0)
+    coulomb: Axes | None = per_member(rank=1, converter=_per_axis_or_none, default=None)
 
     def __check_init__(self):
         _ = self.shape
@@ -264,7 +351,7 @@ class DecoupledAxes(eqx.Module):
         return eqx.tree_at(lambda p: p.inertia, self, add_inertia(self.inertia, inertia))
 
 
-def add_inertia(inertia: Float[Array, "axes ..."], extra: Float[ArrayLike, "..."]) -> Array:
+def add_inertia(inertia: Axes, extra: Float[ArrayLike, "..."]) -> Array:
     """The sum, in the precision of `inertia`, where either may have a trailing ensemble axis."""
     extra = jnp.atleast_1d(jnp.asarray(extra, inertia.dtype))
     total = _align_to(inertia, extra) + _align_to(extra, inertia)

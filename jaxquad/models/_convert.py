@@ -1,6 +1,8 @@
 """Models from others: realisations, series connections, models of python-control and scipy."""
 
-from typing import Protocol, runtime_checkable
+import importlib
+import math
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import equinox as eqx
 import jax
@@ -10,9 +12,10 @@ from jaxtyping import Array, Float
 
 from jaxquad._core import is_concrete
 
-from ._state_space import dot, StateSpace
+from ._state_space import dot, explicit, StateSpace
 from ._transfer_function import (
     coefficients_of,
+    Convertible,
     HasCoefficients,
     require_continuous,
     TransferFunction,
@@ -184,7 +187,6 @@ def from_control(system: HasCoefficients | HasMatrices) -> TransferFunction | St
             *(np.asarray(x, float) for x in (system.A, system.B, system.C, system.D))
         )
     if isinstance(system, HasCoefficients):
-        require_continuous(system.dt)
         above, below = coefficients_of(system)
         if len(above) == len(above[0]) == 1:
             return TransferFunction(above[0][0], below[0][0])
@@ -234,3 +236,114 @@ def _with_passage(
         C = np.concatenate([C, np.zeros_like(D)], axis=1)
         H1 = np.concatenate([np.zeros((len(D), len(across))), D], axis=1)
     return StateSpace(F=A, G=B, H0=C - H1 @ A, H1=H1)
+
+
+_MOST_ORDER = 10  # above it the coefficients lose digits
+
+
+class Explicit(NamedTuple):
+    """x' = A x + B u, y = C x + D u."""
+
+    A: Float[np.ndarray, "states states"]
+    B: Float[np.ndarray, "states inputs"]
+    C: Float[np.ndarray, "outputs states"]
+    D: Float[np.ndarray, "outputs inputs"]
+
+
+def convert(model: Convertible, package: str, pade: int | None) -> Any:
+    """A model for python-control or scipy.signal: to_control and to_scipy."""
+    if isinstance(model, StateSpace):
+        kind, coefficients = "StateSpace", _matrices(model, pade)
+    else:
+        kind, rational = "TransferFunction", model
+        if not isinstance(rational, TransferFunction):
+            rational = model.transfer_function()  # pyright: ignore[reportAttributeAccessIssue]
+        parts = (rational.numerator, rational.denominator, rational.delay)
+        above, below, delay = (np.asarray(x, float) for x in parts)
+        _check_order(delay, pade)
+        if pade is not None and delay:
+            over, under = _pade_coefficients(float(delay), pade)
+            above, below = np.convolve(above, over), np.convolve(below, under)
+        coefficients = (above, below)
+    try:
+        return getattr(importlib.import_module(package), kind)(*coefficients)
+    except ImportError as error:
+        raise ImportError(
+            f"{package} is not installed: run pip install 'jaxquad[interop]', or pip install "
+            f"{package}."
+        ) from error
+
+
+def _matrices(model: StateSpace, pade: int | None) -> Explicit:
+    """The model on the host, its delays approximated."""
+    plain = Explicit(*(np.asarray(part, float) for part in explicit(model)))
+    outputs, inputs = plain.D.shape
+    late = lambda delay, n: np.zeros(n) if delay is None else np.asarray(delay, float)
+    by_input, by_output = late(model.input_delay, inputs), late(model.output_delay, outputs)
+    _check_order(np.concatenate([by_input, by_output]), pade)
+    if pade is None:
+        return plain
+    return _series(_series(_bank(by_input, pade), plain), _bank(by_output, pade))
+
+
+def _check_order(delay: Float[np.ndarray, "..."], pade: int | None) -> None:
+    """Raise ValueError for delays without an order, and for an order that loses digits."""
+    if pade is not None and not 1 <= pade <= _MOST_ORDER:
+        raise ValueError(
+            f"pade is {pade}: give an order of 1 to {_MOST_ORDER}, or None for no delay."
+        )
+    longest = float(np.max(delay, initial=0.0))
+    if longest and pade is None:
+        # omega times delay at which a phase of order 3 is 1 deg off, by its first term.
+        first = math.factorial(3) ** 2 / (math.factorial(6) * math.factorial(7))
+        limit = (math.radians(1.0) / first) ** (1 / 7) / longest
+        raise ValueError(
+            f"The model has a delay of {longest:.4g} s, and a rational model has none: give the "
+            f"order of a Pade approximation. pade=3 is within 1 deg of it up to {limit:.3g} rad/s "
+            f"({limit / (2 * math.pi):.3g} Hz). Or set the delay to 0 with dataclasses.replace."
+        )
+
+
+def _pade_coefficients(
+    delay: float, order: int
+) -> tuple[Float[np.ndarray, " powers"], Float[np.ndarray, " powers"]]:
+    """Numerator and denominator of exp(-delay s), the highest power of s first.
+
+    Source: Golub & Van Loan, Matrix Computations, section 9.3.1.
+    """
+    counts = np.arange(order, -1, -1)
+    choose = lambda k: math.comb(order, k) * math.factorial(2 * order - k)
+    terms = np.array([choose(int(k)) / math.factorial(2 * order) for k in counts])
+    below = terms * delay**counts
+    return below * (-1.0) ** counts, below
+
+
+def _bank(delays: Float[np.ndarray, " channels"], order: int) -> Explicit:
+    """Approximations side by side; no states where there is no delay."""
+    late = np.flatnonzero(delays)
+    count = late.size * order
+    A, B = np.zeros((count, count)), np.zeros((count, delays.size))
+    C, D = np.zeros((delays.size, count)), np.eye(delays.size)
+    # One approximation in time measured in delays, so that no digit is lost.
+    above, below = _pade_coefficients(1.0, order)
+    above, below = above / below[0], below / below[0]
+    first = np.eye(order)[0]
+    companion = np.eye(order, k=-1) - np.outer(first, below[1:])
+    for k, channel in enumerate(late):
+        block = slice(k * order, (k + 1) * order)
+        A[block, block] = companion / delays[channel]
+        B[block, channel] = first / delays[channel]
+        C[channel, block] = above[1:] - above[0] * below[1:]
+    D[late, late] = (-1.0) ** order
+    return Explicit(A, B, C, D)
+
+
+def _series(first: Explicit, second: Explicit) -> Explicit:
+    """The outputs of `first` drive the inputs of `second`."""
+    none = np.zeros((len(first.A), len(second.A)))
+    return Explicit(
+        np.block([[first.A, none], [second.B @ first.C, second.A]]),
+        np.concatenate([first.B, second.B @ first.D]),
+        np.concatenate([second.D @ first.C, second.C], axis=1),
+        second.D @ first.D,
+    )

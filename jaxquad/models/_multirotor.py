@@ -18,8 +18,17 @@ from jaxquad._core import (
     require_positive,
 )
 
-from ._attitude import add_inertia, Attitude, DecoupledAxes, LinearAxis
-from ._rotation import euler_from_quaternion, quaternion_derivative, quaternion_from_euler
+from ._attitude import (
+    add_inertia,
+    Attitude,
+    DecoupledAxes,
+    euler_from_quaternion,
+    Four,
+    LinearAxis,
+    quaternion_derivative,
+    quaternion_from_euler,
+    Vector,
+)
 
 
 class _Frame(NamedTuple):
@@ -85,17 +94,15 @@ class Allocation(eqx.Module):
         effect = self.torque_per_difference[:, None]
         return align(signs, effect) * effect
 
-    def torque(self, inputs: Float[Array, " 4 *ensemble"]) -> Float[Array, " 3 *ensemble"]:
+    def torque(self, inputs: Four) -> Vector:
         """Body torque in N m of the four motor `inputs`: Eq. (9)."""
         return align(self.torque_per_difference, inputs) * self.differences(inputs)
 
-    def differences(self, inputs: Float[Array, " 4 *ensemble"]) -> Float[Array, " 3 *ensemble"]:
+    def differences(self, inputs: Four) -> Vector:
         """The differences of inputs that Eq. (9) multiplies by lever K_t and K_l: V4 - V2 etc."""
         return _product(self._signs, inputs)
 
-    def inputs(
-        self, torque: Float[Array, " 3 *ensemble"], collective: Float[Array, "*ensemble"] | float
-    ) -> Float[Array, " 4 *ensemble"]:
+    def inputs(self, torque: Vector, collective: Float[Array, "*ensemble"] | float) -> Four:
         """The four motor inputs that give a body `torque` in N m about a mean input `collective`.
 
         Eq. (10) has no row for the thrust, so `collective` (the bias voltage of the Hover) makes
@@ -104,14 +111,14 @@ class Allocation(eqx.Module):
         return self.from_differences(torque / align(self.torque_per_difference, torque), collective)
 
     def from_differences(
-        self, wanted: Float[Array, " 3 *ensemble"], collective: Float[Array, "*ensemble"] | float
-    ) -> Float[Array, " 4 *ensemble"]:
+        self, wanted: Vector, collective: Float[Array, "*ensemble"] | float
+    ) -> Four:
         """The four motor inputs with these `differences` about a mean input `collective`."""
         squares = np.sum(self._signs**2, axis=1, keepdims=True)
         common = align(jnp.asarray(collective, dtype=wanted.dtype)[None], wanted)
         return common + _product((self._signs / squares).T, wanted)
 
-    def spin(self, inputs: Float[Array, " 4 *ensemble"]) -> Float[Array, "*ensemble"]:
+    def spin(self, inputs: Four) -> Float[Array, "*ensemble"]:
         """Spin in rad/s for `Attitude.acceleration`; 0 where voltages leave the speeds unknown.
 
         Its signs are those of the yaw torque, since both come from the rotors' sense of turning.
@@ -127,7 +134,7 @@ class Allocation(eqx.Module):
         return _FRAMES[self.convention].signs
 
     @property
-    def torque_per_difference(self) -> Float[Array, " 3 *ensemble"]:
+    def torque_per_difference(self) -> Vector:
         """Torque in N m per unit of `differences`, axis by axis."""
         lever = _FRAMES[self.convention].lever * self.arm * self.thrust_coefficient
         return jnp.stack(jnp.broadcast_arrays(lever, lever, self.torque_coefficient))
@@ -179,9 +186,9 @@ class MotorLag(eqx.Module):
 class MultirotorState(eqx.Module):
     """The state of a `Multirotor`, or its time derivative."""
 
-    quaternion: Float[Array, " 4 *ensemble"]  # body to earth, scalar first; any length but 0
-    rate: Float[Array, " 3 *ensemble"]  # body axes, rad/s
-    motor: Float[Array, " 4 *ensemble"] | None  # effective motor inputs; None without a lag
+    quaternion: Four  # body to earth, scalar first; any length but 0
+    rate: Vector  # body axes, rad/s
+    motor: Four | None  # effective motor inputs; None without a lag
 
 
 class Multirotor(eqx.Module):
@@ -220,7 +227,7 @@ class Multirotor(eqx.Module):
         return ensemble_shape(self)
 
     @property
-    def torque_gain(self) -> Float[Array, " 3 *ensemble"]:
+    def torque_gain(self) -> Vector:
         """N m per unit of the command of an axis, see `Allocation.torque_per_difference`."""
         return self.allocation.torque_per_difference
 
@@ -240,10 +247,7 @@ class Multirotor(eqx.Module):
         return MultirotorState(quaternion, rate, motor)
 
     def derivative(
-        self,
-        state: MultirotorState,
-        inputs: Float[Array, " 4 *ensemble"],
-        disturbance: Float[Array, " 3 *ensemble"],
+        self, state: MultirotorState, inputs: Four, disturbance: Vector
     ) -> MultirotorState:
         """Time derivative of `state` under motor `inputs` and a `disturbance` torque in N m."""
         motor = inputs if state.motor is None else state.motor
@@ -256,7 +260,7 @@ class Multirotor(eqx.Module):
             None if self.motor is None else self.motor.derivative(motor, inputs),
         )
 
-    def measure(self, state: MultirotorState) -> Float[Array, " 3 *ensemble"]:
+    def measure(self, state: MultirotorState) -> Vector:
         """Euler angles in rad: what encoders or an attitude filter report."""
         length = jnp.linalg.norm(state.quaternion, axis=0, keepdims=True)
         return euler_from_quaternion(state.quaternion / length)

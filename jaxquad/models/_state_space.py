@@ -1,11 +1,11 @@
 from collections.abc import Sequence
-from typing import NamedTuple, Protocol, runtime_checkable, TYPE_CHECKING
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Complex, Float, Inexact
+from jaxtyping import Array, Complex, Float
 
 from jaxquad._core import (
     as_float,
@@ -15,17 +15,11 @@ from jaxquad._core import (
     require_nonnegative,
 )
 
-from ._protocols import as_frequencies, Frequencies
 from ._response import Matrices, response
-from ._transfer_function import check_order, Explicit, require_package, without_delays
+from ._transfer_function import as_frequencies, Convertible, Frequencies
 
 
-if TYPE_CHECKING:
-    import control
-    import scipy.signal
-
-
-class StateSpace(eqx.Module):
+class StateSpace(Convertible):
     """M x' = F x + G u(t - input_delay), y(t + output_delay) = H0 x + H1 x': CIFER's DERIVID form.
 
     x' is the derivative that the delayed input causes, so H1 x' holds accelerations as they are
@@ -72,18 +66,11 @@ class StateSpace(eqx.Module):
             )
         (states, inputs), outputs = (len(F), G.shape[1]), len(H0)
         shapes = {
-            "G": (states, inputs),
-            "H0": (outputs, states),
-            "H1": (outputs, states),
-            "M": (states, states),
-            "input_delay": (inputs,),
-            "output_delay": (outputs,),
-        }
-        arrays = {
-            "F": F, "G": G, "H0": H0, "H1": self.H1, "M": self.M,
-            "input_delay": self.input_delay, "output_delay": self.output_delay,
+            "F": (states, states), "G": (states, inputs), "H0": (outputs, states),
+            "H1": (outputs, states), "M": (states, states),
+            "input_delay": (inputs,), "output_delay": (outputs,),
         }  # fmt: skip
-        arrays = {name: x for name, x in arrays.items() if x is not None}
+        arrays = {name: x for name in shapes if (x := getattr(self, name)) is not None}
         for name, shape in shapes.items():
             if name in arrays and arrays[name].shape != shape:
                 raise ValueError(
@@ -143,34 +130,6 @@ class StateSpace(eqx.Module):
             names=names,
         )
 
-    def to_control(self, *, pade: int | None = None) -> "control.StateSpace":
-        """The same model for python-control (extra `interop`): x' = A x + B u, y = C x + D u.
-
-        **Arguments:**
-
-        - `pade`: the order of the Pade approximations of the delays, 1 to 10; needed where there
-            are delays. Each adds as many states.
-
-        **Raises:**
-
-        - `ValueError`: there is a delay, but no order.
-        - `ImportError`: python-control is not installed.
-        """
-        return require_package("control").StateSpace(*_rational(self, pade))
-
-    def to_scipy(self, *, pade: int | None = None) -> "scipy.signal.StateSpace":
-        """The same model for scipy.signal, whose `lsim`, `step` and `bode` take it.
-
-        **Arguments:**
-
-        - `pade`: as in `to_control`.
-
-        **Raises:**
-
-        - `ValueError`: there is a delay, but no order.
-        """
-        return require_package("scipy.signal").StateSpace(*_rational(self, pade))
-
     @property
     def poles(self) -> np.ndarray:
         """Eigenvalues of M^-1 F, rad/s; on the host, so not under jit."""
@@ -180,9 +139,30 @@ class StateSpace(eqx.Module):
     def zeros(self) -> np.ndarray:
         """Transmission zeros of all channels together, rad/s; on the host, so not under jit.
 
-        Those of one pair are the zeros of `select([output], [input])`.
+        There the response from all inputs to all outputs loses rank. Those of one pair are the
+        zeros of `select([output], [input])`. Zeros at infinity are taken out beforehand: an
+        eigenvalue solver would scatter them over large finite values. Source: Emami-Naeini &
+        Van Dooren, Automatica 18 (1982), p. 415.
         """
-        return _transmission_zeros(*_host(self))
+        A, B, C, D = _host(self)
+        from scipy.linalg import matrix_balance
+
+        # In units of states, inputs and outputs that make the numbers alike.
+        (states, inputs), outputs = B.shape, len(C)
+        loop = np.block(
+            [
+                [A, B, np.zeros((states, outputs))],
+                [np.zeros((inputs, states + inputs)), np.ones((inputs, outputs))],
+                [C, D, np.zeros((outputs, outputs))],
+            ]
+        )
+        unit = np.asarray(matrix_balance(loop, permute=False, separate=True)[1][0])
+        x, u, y = np.split(unit, [states, states + inputs])
+        A, B, C, D = A * x / x[:, None], B * u / x[:, None], C * x / y[:, None], D * u / y[:, None]
+        limit = _RANK * float(np.linalg.norm(np.block([[A, B], [C, D]])))
+        A, B, C, D = _without_rows(A, B, C, D, limit)
+        A, C, B, D = (part.T for part in _without_rows(A.T, C.T, B.T, D.T, limit))
+        return np.linalg.eigvals(A - B @ np.linalg.solve(D, C))
 
     @property
     def lateness(self) -> Float[Array, "outputs inputs"] | None:
@@ -226,16 +206,6 @@ def _host(model: StateSpace) -> tuple[np.ndarray, ...]:
     return tuple(np.asarray(part) for part in explicit(model))
 
 
-def _rational(model: StateSpace, pade: int | None) -> Explicit:
-    """The model on the host, its delays approximated."""
-    plain = Explicit(*(np.asarray(part, float) for part in _host(model)))
-    outputs, inputs = plain.D.shape
-    late = lambda delay, n: np.zeros(n) if delay is None else np.asarray(delay, float)
-    by_input, by_output = late(model.input_delay, inputs), late(model.output_delay, outputs)
-    check_order(np.concatenate([by_input, by_output]), pade)
-    return plain if pade is None else without_delays(plain, by_input, by_output, pade)
-
-
 def _check_names(names: Sequence[tuple[str, str]], arrays: dict[str, Array]) -> None:
     if not names:
         return
@@ -265,37 +235,6 @@ def dot(a: Array, b: Array) -> Array:
 
 
 _RANK = 1e-10  # of the norm, after balancing: below it a singular value is rounding
-
-
-def _transmission_zeros(
-    A: Float[np.ndarray, "states states"],
-    B: Float[np.ndarray, "states inputs"],
-    C: Float[np.ndarray, "outputs states"],
-    D: Float[np.ndarray, "outputs inputs"],
-) -> Inexact[np.ndarray, " zeros"]:
-    """Where the response from all inputs to all outputs loses rank, rad/s.
-
-    Zeros at infinity are taken out beforehand: an eigenvalue solver would scatter them over large
-    finite values. Source: Emami-Naeini & Van Dooren, Automatica 18 (1982), p. 415.
-    """
-    from scipy.linalg import matrix_balance
-
-    # In units of states, inputs and outputs that make the numbers alike.
-    (states, inputs), outputs = B.shape, len(C)
-    loop = np.block(
-        [
-            [A, B, np.zeros((states, outputs))],
-            [np.zeros((inputs, states + inputs)), np.ones((inputs, outputs))],
-            [C, D, np.zeros((outputs, outputs))],
-        ]
-    )
-    unit = np.asarray(matrix_balance(loop, permute=False, separate=True)[1][0])
-    x, u, y = np.split(unit, [states, states + inputs])
-    A, B, C, D = A * x / x[:, None], B * u / x[:, None], C * x / y[:, None], D * u / y[:, None]
-    limit = _RANK * float(np.linalg.norm(np.block([[A, B], [C, D]])))
-    A, B, C, D = _without_rows(A, B, C, D, limit)
-    A, C, B, D = (part.T for part in _without_rows(A.T, C.T, B.T, D.T, limit))
-    return np.linalg.eigvals(A - B @ np.linalg.solve(D, C))
 
 
 def _without_rows(A, B, C, D, limit):

@@ -1,17 +1,15 @@
-"""Models of one input and one output in s, and Pade approximations of delays."""
+"""What a model needs to be fitted, plotted and compared; models of one input and one output."""
 
 import dataclasses
-import importlib
-import math
-from collections.abc import Sequence
-from types import ModuleType
-from typing import NamedTuple, Protocol, runtime_checkable, TYPE_CHECKING
+import re
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Complex, Float
+from jaxtyping import Array, ArrayLike, Complex, Float, PyTree
 
 from jaxquad._core import (
     as_float,
@@ -23,12 +21,195 @@ from jaxquad._core import (
     require_positive,
 )
 
-from ._protocols import as_floats, as_frequencies, Frequencies, OPTIONAL, Scale, unit
+
+Frequencies = ArrayLike | Sequence[float | int]  # rad/s
 
 
-if TYPE_CHECKING:
-    import control
-    import scipy.signal
+@runtime_checkable
+class Model(Protocol):
+    """A linear model, `jq.TransferFunction`, `jq.StateSpace` or a user's own `eqx.Module`.
+
+    !!! example
+
+        ```python
+        class Integrator(eqx.Module):
+            gain: float
+
+            def frequency_response(self, omega):
+                return self.gain / (1j * omega)
+
+        fit = jq.fit(Integrator(2), frf)
+        ```
+    """
+
+    def frequency_response(
+        self, omega: Float[Array, " frequencies"]
+    ) -> Complex[Array, "frequencies ..."]:
+        """The response at `omega` in rad/s: (frequencies, outputs, inputs), outputs per inputs.
+
+        A result of one axis, (frequencies,), stands for one input and one output.
+        """
+        ...
+
+
+def evaluate_response(
+    model: Model, omega: Float[Array, " frequencies"]
+) -> Complex[Array, "frequencies outputs inputs"]:
+    """`model.frequency_response(omega)` with axes for outputs and inputs, also where it has none.
+
+    **Raises:**
+
+    - `ValueError`: the result has neither one axis nor three.
+    """
+    response = jnp.asarray(model.frequency_response(omega))
+    if response.ndim not in (1, 3):
+        raise ValueError(
+            f"{type(model).__name__}.frequency_response returned the shape {response.shape} for "
+            f"{omega.size} frequencies: return (frequencies, outputs, inputs), or (frequencies,) "
+            "for one input and one output."
+        )
+    return response[:, None, None] if response.ndim == 1 else response
+
+
+def with_arrays(model: PyTree) -> PyTree:
+    """`model` with every number in it as an array of floats, so that it can be free in a fit.
+
+    Python's `float` and `int`, and arrays of whole numbers. What is no number to fit, such as an
+    index or a count, belongs into a field of `eqx.field(static=True)`.
+    """
+
+    def is_number(x: object) -> bool:  # which JAX would not take for a parameter
+        if isinstance(x, np.ndarray | np.generic | jax.Array):
+            return x.dtype.kind in "iu"
+        return isinstance(x, int | float) and not isinstance(x, bool)
+
+    return jax.tree.map(lambda x: as_float(x) if is_number(x) else x, model)
+
+
+def as_frequencies(omega: Frequencies) -> Float[Array, " frequencies"]:
+    """Frequencies as a row of floats; a number by itself is one frequency."""
+    omega = as_floats(omega)
+    return omega if omega.ndim else omega[None]
+
+
+def as_floats(omega: Frequencies) -> Float[Array, "..."]:
+    """Frequencies as an array of floats; floats keep their precision."""
+    omega = jnp.asarray(omega)
+    return omega if eqx.is_inexact_array(omega) else omega.astype(float)
+
+
+class Scale(NamedTuple):
+    """The unit of a coefficient: (output unit / input unit) / s^power, or 1 / s^power alone."""
+
+    power: int
+    of_ratio: bool = True
+
+
+Unit = str | Callable[[PyTree, int], Scale]  # by the model, and by the index within an array
+
+
+def unit(declared: Unit) -> dict[str, Unit]:
+    """The metadata of a field whose numbers have this unit."""
+    return {"unit": declared}
+
+
+OPTIONAL = {"optional": True}  # metadata of a field that is no term of the model while it is 0
+
+
+class Convertible(eqx.Module):
+    """A linear model that python-control and scipy.signal can take, as all of `jq.models` can.
+
+    Delays need `pade`, the order of their Pade approximations, 1 to 10; in a state space each adds
+    as many states.
+    """
+
+    def to_control(self, *, pade: int | None = None) -> Any:
+        """The same model for python-control (extra `interop`): a transfer function or state space.
+
+        **Raises:**
+
+        - `ValueError`: there is a delay, but no order.
+        - `ImportError`: python-control is not installed.
+        """
+        from ._convert import convert
+
+        return convert(self, "control", pade)
+
+    def to_scipy(self, *, pade: int | None = None) -> Any:
+        """The same model for scipy.signal, whose `lsim`, `step` and `bode` take it.
+
+        **Raises:**
+
+        - `ValueError`: there is a delay, but no order.
+        """
+        from ._convert import convert
+
+        return convert(self, "scipy.signal", pade)
+
+
+_NAME = re.compile(r"([A-Za-z_][\w.]*)(?:\[(\d+)\])?.*")
+_PER_SECOND = re.compile(r"(.*?)(?:/s(?:\^(\d+))?)?")
+
+
+def parameter_units(
+    model: PyTree, names: Sequence[str], *, output: str = "output", input: str = "input"
+) -> tuple[str, ...]:
+    """The units of numbers of a model, as its fields declare them.
+
+    **Arguments:**
+
+    - `model`: for instance `Fit.model`.
+    - `names`: of its numbers, as `Fit.names`: `gain`, `numerator[0]`, `plant.lag`.
+    - `output`, `input`: the units of the channels, or their names where those are not known.
+
+    **Returns:** a text for each name, such as `rad/s^2 per N m`; empty where the model declares
+    none.
+    """
+    units = []
+    for name in names:
+        owner, metadata = _declared(model, name)
+        kind = metadata.get("unit", "")
+        if not isinstance(kind, str):
+            match = _NAME.fullmatch(name)
+            power, of_ratio = kind(owner, int(match[2] or 0) if match else 0)
+            if of_ratio:
+                kind = f"{_over_seconds(output, power)} per {input}"
+            else:
+                kind = _over_seconds("1", power) if power else ""
+        units.append(kind)
+    return tuple(units)
+
+
+def is_optional(model: PyTree, name: str) -> bool:
+    """Whether a number of a model is no term of it while it is 0, as its field declares."""
+    return bool(_declared(model, name)[1].get("optional"))
+
+
+def _declared(model: PyTree, name: str) -> tuple[PyTree, Mapping]:
+    """The part of a model that has a number, and the metadata of its field there."""
+    match = _NAME.fullmatch(name)
+    *owners, leaf = match[1].split(".") if match else ("",)
+    for owner in owners:
+        model = vars(model).get(owner) if dataclasses.is_dataclass(model) else None
+    fields = dataclasses.fields(model) if dataclasses.is_dataclass(model) else ()
+    return model, {field.name: field.metadata for field in fields}.get(leaf, {})
+
+
+def _over_seconds(unit: str, power: int) -> str:
+    """`rad/s` over s is `rad/s^2`."""
+    match = _PER_SECOND.fullmatch(unit)
+    if match and unit != match[1]:
+        unit, power = match[1], power + int(match[2] or 1)
+    return unit if power == 0 else f"{unit}/s" if power == 1 else f"{unit}/s^{power}"
+
+
+def require_continuous(dt: float | int | bool | None) -> None:
+    """Raise ValueError for a sampled system."""
+    if dt:
+        raise ValueError(
+            f"The system is sampled (dt = {dt}), and models here are continuous: convert the one "
+            "that it was sampled from, or fit one to its response with jq.fit_transfer_function."
+        )
 
 
 @runtime_checkable
@@ -48,7 +229,11 @@ class HasCoefficients(Protocol):
 def coefficients_of(
     system: HasCoefficients,
 ) -> tuple[list[list[np.ndarray]], list[list[np.ndarray]]]:
-    """Numerators and denominators, outputs per inputs, without leading zeros."""
+    """Numerators and denominators, outputs per inputs, without leading zeros.
+
+    Raises ValueError for a sampled system.
+    """
+    require_continuous(system.dt)
     trim = lambda x: np.trim_zeros(np.atleast_1d(np.asarray(x, float)), "f")
     polynomials = []
     for rows in (system.num, system.den):
@@ -57,15 +242,6 @@ def coefficients_of(
             rows = [[row] for row in np.atleast_2d(rows)]
         polynomials.append([[trim(x) if np.any(x) else np.zeros(1) for x in row] for row in rows])
     return polynomials[0], polynomials[1]
-
-
-def require_continuous(dt: float | int | bool | None) -> None:
-    """Raise ValueError for a sampled system."""
-    if dt:
-        raise ValueError(
-            f"The system is sampled (dt = {dt}), and models here are continuous: convert the one "
-            "that it was sampled from, or fit one to its response with jq.fit_transfer_function."
-        )
 
 
 def _namespace(*numbers: Array | np.ndarray):
@@ -78,7 +254,7 @@ def imaginary(omega: Frequencies) -> Complex[Array, "..."]:
     return jax.lax.complex(jnp.zeros_like(omega), omega)
 
 
-class TransferFunction(eqx.Module):
+class TransferFunction(Convertible):
     """One input to one output: numerator(s) / denominator(s) exp(-delay s).
 
     !!! example
@@ -124,7 +300,6 @@ class TransferFunction(eqx.Module):
                     f"TransferFunction has a {type(numerator).__name__} and a denominator: leave "
                     "one out."
                 )
-            require_continuous(numerator.dt)
             above, below = coefficients_of(numerator)
             if len(above) * len(above[0]) != 1:
                 raise ValueError(
@@ -174,34 +349,6 @@ class TransferFunction(eqx.Module):
             self.delay + other.delay,
         )
 
-    def to_control(self, *, pade: int | None = None) -> "control.TransferFunction":
-        """The same model for python-control (extra `interop`).
-
-        **Arguments:**
-
-        - `pade`: the order of the Pade approximation of the delay, 1 to 10; needed where there is
-            a delay.
-
-        **Raises:**
-
-        - `ValueError`: there is a delay, but no order.
-        - `ImportError`: python-control is not installed.
-        """
-        return require_package("control").TransferFunction(*_rational(self, pade))
-
-    def to_scipy(self, *, pade: int | None = None) -> "scipy.signal.TransferFunction":
-        """The same model for scipy.signal, whose `lsim`, `step` and `bode` take it.
-
-        **Arguments:**
-
-        - `pade`: as in `to_control`.
-
-        **Raises:**
-
-        - `ValueError`: there is a delay, but no order.
-        """
-        return require_package("scipy.signal").TransferFunction(*_rational(self, pade))
-
     @property
     def poles(self) -> np.ndarray:
         """Roots of the denominator, rad/s; on the host, so not under jit."""
@@ -213,19 +360,7 @@ class TransferFunction(eqx.Module):
         return np.roots(np.asarray(self.numerator))
 
 
-def _rational(model: TransferFunction, pade: int | None) -> tuple[np.ndarray, np.ndarray]:
-    """Numerator and denominator with the delay approximated."""
-    above, below, delay = (
-        np.asarray(x, float) for x in (model.numerator, model.denominator, model.delay)
-    )
-    check_order(delay, pade)
-    if pade is None or not delay:
-        return above, below
-    over, under = _pade_coefficients(float(delay), pade)
-    return np.convolve(above, over), np.convolve(below, under)
-
-
-class LaggedIntegrator(eqx.Module):
+class LaggedIntegrator(Convertible):
     """The simplest model of an axis: K e^(-delay s) / (s^integrators (lag s + 1)).
 
     From a moment command to a rate with one integration, to an angle with two. With `damping` one
@@ -278,14 +413,6 @@ class LaggedIntegrator(eqx.Module):
         rigid = s ** (n - 1) * (s + damping) if n else 1.0
         return (gain * jnp.exp(-delay * s) / ((lag * s + 1) * rigid))[:, None, None]
 
-    def to_control(self, *, pade: int | None = None) -> "control.TransferFunction":
-        """`transfer_function().to_control(pade=)`: the same model for python-control."""
-        return self.transfer_function().to_control(pade=pade)
-
-    def to_scipy(self, *, pade: int | None = None) -> "scipy.signal.TransferFunction":
-        """`transfer_function().to_scipy(pade=)`: the same model for scipy.signal."""
-        return self.transfer_function().to_scipy(pade=pade)
-
     def transfer_function(self) -> TransferFunction:
         """The same model as a ratio of polynomials; a known lag of 0 is left out."""
         numbers = self.gain, self.lag, self.damping
@@ -298,7 +425,7 @@ class LaggedIntegrator(eqx.Module):
         return TransferFunction(gain[None], denominator, self.delay)
 
 
-class AttitudeAxis(eqx.Module):
+class AttitudeAxis(Convertible):
     """One axis near hover, from the difference of two opposite motor inputs to the angle in rad.
 
     Only the ratio L K_t / J_x enters the response: one record cannot separate J_x from K_t. That
@@ -347,14 +474,6 @@ class AttitudeAxis(eqx.Module):
         rigid = s * (inertia * s + damping)
         return (lever * jnp.exp(-delay * s) / (rigid * (lag * s + 1)))[:, None, None]
 
-    def to_control(self, *, pade: int | None = None) -> "control.TransferFunction":
-        """`transfer_function().to_control(pade=)`: the same model for python-control."""
-        return self.transfer_function().to_control(pade=pade)
-
-    def to_scipy(self, *, pade: int | None = None) -> "scipy.signal.TransferFunction":
-        """`transfer_function().to_scipy(pade=)`: the same model for scipy.signal."""
-        return self.transfer_function().to_scipy(pade=pade)
-
     def transfer_function(self) -> TransferFunction:
         """The same model as a ratio of polynomials.
 
@@ -371,98 +490,3 @@ class AttitudeAxis(eqx.Module):
         """The same axis carrying a known extra `inertia` in kg m^2."""
         J_x, added = on_host((self.J_x, as_float(inertia)))
         return dataclasses.replace(self, J_x=J_x + added)
-
-
-_MOST_ORDER = 10  # above it the coefficients lose digits
-
-
-class Explicit(NamedTuple):
-    """x' = A x + B u, y = C x + D u."""
-
-    A: Float[np.ndarray, "states states"]
-    B: Float[np.ndarray, "states inputs"]
-    C: Float[np.ndarray, "outputs states"]
-    D: Float[np.ndarray, "outputs inputs"]
-
-
-def require_package(name: str) -> ModuleType:
-    """A package of the extra `interop`; ImportError with the line that installs it."""
-    try:
-        return importlib.import_module(name)
-    except ImportError as error:
-        raise ImportError(
-            f"{name} is not installed: run pip install 'jaxquad[interop]', or pip install {name}."
-        ) from error
-
-
-def check_order(delay: Float[np.ndarray, "..."], pade: int | None) -> None:
-    """Raise ValueError for delays without an order, and for an order that loses digits."""
-    if pade is not None and not 1 <= pade <= _MOST_ORDER:
-        raise ValueError(
-            f"pade is {pade}: give an order of 1 to {_MOST_ORDER}, or None for no delay."
-        )
-    longest = float(np.max(delay, initial=0.0))
-    if longest and pade is None:
-        # omega times delay at which a phase of order 3 is 1 deg off, by its first term.
-        first = math.factorial(3) ** 2 / (math.factorial(6) * math.factorial(7))
-        limit = (math.radians(1.0) / first) ** (1 / 7) / longest
-        raise ValueError(
-            f"The model has a delay of {longest:.4g} s, and a rational model has none: give the "
-            f"order of a Pade approximation. pade=3 is within 1 deg of it up to {limit:.3g} rad/s "
-            f"({limit / (2 * math.pi):.3g} Hz). Or set the delay to 0 with dataclasses.replace."
-        )
-
-
-def _pade_coefficients(
-    delay: float, order: int
-) -> tuple[Float[np.ndarray, " powers"], Float[np.ndarray, " powers"]]:
-    """Numerator and denominator of exp(-delay s), the highest power of s first.
-
-    Source: Golub & Van Loan, Matrix Computations, section 9.3.1.
-    """
-    counts = np.arange(order, -1, -1)
-    choose = lambda k: math.comb(order, k) * math.factorial(2 * order - k)
-    terms = np.array([choose(int(k)) / math.factorial(2 * order) for k in counts])
-    below = terms * delay**counts
-    return below * (-1.0) ** counts, below
-
-
-def without_delays(
-    model: Explicit,
-    by_input: Float[np.ndarray, " inputs"],
-    by_output: Float[np.ndarray, " outputs"],
-    order: int,
-) -> Explicit:
-    """The model between approximations of its delays (s)."""
-    return _series(_series(_bank(by_input, order), model), _bank(by_output, order))
-
-
-def _bank(delays: Float[np.ndarray, " channels"], order: int) -> Explicit:
-    """Approximations side by side; no states where there is no delay."""
-    late = np.flatnonzero(delays)
-    count = late.size * order
-    A, B = np.zeros((count, count)), np.zeros((count, delays.size))
-    C, D = np.zeros((delays.size, count)), np.eye(delays.size)
-    # One approximation in time measured in delays, so that no digit is lost.
-    above, below = _pade_coefficients(1.0, order)
-    above, below = above / below[0], below / below[0]
-    first = np.eye(order)[0]
-    companion = np.eye(order, k=-1) - np.outer(first, below[1:])
-    for k, channel in enumerate(late):
-        block = slice(k * order, (k + 1) * order)
-        A[block, block] = companion / delays[channel]
-        B[block, channel] = first / delays[channel]
-        C[channel, block] = above[1:] - above[0] * below[1:]
-    D[late, late] = (-1.0) ** order
-    return Explicit(A, B, C, D)
-
-
-def _series(first: Explicit, second: Explicit) -> Explicit:
-    """The outputs of `first` drive the inputs of `second`."""
-    none = np.zeros((len(first.A), len(second.A)))
-    return Explicit(
-        np.block([[first.A, none], [second.B @ first.C, second.A]]),
-        np.concatenate([first.B, second.B @ first.D]),
-        np.concatenate([second.D @ first.C, second.C], axis=1),
-        second.D @ first.D,
-    )

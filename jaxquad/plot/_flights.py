@@ -233,7 +233,8 @@ _POINTS = 200
 _LOWEST = 2.0  # Hz
 _HATCHES = (None, "....", "////", "xxxx", "----")  # of bands, for those who see no colours
 _SPAN = 70.0  # dB that a figure shows below the highest level
-Frequencies, Samples = Float[np.ndarray, " frequencies"], Float[np.ndarray, " samples"]
+Frequencies = Float[np.ndarray, " frequencies"]
+Samples = Float[np.ndarray, " samples"]
 
 
 class Spectrum(NamedTuple):

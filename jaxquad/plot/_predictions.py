@@ -154,7 +154,21 @@ def step(
     end = max(map(_duration, things.values())) if duration is None else float(duration)
     time = np.linspace(0.0, end, _SAMPLES)
     answers = {name: _answer(thing, time) for name, thing in things.items()}
-    channels = _channels(things, answers, records)
+    shapes = {name: answer.value.shape[1:] for name, answer in answers.items()}
+    if len(set(shapes.values())) > 1:
+        raise ValueError(
+            f"models of different channels (outputs, inputs): {shapes}; draw them one by one"
+        )
+    origins = [x.origin for x in things.values() if isinstance(x, Fit) and x.origin is not None]
+    flown = [thing.names for thing in things.values() if isinstance(thing, StepResponse)]
+    if origins:  # names and units of the first fit or record that has them; else numbers
+        channels = channels_shown([Measured("", origins[0].frfs[0])], [])
+    elif flown:
+        reference, output = flown[0]
+        units = [records[0].unit(name) for name in (output, reference)] if records else ["", ""]
+        channels = Channels((output,), (reference,), (units[0],), (units[1],), True)
+    else:
+        channels = Channels.numbered(*next(iter(shapes.values())))
     places = channels.places(pair)
     columns = len({i for _, i in places})
     panels = lay.stacked(len(places), ax, columns=columns)
@@ -219,27 +233,6 @@ def _answer(thing: Thing, time: Samples) -> _Answer:
     )
     angle = np.asarray(flown.angle)[:, 0] / size
     return _Answer(np.asarray(flown.time), angle[:, None, None])
-
-
-def _channels(
-    things: Mapping[str, Thing], answers: Mapping[str, _Answer], records: Sequence[Record]
-) -> Channels:
-    """Names and units of the first fit or record that has them; else numbers."""
-    shapes = {name: answer.value.shape[1:] for name, answer in answers.items()}
-    if len(set(shapes.values())) > 1:
-        raise ValueError(
-            f"models of different channels (outputs, inputs): {shapes}; draw them one by one"
-        )
-    origins = [x.origin for x in things.values() if isinstance(x, Fit) and x.origin is not None]
-    if origins:
-        return channels_shown([Measured("", origins[0].frfs[0])], [])
-    flown = [thing.names for thing in things.values() if isinstance(thing, StepResponse)]
-    if flown:
-        reference, output = flown[0]
-        units = [records[0].unit(name) for name in (output, reference)] if records else ["", ""]
-        return Channels((output,), (reference,), (units[0],), (units[1],), True)
-    outputs, inputs = next(iter(shapes.values()))
-    return Channels.numbered(outputs, inputs)
 
 
 _SIGMAS = 1.96  # of a normal error, that hold 95 %

@@ -119,7 +119,18 @@ def _draw_pair(
     models = same_branch[len(measured) :]
     for k, (response, curve) in enumerate(zip(measured, same_branch, strict=False)):
         if k == 0:
-            _draw_measured(axes, first, response)
+            why = "not used" if response.used is not None else f"coherence below {COHERENT}"
+            omega, good, name = first.omega, first.good, response.name
+            for axis, (level, error) in zip(axes, _levels(first), strict=False):
+                if good.any():
+                    reach = np.where(good, error, np.nan)
+                    low, high = level - reach, level + reach
+                    axis.fill_between(omega, low, high, color="0.75", lw=0, label="95 % band")
+                    axis.plot(omega[good], level[good], "o", ms=3.5, color="0.15", label=name)
+                if not good.all():
+                    faint: Style = {"mfc": "none", "mec": "0.7", "label": f"{name}, {why}"}
+                    axis.plot(omega[~good], level[~good], "o", ms=3, **faint)
+            axes[2].plot(omega, first.coherence, "o-", ms=2.5, lw=0.8, color="0.15")
             continue
         mark, good = _MARKS[(k - 1) % len(_MARKS)], curve.good
         style: Style = {"marker": mark, "color": "tab:red"}
@@ -179,21 +190,6 @@ def _model_curve(
         magnitude = 20 * np.log10(np.abs(response))
     one = np.ones_like(omega)
     return _Curve(omega, magnitude, phase, one, decibels, degrees, one > 0)
-
-
-def _draw_measured(axes: Sequence[Axes], curve: _Curve, response: Measured) -> None:
-    omega, good, name = curve.omega, curve.good, response.name
-    why = "not used" if response.used is not None else f"coherence below {COHERENT}"
-    for axis, (level, error) in zip(axes, _levels(curve), strict=False):
-        if good.any():
-            reach = np.where(good, error, np.nan)
-            low, high = level - reach, level + reach
-            axis.fill_between(omega, low, high, color="0.75", lw=0, label="95 % band")
-            axis.plot(omega[good], level[good], "o", ms=3.5, color="0.15", label=name)
-        if not good.all():
-            label = f"{name}, {why}"
-            axis.plot(omega[~good], level[~good], "o", ms=3, mfc="none", mec="0.7", label=label)
-    axes[2].plot(omega, curve.coherence, "o-", ms=2.5, lw=0.8, color="0.15")
 
 
 _WIDEST = 6.0, 45.0  # dB and deg of a band that sets the limits of an axis

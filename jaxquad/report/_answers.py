@@ -12,11 +12,11 @@ from jaxquad.plot import COHERENT
 from jaxquad.records import Record
 from jaxquad.spectra import FrequencyResponse
 
-from ._measured import GOOD_TIC
 from ._page import Section
 
 
 Grid = Float[np.ndarray, " frequencies"]
+GOOD_TIC = 0.25  # Theil inequality coefficient, below which agreement is good
 _LOOSE = 0.2  # half of a 95 % interval over the value: CIFER's Cramer-Rao guideline of 20 %
 _AIM = 0.8  # coherence that a flight is planned for
 _FAINT = 0.2  # coherence below which its estimate says nothing
@@ -212,7 +212,25 @@ def next_flight(
     if checks:
         what = "None for this model: tune with it, then fly the tuned gains."
         return Flight(what, {}, [*(_sentence(need.why) for need in poor), *wished])
-    return _verification(frf, record, wished)
+    # A 3-2-1-1 whose spectrum peaks in the middle of the band.
+    good = _good(frf)
+    low, high = _ends(frf, good) if good.any() else _measured_band(frf)
+    unit = three_two_one_one(width=1.0, amplitude=1.0, sample_rate=20.0)
+    width = float(np.sqrt(unit.omega_min * unit.omega_max / (low * high)))
+    source, text = _amplitude(frf, record, 1.0)
+    facts = {
+        "axis": f"{', '.join(frf.output_names)}, by {source}",
+        "pulses": f"3-2-1-1, the shortest pulse {width:.2g} s, so that it peaks at "
+        f"{np.sqrt(low * high) / (2 * np.pi):.2g} Hz",
+        "amplitude": text,
+        "seconds": f"{7 * width + 4:.2g}, rest before and after included",
+    }
+    what = (
+        f"A 3-2-1-1 on the channel {source} with a shortest pulse of {width:.2g} s, to verify the "
+        "model on a flight that it was not fitted to."
+    )
+    why = "The log determines this model: what is missing is a check."
+    return Flight(what, facts, [why, *wished])
 
 
 def _sentence(text: str) -> str:
@@ -325,25 +343,3 @@ def _amplitude(frf: FrequencyResponse, record: Record | None, louder: float) -> 
     if louder > 1:
         return name, f"{text} ({louder:.2g} times this record's; less if the motors saturate)"
     return name, f"{text} (as in this record)"
-
-
-def _verification(frf: FrequencyResponse, record: Record | None, wished: Sequence[str]) -> Flight:
-    """A 3-2-1-1 whose spectrum peaks in the middle of the band."""
-    good = _good(frf)
-    low, high = _ends(frf, good if good.any() else np.ones_like(good))
-    unit = three_two_one_one(width=1.0, amplitude=1.0, sample_rate=20.0)
-    width = float(np.sqrt(unit.omega_min * unit.omega_max / (low * high)))
-    source, text = _amplitude(frf, record, 1.0)
-    facts = {
-        "axis": f"{', '.join(frf.output_names)}, by {source}",
-        "pulses": f"3-2-1-1, the shortest pulse {width:.2g} s, so that it peaks at "
-        f"{np.sqrt(low * high) / (2 * np.pi):.2g} Hz",
-        "amplitude": text,
-        "seconds": f"{7 * width + 4:.2g}, rest before and after included",
-    }
-    what = (
-        f"A 3-2-1-1 on the channel {source} with a shortest pulse of {width:.2g} s, to verify the "
-        "model on a flight that it was not fitted to."
-    )
-    why = "The log determines this model: what is missing is a check."
-    return Flight(what, facts, [why, *wished])

@@ -95,7 +95,24 @@ def step_section(
             "The model is driven by the flown inputs, so that no controller has to be known; in "
             "each window it may drift from the output. Its band counts its parameters, and gusts."
         )
-    return head | {"image": image, "table": _step_table(step, predicted), "notes": notes}
+    in_ms = lambda seconds: f"{1e3 * seconds:.3g}" if np.isfinite(seconds) else "not in the window"
+    final = lambda value, error: f"{value:.3g} \u00b1 {1.96 * error[-1]:.1g}"
+    heads, rows = ("", "measured"), [
+        ["rise time (10 to 90 %), ms", in_ms(step.rise_time)],
+        ["overshoot, %", f"{100 * step.overshoot:.2g}"],
+        ["settling time (5 %), ms", in_ms(step.settling_time)],
+        ["final value", final(step.final, step.standard_error)],
+    ]  # fmt: skip
+    if predicted is not None:
+        model, error = step._replace(mean=predicted.mean), predicted.error
+        # Over the measured final value, which is the sharper.
+        over = max(0.0, float(np.max(model.mean)) / step.final - 1)
+        last = f"{model.final:.3g}" if error is None else final(model.final, error)
+        cells = [in_ms(model.rise_time), f"{100 * over:.2g}", "\u2013", last]
+        heads += ("model",)
+        rows = [[*row, cell] for row, cell in zip(rows, cells, strict=True)]
+    table = Table("Step response (95 % intervals)", heads, rows)
+    return head | {"image": image, "table": table, "notes": notes}
 
 
 def predict_step(fit: Fit, frf: FrequencyResponse, record: Record) -> Prediction | None:
@@ -188,26 +205,6 @@ def _draw_step(record: Record, step: StepResponse, predicted: Prediction | None)
     panel.grid(True, color="0.9", lw=0.5)
     figure.legend(*panel.get_legend_handles_labels(), loc="upper center", ncols=2, fontsize=9)
     return figure
-
-
-def _step_table(step: StepResponse, predicted: Prediction | None) -> Table:
-    in_ms = lambda seconds: f"{1e3 * seconds:.3g}" if np.isfinite(seconds) else "not in the window"
-    final = lambda value, error: f"{value:.3g} \u00b1 {1.96 * error[-1]:.1g}"
-    rows = [
-        ["rise time (10 to 90 %), ms", in_ms(step.rise_time)],
-        ["overshoot, %", f"{100 * step.overshoot:.2g}"],
-        ["settling time (5 %), ms", in_ms(step.settling_time)],
-        ["final value", final(step.final, step.standard_error)],
-    ]
-    if predicted is None:
-        return Table("Step response (95 % intervals)", ("", "measured"), rows)
-    model, error = step._replace(mean=predicted.mean), predicted.error
-    # Over the measured final value, which is the sharper.
-    over = max(0.0, float(np.max(model.mean)) / step.final - 1)
-    cells = [in_ms(model.rise_time), f"{100 * over:.2g}", "\u2013"]
-    cells.append(f"{model.final:.3g}" if error is None else final(model.final, error))
-    both = [[*row, cell] for row, cell in zip(rows, cells, strict=True)]
-    return Table("Step response (95 % intervals)", ("", "measured", "model"), both)
 
 
 _FEWEST = 8  # frequencies of a loop that is shown

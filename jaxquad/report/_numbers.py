@@ -31,7 +31,24 @@ def parameter_section(
     heads += ("by noise alone", "width") if fit.discrepancy is not None else ()
     heads += ("CR, %", "insensitivity, %")
     heads += () if fit.identifiable else ("stopped at",)
-    rows = [_parameter(fit, k) for k in range(len(fit.names))]
+    rows: list[list[str | Cell]] = []
+    for k, (name, value, error) in enumerate(
+        zip(fit.names, fit.values, fit.standard_errors, strict=True)
+    ):
+        cells = _estimate(Combination(name, float(value), float(error)))
+        low, high = fit.interval(name)
+        cells[-1] = f"{low:.5g} .. {high:.5g}"
+        stopped = [] if fit.identifiable else [""]
+        by_noise = [] if fit.discrepancy is None else ["", ""]
+        if fit.discrepancy is not None and fit.determined[k]:
+            low, high = fit.interval(name, model_error=False)
+            by_noise = [f"{low:.5g} .. {high:.5g}", fit.discrepancy.widths[k]]
+        if not fit.determined[k]:
+            stopped = [cells[1]]
+            cells = [Cell(f"{name} *"), "", cells[2], "not determined"]
+        percents = zip((fit.cramer_rao[k], fit.insensitivity[k]), _BOUNDS, strict=True)
+        shares = [_marked(f"{x:.2f}" if np.isfinite(x) else "", bool(x > m)) for x, m in percents]
+        rows.append([*cells, *by_noise, *shares, *stopped])
     dashes = [_DASH] * (len(heads) - 4 - bool(units))
     rows += [[*_estimate(combination), *dashes] for combination in derived]
     if units:
@@ -61,34 +78,24 @@ def parameter_section(
     }
     if fit.minima:
         facts["starts"] = count_starts([len(point.starts) for point in fit.minima])
+    determined, correlation = np.flatnonzero(fit.determined).tolist(), None
+    if len(determined) > 1:
+        title = f"Correlation of the estimates (bold from {_CORRELATED:g})"
+        names, values = [Cell(fit.names[k]) for k in determined], fit.correlation
+        cell = lambda k, m: _marked(f"{values[k, m]:.2f}", bool(abs(values[k, m]) >= _CORRELATED))
+        body = [["1" if k == m else cell(k, m) for m in determined] for k in determined]
+        lines = [[name, *cells] for name, cells in zip(names, body, strict=True)]
+        correlation = Table(title, ["", *names], lines)
     return {
         "table": Table("Identified parameters", heads, rows),
         "bounds": [f"{bound:g}" for bound in _BOUNDS],
         "is_marked": not fit.identifiable,
         "factors": poles_and_zeros,
         "facts": facts,
-        "correlation": _correlation(fit),
+        "correlation": correlation,
         "text": str(fit),
         "texts": [{"title": title, "text": text} for title, text in texts.items()],
     }
-
-
-def _parameter(fit: Fit, k: int) -> list[str | Cell]:
-    name = fit.names[k]
-    value, error = float(fit.values[k]), float(fit.standard_errors[k])
-    low, high = fit.interval(name)
-    cells = [*_estimate(Combination(name, value, error))[:-1], f"{low:.5g} .. {high:.5g}"]
-    stopped = [] if fit.identifiable else [""]
-    by_noise = [] if fit.discrepancy is None else ["", ""]
-    if fit.discrepancy is not None and fit.determined[k]:
-        low, high = fit.interval(name, model_error=False)
-        by_noise = [f"{low:.5g} .. {high:.5g}", fit.discrepancy.widths[k]]
-    if not fit.determined[k]:
-        stopped = [cells[1]]
-        cells = [Cell(f"{name} *"), "", cells[2], "not determined"]
-    percents = zip((fit.cramer_rao[k], fit.insensitivity[k]), _BOUNDS, strict=True)
-    shares = [_marked(f"{x:.2f}" if np.isfinite(x) else "", bool(x > most)) for x, most in percents]
-    return [*cells, *by_noise, *shares, *stopped]
 
 
 def _estimate(one: Combination) -> list[str | Cell]:
@@ -105,20 +112,6 @@ def count_starts(starts: Sequence[int]) -> str:
     """How many starts led to how many different optima: "3 starts, 1 optimum"."""
     total, optima = sum(starts), len(starts)
     return f"{total} start{'s' * (total > 1)}, {optima} optim{'a' if optima > 1 else 'um'}"
-
-
-def _correlation(fit: Fit) -> Table | None:
-    determined = np.flatnonzero(fit.determined).tolist()
-    if len(determined) < 2:
-        return None
-    rows = []
-    for k in determined:
-        values = [(float(fit.correlation[k, m]), k == m) for m in determined]
-        cells = [_marked(f"{x:.2f}", bool(abs(x) >= _CORRELATED)) for x, _ in values]
-        cells = ["1" if same else cell for cell, (_, same) in zip(cells, values, strict=True)]
-        rows.append([Cell(fit.names[k]), *cells])
-    title = f"Correlation of the estimates (bold from {_CORRELATED:g})"
-    return Table(title, ["", *(Cell(fit.names[k]) for k in determined)], rows)
 
 
 def identifiability_section(fit: Fit) -> dict[str, object]:

@@ -1,25 +1,38 @@
-from ._closed_loop import (
-    BrokenLoop as BrokenLoop,
-    deembed as deembed,
-    Entry as Entry,
-    estimate_broken_loop as estimate_broken_loop,
-    feedback_bias as feedback_bias,
-    FeedbackBias as FeedbackBias,
-)
 from ._error_covariance import (
     ErrorCovariance as ErrorCovariance,
     independent_errors as independent_errors,
 )
-from ._estimate import Estimator as Estimator, frequency_response as frequency_response
 from ._estimators import (
     Composite as Composite,
+    DOMINATED as DOMINATED,
+    EARLY as EARLY,
+    Estimator as Estimator,
     JointInputOutput as JointInputOutput,
     LocalPolynomial as LocalPolynomial,
     Periodic as Periodic,
+    Remark as Remark,
     Welch as Welch,
 )
-from ._frequency_response import Distortion as Distortion, FrequencyResponse as FrequencyResponse
-from ._lines import find_line as find_line, SpectralLine as SpectralLine
-from ._remarks import DOMINATED as DOMINATED, EARLY as EARLY, Remark as Remark
-from ._step_response import estimate_step as estimate_step, StepResponse as StepResponse
-from ._welch import spectral_density as spectral_density, SpectralDensity as SpectralDensity
+from ._feedback import (
+    deembed as deembed,
+    feedback_bias as feedback_bias,
+    FeedbackBias as FeedbackBias,
+)
+from ._flown_loop import (
+    BrokenLoop as BrokenLoop,
+    Entry as Entry,
+    estimate_broken_loop as estimate_broken_loop,
+    estimate_step as estimate_step,
+    StepResponse as StepResponse,
+)
+from ._frequency_response import (
+    Distortion as Distortion,
+    frequency_response as frequency_response,
+    FrequencyResponse as FrequencyResponse,
+)
+from ._welch import (
+    find_line as find_line,
+    spectral_density as spectral_density,
+    SpectralDensity as SpectralDensity,
+    SpectralLine as SpectralLine,
+)

@@ -1,29 +1,39 @@
 """Responses, coherence and errors from windowed transforms of one or several window lengths."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Complex, Float
+from jaxtyping import Complex, Float
 
-from ._leakage import find_bias, power_of, Slopes, without_leakage
-from ._noise import noise_root
+from ._error_covariance import window_products
+from ._estimators import adjoint, diagonal, Grid, Levels, Pairs, power_of, Responses
+from ._fourier_sums import coefficients, Layout
+from ._noise import noise_root, padded, Resolved, Slopes, without_leakage
 
 
 _TINY = 1e-300
-_ROUNDING = 1e-15
 _COHERENCE_WEIGHT = 5.0
 _STEPS = 5  # of Gauss-Newton; each gains two digits or more
 _DEPENDENT = 1e-4  # share of an input's power below which it cannot be separated from the others
+_CYCLES = 2.0  # in a window, below which leakage outweighs what more averages gain
 
-Pairs = Float[np.ndarray, "frequencies outputs inputs"]
-Responses = Complex[np.ndarray, "frequencies outputs inputs"]
+Shares = Float[np.ndarray, "frequencies outputs inputs groups"]
 Products = Complex[np.ndarray, "groups frequencies channels channels"]
-Matrices = Complex[np.ndarray, "groups frequencies n n"]
 Counts = Float[np.ndarray, " groups"]
-Resolved = Bool[np.ndarray, "groups frequencies"]
 _Powers = Float[np.ndarray, "*groups frequencies inputs"]
 _Pairs = Float[np.ndarray, "*groups frequencies outputs inputs"]
+
+
+class Segments(NamedTuple):
+    """Transforms of windows for each length, in absolute phase, by the channels of `Record.names`.
+
+    The starts in `groups` are of the records one after the other, with gaps wider than any window.
+    """
+
+    transforms: tuple[Complex[np.ndarray, "frequencies windows channels"], ...]
+    slopes: tuple[Slopes, ...]  # empty where they are not needed, or nothing follows from them
+    groups: Layout
 
 
 class Channels(NamedTuple):
@@ -54,24 +64,33 @@ class Conditioned(NamedTuple):
 
 
 def condition(products: Products, channels: Channels, counts: Counts) -> Conditioned:
-    """`(Z* X)^-1 Z* Y` from the sums of `conj(a) b` over so many windows of each length.
+    """`(Z* X)^-1 Z* Y` from the sums of `conj(a) b` (Bendat & Piersol, ch. 7; Tischler & Remple,
+    ch. 9)."""
 
-    With two inputs and instruments z = x, this is the closed form of the textbook.
-    Source: Bendat & Piersol, ch. 7; Tischler & Remple, ch. 9.
-    """
+    def inverse(matrix: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
+        """That of matrices in any units, which `rows` and `columns` are."""
+        if matrix.shape[-1] == 1:
+            return 1 / matrix
+        units = columns[..., :, None] * rows[..., None, :]
+        scaled = matrix / np.swapaxes(units, 2, 3)
+        try:
+            return np.linalg.inv(scaled) / units
+        except np.linalg.LinAlgError:  # One of many is singular to the last digit: make it huge.
+            return np.linalg.inv(scaled + 1e-15 * np.eye(matrix.shape[-1])) / units
+
     z, x, y = channels.split(np.arange(products.shape[-1]))
-    power = _diagonal(products)
+    power = diagonal(products)
     size = np.sqrt(np.maximum(power, _TINY))
     from_z = products[:, :, z]
-    solver = _inverse(from_z[..., x], size[..., z], size[..., x])
+    solver = inverse(from_z[..., x], size[..., z], size[..., x])
     response = np.swapaxes(solver @ from_z[..., y], 2, 3)
     # What the instruments move of the inputs, and the diagonal of its inverse.
     if channels.instruments:
-        inverted = solver @ from_z[..., z] @ np.conj(np.swapaxes(solver, 2, 3))
-        least = np.maximum(_diagonal(inverted), _TINY)
-        moving = _inverse(inverted, np.sqrt(least), np.sqrt(least))
+        inverted = solver @ from_z[..., z] @ adjoint(solver)
+        least = np.maximum(diagonal(inverted), _TINY)
+        moving = inverse(inverted, np.sqrt(least), np.sqrt(least))
     else:  # Rounding may make what is singular negative.
-        least, moving = np.maximum(np.abs(_diagonal(solver)), _TINY), from_z[..., x]
+        least, moving = np.maximum(np.abs(diagonal(solver)), _TINY), from_z[..., x]
     explained = np.sum(np.conj(response) * (response @ np.swapaxes(moving, 2, 3)), axis=3).real
     total = power[..., y]
     through = power_of(response) / least[:, :, None]
@@ -82,61 +101,30 @@ def condition(products: Products, channels: Channels, counts: Counts) -> Conditi
         response,
         solver,
         1 / (least * count),
-        1 / (least * np.maximum(_diagonal(moving), _TINY)),
+        1 / (least * np.maximum(diagonal(moving), _TINY)),
         answer / count[..., None],
         through / np.maximum(answer, _TINY),
-        np.minimum(_diagonal(moving) / np.maximum(power[..., x], _TINY), 1.0),
+        np.minimum(diagonal(moving) / np.maximum(power[..., x], _TINY), 1.0),
         np.clip(1 - rest / np.maximum(total, _TINY), 0.0, 1.0),
     )
-
-
-def _inverse(
-    matrix: Matrices,
-    rows: Float[np.ndarray, "groups frequencies n"],
-    columns: Float[np.ndarray, "groups frequencies n"],
-) -> Matrices:
-    """That of matrices in any units, which `rows` and `columns` are."""
-    if matrix.shape[-1] == 1:
-        return 1 / matrix
-    units = columns[..., :, None] * rows[..., None, :]
-    scaled = matrix / np.swapaxes(units, 2, 3)
-    try:
-        return np.linalg.inv(scaled) / units
-    except np.linalg.LinAlgError:  # One of many is singular to the last digit: make it huge.
-        return np.linalg.inv(scaled + _ROUNDING * np.eye(matrix.shape[-1])) / units
-
-
-def _diagonal(
-    matrix: Complex[np.ndarray, "*batch rows rows"],
-) -> Float[np.ndarray, "*batch rows"]:
-    return np.real(np.diagonal(matrix, axis1=-2, axis2=-1))
 
 
 class Combined(NamedTuple):
     response: Responses
     coherence: Pairs
-    share: Float[np.ndarray, "frequencies outputs inputs groups"]  # of each length in the response
-
-
-def single_length(part: Conditioned) -> Combined:
-    """The response of one window length, without a combination."""
-    response, coherence = part.response[0], part.coherence[0]
-    lesser = np.minimum(coherence, part.instrument_share[0][:, None, :])
-    return Combined(response, lesser, np.ones((*response.shape, 1)))
+    share: Shares  # of each length in the response
 
 
 def combine(parts: Conditioned, scales: Counts, freedom: Counts, resolved: Resolved) -> Combined:
-    """Weight spectra of several window lengths by (eps_i / eps_min)^-4 and fit one set to them.
+    """Weight spectra of several window lengths by W_i = (eps_i / eps_min)^-4 and fit one set to
+    them.
 
-    `scales` turn powers into densities, `freedom` are the independent windows less the inputs
-    that share them, and eps = sqrt(1 - g^2) / (|g| sqrt(2 freedom)); `resolved` says where a window
-    holds enough cycles. The cost is
+    The cost (Tischler & Remple eq. 10.4), each part relative to its mean under W_i^2 (G_xx~ ...),
+    is
 
         sum_i W_i {(G_xx - G_xx,i)^2 + (G_yy - G_yy,i)^2 + |G_xy - G_xy,i|^2 + 5 (g^2 - g_i^2)^2}
 
-    each part relative to its mean under W_i^2 (G_xx~ and so on). |G_xy~| stands for the textbook's
-    Re G_xy~ and Im G_xy~, one of which may be zero. Only weighted means of the spectra enter, and
-    the phase is that of the mean. Source: Tischler & Remple eq. 10.4.
+    with |G_xy~| for Re G_xy~ and Im G_xy~, one of which may be zero. The phase is that of the mean.
     """
     averages = 2 * freedom[:, None, None, None]
     error = (1 - parts.coherence + 1e-12) / (np.maximum(parts.coherence, 1e-12) * averages)
@@ -157,7 +145,16 @@ def combine(parts: Conditioned, scales: Counts, freedom: Counts, resolved: Resol
         np.sum(mean * parts.coherence, axis=0) / gg,
     ])  # fmt: skip
     level = xy**2 / (xx * yy)
-    a, b, r = _fit_spectra(targets, level / gg)
+    # Minimise (a - a0)^2 + (b - b0)^2 + (r - r0)^2 + 5 (level r^2 / (a b) - q0)^2.
+    u, level_q = targets[:3], level / gg
+    for _ in range(_STEPS):
+        q = level_q * u[2] ** 2 / (u[0] * u[1])
+        slopes = np.stack([-q / u[0], -q / u[1], 2 * q / u[2]])
+        # Normal equations of identity plus one rank, by Sherman and Morrison.
+        norm, away = np.sum(slopes**2, axis=0), np.sum((targets[:3] - u) * slopes, axis=0)
+        correction = _COHERENCE_WEIGHT * (targets[3] - q - away) / (1 + _COHERENCE_WEIGHT * norm)
+        u = targets[:3] + correction[None] * slopes
+    a, b, r = u
     moved = np.sum(mean * parts.instrument_share[:, :, None, :], axis=0)
     share = mean * gain / np.sum(mean * gain, axis=0, keepdims=True)
     return Combined(
@@ -167,62 +164,47 @@ def combine(parts: Conditioned, scales: Counts, freedom: Counts, resolved: Resol
     )
 
 
-def _fit_spectra(
-    targets: Float[np.ndarray, "4 frequencies outputs inputs"], level: Pairs
-) -> Float[np.ndarray, "3 frequencies outputs inputs"]:
-    """Minimise (a - a0)^2 + (b - b0)^2 + (r - r0)^2 + 5 (level r^2 / (a b) - q0)^2."""
-    start, q0 = targets[:3], targets[3]
-    u = start
-    for _ in range(_STEPS):
-        q = level * u[2] ** 2 / (u[0] * u[1])
-        slopes = np.stack([-q / u[0], -q / u[1], 2 * q / u[2]])
-        # Normal equations of identity plus one rank, by Sherman and Morrison.
-        norm, away = np.sum(slopes**2, axis=0), np.sum((start - u) * slopes, axis=0)
-        correction = _COHERENCE_WEIGHT * (q0 - q - away) / (1 + _COHERENCE_WEIGHT * norm)
-        u = start + correction[None] * slopes
-    return u
-
-
-# What leakage adds to the response, relative, and the standard error of that.
-Leakage = Float[np.ndarray, "2 frequencies outputs inputs"]
-
-
 class Averaged(NamedTuple):
     response: Responses
     coherence: Pairs
     random_error: Pairs
     direct_coherence: Pairs
-    multiple_coherence: Float[np.ndarray, "frequencies outputs"]
+    multiple_coherence: Levels
     alone: Float[np.ndarray, "frequencies inputs"]  # share of an input's power, nan without any
     effect: Complex[np.ndarray, "frequencies inputs windows"]
-    share: Float[np.ndarray, "frequencies outputs inputs groups"]
+    share: Shares
     noise: Complex[np.ndarray, "frequencies outputs roots"]
     freedom: Float[np.ndarray, "frequencies outputs groups"]  # complex, of each length's noise
-    leakage: Callable[[], Leakage]  # computed where it is asked for
+    # What leakage adds to the response, relative, and the standard error of that.
+    leakage: Callable[[], Float[np.ndarray, "2 frequencies outputs inputs"]]
 
 
 @np.errstate(divide="ignore", invalid="ignore", over="ignore")
 def average(
-    transforms: tuple[Complex[np.ndarray, "frequencies _ channels"], ...],
+    segments: Segments,
     sums: Products,
-    slopes: tuple[Slopes, ...],
     channels: Channels,
-    omega: Float[np.ndarray, " frequencies"],
-    overlap: Float[np.ndarray, "windows windows"],
-    scales: Counts,
-    resolved: Resolved,
-    averages: Counts,
+    omega: Grid,
+    dt: float,
+    shape: str,
+    independent: Counts,
 ) -> Averaged:
-    """One response from all window lengths, with the effect of noise in each window.
-
-    `sums` are those of the products of `transforms` over windows, `averages` the independent
-    windows of each length less the inputs, and `slopes` the transforms behind the derivatives of
-    the windows.
-    """
-    many = tuple(part.shape[1] for part in transforms)
-    counts = np.array(many, float)
+    """One response from all window lengths, with the effect of noise in each window."""
+    lengths, starts = zip(*segments.groups, strict=True)
+    transforms, many = segments.transforms, tuple(map(len, starts))
+    overlap, counts = window_products(segments.groups, shape), np.array(many, float)
+    averages = np.maximum(independent - channels.inputs + 1, 0.5)
+    level, cosine = coefficients(shape)
+    scales = 2 * dt / ((level**2 + cosine**2 / 2) * np.array(lengths))  # to one-sided densities
+    resolving = np.array([np.inf, *lengths[1:]])  # the longest window is used everywhere
+    resolved = (omega * dt)[None, :] * resolving[:, None] >= 2 * np.pi * _CYCLES
     parts = condition(sums, channels, counts)
-    combined = combine(parts, scales, averages, resolved) if len(many) > 1 else single_length(parts)
+    if len(many) > 1:
+        combined = combine(parts, scales, averages, resolved)
+    else:
+        response, coherence = parts.response[0], parts.coherence[0]
+        lesser = np.minimum(coherence, parts.instrument_share[0][:, None, :])
+        combined = Combined(response, lesser, np.ones((*response.shape, 1)))
     alone = np.einsum("fig,gfi->fi", np.mean(combined.share, axis=1), parts.alone)
     inseparable = ~(alone >= _DEPENDENT)
     lost = np.any(inseparable, axis=1)
@@ -237,15 +219,24 @@ def average(
             np.where(gone, 0.0, combined.coherence),
             np.where(gone[..., None], equal, combined.share),
         )
-    instruments = [np.conj(np.swapaxes(channels.split(part)[0], 1, 2)) for part in transforms]
-    pairs = zip(parts.solver, instruments, strict=True)
-    effect = np.concatenate([solver @ part for solver, part in pairs], axis=2)
-    gain = _unit_noise(effect, combined.share, overlap, many)
+    instruments = [adjoint(channels.split(part)[0]) for part in transforms]
+    effect = np.concatenate(list(map(np.matmul, parts.solver, instruments)), axis=2)
+    # Variance of the responses under noise of unit power: pair of lengths by pair, since their
+    # shares differ between outputs.
+    first, gain = np.cumsum((0, *many[:-1])), np.zeros(combined.share.shape[:3])
+    rows = effect.reshape(-1, len(overlap))
+    rows = np.concatenate([np.real(rows), np.imag(rows)])
+    for g, (start, end) in enumerate(zip(first, (*first[1:], len(overlap)), strict=True)):
+        products = (rows[:, start:end] @ overlap[start:end, start:]) * rows[:, start:]
+        both = np.add.reduceat(products, first[g:] - start, axis=1)
+        pairs = np.sum(both.reshape(2, *effect.shape[:2], -1), axis=0)
+        pairs[..., 1:] *= 2.0  # each pair of lengths once
+        gain += combined.share[..., g] * np.einsum("fih,foih->foi", pairs, combined.share[..., g:])
     windows = [channels.split(part)[1:] for part in transforms]
-    rest = without_leakage(windows, combined.response, slopes, overlap, resolved)
+    rest = without_leakage(windows, combined.response, segments.slopes, overlap, resolved)
     weights = np.mean(combined.share, axis=2)
     trust = np.where(lost, 1e-9, 1.0)[:, None, None]
-    outputs = np.moveaxis(channels.split(_diagonal(sums))[2], 0, 2)
+    outputs = np.moveaxis(channels.split(diagonal(sums))[2], 0, 2)
     noise = noise_root(omega, rest, outputs, weights * trust)
     power = np.sum(power_of(noise), axis=2)
     error = np.sqrt(power[:, :, None] * gain / 2) / np.abs(combined.response)
@@ -258,8 +249,9 @@ def average(
         mask = inseparable[:, None, :]
         response, coherence, error = (np.where(mask, blank, field) for field, blank in none)
 
-    def leakage() -> Leakage:
-        bias, square = find_bias(rest.fits, *combined.response.shape[1:])
+    def leakage() -> Float[np.ndarray, "2 frequencies outputs inputs"]:
+        biases = [fit.bias(*combined.response.shape[1:]) for fit in rest.fits]
+        bias, square = (padded(part, omega.size) for part in zip(*biases, strict=True))
         added = np.abs(np.sum(bias * combined.share, axis=3))
         spread = np.sum(combined.share * np.sqrt(square), axis=3)
         doubt = np.sqrt(power / 2)[:, :, None] * spread
@@ -279,25 +271,3 @@ def average(
         rest.freedom,
         leakage,
     )
-
-
-def _unit_noise(
-    effect: Complex[np.ndarray, "frequencies inputs windows"],
-    share: Float[np.ndarray, "frequencies outputs inputs groups"],
-    overlap: Float[np.ndarray, "windows windows"],
-    counts: Sequence[int],
-) -> Pairs:
-    """Variance of the responses under noise of unit power.
-
-    Sums over windows are taken pair of groups by pair, since the shares differ between outputs.
-    """
-    first = np.cumsum((0, *counts[:-1]))
-    ends, rows = (*first[1:], len(overlap)), effect.reshape(-1, len(overlap))
-    parts, total = np.concatenate([np.real(rows), np.imag(rows)]), np.zeros(share.shape[:3])
-    for g, (start, end) in enumerate(zip(first, ends, strict=True)):
-        products = (parts[:, start:end] @ overlap[start:end, start:]) * parts[:, start:]
-        both = np.add.reduceat(products, first[g:] - start, axis=1)
-        pairs = np.sum(both.reshape(2, *effect.shape[:2], -1), axis=0)
-        pairs[..., 1:] *= 2.0  # each pair of lengths once
-        total += share[..., g] * np.einsum("fih,foih->foi", pairs, share[..., g:])
-    return total

@@ -11,7 +11,8 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 
 from jaxquad._core import pytree_node
 
-from ._windows import coefficients, Layout
+from ._estimators import Pairs, Places
+from ._fourier_sums import coefficients, Layout
 
 
 _POINTS = 32  # times to the shortest window, on which overlaps are summed
@@ -124,10 +125,8 @@ class ErrorCovariance:
         drawn: Complex[np.ndarray, "frequencies inputs groups roots columns"],
         columns: Complex[np.ndarray, "frequencies outputs inputs columns"],
     ) -> Iterator[Complex[np.ndarray, "atoms roots_columns"]]:
-        """What noise of unit power does to Re(sum of `conj(columns) dT`), a piece at a time.
-
-        The pieces are some of the times that windows overlap, or some of the atoms.
-        """
+        """What unit noise does to Re(sum of `conj(columns) dT`), by pieces of the times or the
+        atoms."""
         if self.windows is not None:
             along = np.swapaxes(drawn, 1, 2).reshape(-1, drawn.shape[3] * drawn.shape[4])
             for k in range(0, self.windows.times.size, _CHUNK):
@@ -151,7 +150,7 @@ class ErrorCovariance:
                 part[driven[taken] - low] += both.reshape(len(both), part.shape[1])
             yield part
 
-    def variance(self) -> Float[np.ndarray, "frequencies outputs inputs"]:
+    def variance(self) -> Pairs:
         """Mean squared error E|dT|^2 of each response, for independent atoms (no windows)."""
         if self.windows is not None:
             raise ValueError(
@@ -314,8 +313,8 @@ def independent_errors(
 class Reach(NamedTuple):
     """The atoms from `first` to before `last` that have an effect at each frequency."""
 
-    first: Int[np.ndarray, " frequencies"]
-    last: Int[np.ndarray, " frequencies"]
+    first: Places
+    last: Places
 
     def reached(self, count: int) -> Bool[np.ndarray, " count"]:
         """Which of `count` atoms have an effect on any frequency."""

@@ -1,21 +1,39 @@
-"""Signs that a controller, and not the plant, made the coherence between input and output."""
+"""Feedback: signs that a controller made the coherence, the bias by it, the plant without it."""
 
+import dataclasses
 import functools as ft
 import itertools
 from collections.abc import Callable, Sequence
 from typing import Literal, NamedTuple
 
+import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Complex, Float, Int
+from jaxtyping import ArrayLike, Complex, Float, Int
 
+from jaxquad.models import Model
 from jaxquad.records import Record
 
-from ._checks import in_hertz
-from ._error_covariance import ErrorCovariance
-from ._remarks import DOMINATED, EARLY, Remark
+from ._estimators import (
+    check_compatible,
+    check_references,
+    COHERENT,
+    DOMINATED,
+    EARLY,
+    Grid,
+    in_hertz,
+    Method,
+    Remark,
+    Response,
+    Welch,
+    Where,
+)
+from ._frequency_response import Estimate, FrequencyResponse
+from ._welch import spectral_density
 
 
-COHERENT = 0.6  # magnitude-squared coherence from which a frequency is commonly used
+_AMPLIFIED = 10.0  # factor on the relative error from which a remark is made
+_SIGNIFICANT = 0.02  # share of noise in the input from which the joint estimate is recommended
 _CHANCE = 1.35e-3  # of calling the phase of any pair rising: 3 standard errors of a single slope
 _FALLS = 0.35  # rad over the top of the coherent band: less than an actuator's phase falls there
 _LESS = 0.05  # power of 1/omega by which a lag's magnitude falls there
@@ -23,8 +41,6 @@ _NEARLY_ALL, _MORE = 0.9, 0.5  # median shares of the input's power, output firs
 _FEWEST = 8  # frequencies for a slope
 _TOP = 4.0  # ratio of frequencies, at the top of the coherent band, over which the phase must fall
 
-Grid = Float[np.ndarray, " frequencies"]
-Pairs = Float[np.ndarray, "frequencies outputs inputs"]
 Covariance = Callable[[], Complex[np.ndarray, "frequencies frequencies"]]
 
 _RISES = (
@@ -48,37 +64,38 @@ _FED_BACK = (
 
 
 def remarks_on_feedback(
-    records: Sequence[Record],
-    method: Literal["direct", "joint"],
-    omega: Grid,
-    response: Complex[np.ndarray, "frequencies outputs inputs"],
-    error: Pairs,
-    coherence: Pairs,
-    direct: Pairs,
-    names: tuple[Sequence[str], Sequence[str]],
-    errors: ErrorCovariance | None = None,
+    records: Sequence[Record], method: Method, estimate: Estimate
 ) -> tuple[Remark, ...]:
-    """Remarks on feedback that a user of the response has to know; `names` of outputs and inputs.
-
-    `direct` is the coherence from input to output, `coherence` that of the estimate, `errors` those
-    of the response; without them, its points count as independent.
-    """
+    """Remarks on feedback; points whose errors overlapping windows correlate count as
+    independent."""
     from scipy.special import ndtri
 
-    remarks, clear = [], float(ndtri(1 - _CHANCE / (len(names[0]) * len(names[1]))))
-    for (o, output), (i, source) in itertools.product(*map(enumerate, names)):
-        pair = output, source
-        if method == "joint":
-            remarks += _explained_by_reference(omega, coherence[:, o, i], direct[:, o, i], pair)
-        finite = np.isfinite(response[:, o, i])
-        values = np.where(finite, response[:, o, i], 1.0)
-        doubt = np.where(finite, error[:, o, i], np.inf)
-        coherent = np.where(finite, coherence[:, o, i], 0.0)
+    outputs, inputs, omega = records[0].output_names, records[0].input_names, estimate.omega
+    remarks, clear = [], float(ndtri(1 - _CHANCE / (len(outputs) * len(inputs))))
+    for (o, output), (i, source) in itertools.product(enumerate(outputs), enumerate(inputs)):
+        pair, place = (output, source), (slice(None), o, i)
+        direct, finite = estimate.direct_coherence[place], np.isfinite(estimate.response[place])
+        dominated = dominated_by_feedback(direct, estimate.coherence[place])
+        if method == "joint" and 2 * np.sum(dominated) > np.sum(direct >= COHERENT):
+            text = (
+                "feedback-dominated: input and output are coherent at "
+                f"{np.sum(direct >= COHERENT)} frequencies, but at {np.sum(dominated)} of them, "
+                f"{in_hertz(omega[dominated])}, the reference explains neither. There the "
+                "controller feeds back noise, and the record holds no information on the plant. "
+                "Excite these frequencies by the reference"
+            )
+            remarks.append(Remark(text, pair=pair, kind=DOMINATED))
+        values = np.where(finite, estimate.response[place], 1.0)
+        doubt = np.where(finite, estimate.random_error[place], np.inf)
+        coherent = np.where(finite, estimate.coherence[place], 0.0)
         slope = phase_slope(omega, values, doubt, coherent)
         if slope is None:
             continue
         # What the phase at the top of the coherent band says, where it falls as no actuator's does.
-        covariance = None if errors is None else ft.partial(errors.between, (o, i), (o, i))
+        errors = estimate.errors
+        covariance = (
+            None if errors.windows is not None else ft.partial(errors.between, (o, i), (o, i))
+        )
         rises, lead = slope.rises(values, covariance, clear), 1e3 * slope.value
         used = omega[coherent >= COHERENT]
         if method == "joint":
@@ -86,7 +103,17 @@ def remarks_on_feedback(
             continue
         signals = [np.stack([x.outputs[:, o], x.inputs[:, i]]) for x in records]
         share = share_from_output(signals, records[0].dt, used)
-        by_controller = _is_made_by_controller(omega, values, doubt, coherent, share)
+        # Whether the output makes nearly all of the input at most of the coherent frequencies. The
+        # same holds of a plant whose answer is logged beside its cause, as far as nothing else
+        # moves either. It lags: where the output makes the input, its phase and magnitude fall.
+        # Where they do, the input's past must follow the output's, too.
+        by_controller = np.median(share.output_first) > _NEARLY_ALL
+        if by_controller and np.median(share.input_first) <= _MORE:
+            level = np.zeros(omega.size)
+            level[coherent >= COHERENT] = share.output_first > _NEARLY_ALL
+            moved = phase_slope(omega, values, doubt, level)
+            by_controller = moved is not None and moved.value * moved.span >= -_FALLS
+            by_controller = by_controller and moved.order >= -_LESS
         if rises:
             where = used if by_controller else omega[slope.top]
             remarks.append(Remark(_RISES.format(lead=lead), where, pair, DOMINATED))
@@ -97,22 +124,7 @@ def remarks_on_feedback(
     return tuple(dict.fromkeys(remarks))
 
 
-def _explained_by_reference(
-    omega: Grid, coherence: Grid, direct: Grid, pair: tuple[str, str]
-) -> list[Remark]:
-    dominated = dominated_by_feedback(direct, coherence)
-    if 2 * np.sum(dominated) <= np.sum(direct >= COHERENT):
-        return []
-    text = (
-        f"feedback-dominated: input and output are coherent at {np.sum(direct >= COHERENT)} "
-        f"frequencies, but at {np.sum(dominated)} of them, {in_hertz(omega[dominated])}, the "
-        "reference explains neither. There the controller feeds back noise, and the record holds "
-        "no information on the plant. Excite these frequencies by the reference"
-    )
-    return [Remark(text, pair=pair, kind=DOMINATED)]
-
-
-def dominated_by_feedback(direct: Grid, by_reference: Grid) -> Bool[np.ndarray, " frequencies"]:
+def dominated_by_feedback(direct: Grid, by_reference: Grid) -> Where:
     """Where input and output are coherent although the reference explains neither."""
     return (direct >= COHERENT) & (by_reference < COHERENT)
 
@@ -128,16 +140,12 @@ class PhaseSlope(NamedTuple):
     order: float  # of the magnitude: -1 where it falls as 1/omega
 
     def rises(
-        self,
-        response: Complex[np.ndarray, " frequencies"],
-        covariance: Covariance | None = None,
-        clear: float = 3.0,
+        self, response: Response, covariance: Covariance | None = None, clear: float = 3.0
     ) -> bool:
-        """Whether the phase increases, by `clear` standard errors.
+        """Whether the phase increases by `clear` standard errors, as that of -1/C and of no
+        actuator.
 
-        Every actuator lags, so a plant's phase decreases there. That of -1/C, with a controller
-        that filters and delays, increases. Neighbours share noise, which makes a slope less certain
-        than its many points say: the response's `covariance` is asked for where these say that it
+        Neighbours share noise: the `covariance` is asked for where the points alone say that it
         rises.
         """
         variance, top = self.variance, self.top
@@ -148,9 +156,7 @@ class PhaseSlope(NamedTuple):
         return bool(self.value > clear * np.sqrt(variance))
 
 
-def phase_slope(
-    omega: Grid, response: Complex[np.ndarray, " frequencies"], error: Grid, coherence: Grid
-) -> PhaseSlope | None:
+def phase_slope(omega: Grid, response: Response, error: Grid, coherence: Grid) -> PhaseSlope | None:
     """At the highest coherent frequency that has enough others below it; `None` without any."""
     good, top = np.flatnonzero(coherence >= COHERENT), np.zeros(0, int)
     for end in range(len(good), _FEWEST - 1, -1):
@@ -174,29 +180,6 @@ def phase_slope(
     return PhaseSlope(top, pull, slope, float(variance), span, float(order))
 
 
-def _is_made_by_controller(
-    omega: Grid,
-    response: Complex[np.ndarray, " frequencies"],
-    error: Grid,
-    coherence: Grid,
-    share: "Share",
-) -> bool:
-    """Whether the output makes nearly all of the input at most of the coherent frequencies.
-
-    The same holds of a plant whose answer is logged beside its cause, as far as nothing else moves
-    either. It lags: where the output makes the input, its phase and magnitude fall. Where they do,
-    the input's past must follow the output's, too.
-    """
-    if np.median(share.output_first) <= _NEARLY_ALL:
-        return False
-    if np.median(share.input_first) > _MORE:
-        return True
-    level = np.zeros(omega.size)
-    level[coherence >= COHERENT] = share.output_first > _NEARLY_ALL
-    slope = phase_slope(omega, response, error, level)
-    return slope is not None and slope.value * slope.span >= -_FALLS and slope.order >= -_LESS
-
-
 _ORDER = 12  # samples of both that the model remembers
 _ENOUGH = 20 * _ORDER  # samples for a model
 _LEVELS = (16.0, 4.0, 2.0, 1.0)  # half the sample rate over the highest frequency of interest
@@ -208,9 +191,9 @@ _EXACT = 1e-7  # of its power: new parts of the output below it say nothing
 class Share(NamedTuple):
     """Of the input's power at each frequency, that which the output's innovations make.
 
-    Innovations are what the past of both signals does not predict. What both have in common at one
-    sample counts as the output's in `output_first`, because a plant takes time to answer, and as
-    the input's in `input_first`, because a logger may write an answer beside its cause.
+    What both have in common at one sample is the output's in `output_first`, because a plant takes
+    time to answer, and the input's in `input_first`, because a logger may write an answer beside
+    its cause.
     """
 
     output_first: Grid
@@ -220,17 +203,11 @@ class Share(NamedTuple):
 def share_from_output(
     records: Sequence[Float[np.ndarray, "2 _samples"]], dt: float, omega: Grid
 ) -> Share:
-    """The directed share of Geweke (1982); zero where the records are too short for a model.
+    """The directed share of Geweke (1982) by an autoregressive model; zero for records too short.
 
-    It is that of a joint autoregressive model of both. At which sample rate innovations tell a
-    loop's directions apart depends on its noise: of several rates, the one with the largest median
-    counts. At a rate so slow that a plant answers within one sample, it can be mistaken for its
+    `records` are of output and input. Of several sample rates, the one with the largest median
+    counts. At one so slow that a plant answers within a sample, it can be mistaken for its
     controller: the highest rate has to show half of it, too.
-
-    **Arguments:**
-
-    - `records`: output and input, sampled every `dt` seconds.
-    - `omega`: frequencies in rad/s, increasing.
     """
     flat = []
     for x in records:  # without offset and trend, in units of the standard deviation
@@ -253,7 +230,19 @@ def share_from_output(
         if samples >= _ENOUGH:
             products = sum(lagged_products(x) for x in slow) / samples
             products += _ROUNDING * np.diag(np.tile(np.diag(products)[:2], _ORDER + 1))
-            shares.append(_share_at(products, omega * dt * every))
+            # By the model's response, from the innovations of output and input to the input.
+            past = np.linalg.solve(products[2:, 2:], products[2:, :2])
+            new = products[:2, :2] - products[:2, 2:] @ past
+            if not new[0, 0] > _EXACT * products[0, 0]:
+                shares.append(shares[0])
+                continue
+            late = np.exp(-1j * (omega * dt * every)[:, None] * np.arange(1, _ORDER + 1))
+            taken = np.einsum("fk,kij->fji", late, past.reshape(_ORDER, 2, 2))
+            from_output, from_input = paths = np.linalg.inv(np.eye(2) - taken)[:, 1].T
+            power = np.maximum(np.einsum("if,ij,jf->f", paths.conj(), new, paths).real, 1e-300)
+            both = new[0, 0] * np.abs(from_output + new[1, 0] / new[0, 0] * from_input) ** 2
+            alone = max(new[0, 0] - new[0, 1] ** 2 / max(new[1, 1], 1e-300), 0.0)
+            shares.append(Share(both / power, alone * np.abs(from_output) ** 2 / power))
     medians = [float(np.median(share.output_first)) for share in shares]
     best, quickest = int(np.argmax(medians)), min(1, len(shares) - 1)
     return shares[best if medians[quickest] > _CONFIRMED * medians[best] else quickest]
@@ -274,17 +263,144 @@ def lagged_products(x: Float[np.ndarray, "2 samples"]) -> Float[np.ndarray, "lag
     return sums.reshape(2 * p + 2, 2 * p + 2)
 
 
-def _share_at(products: Float[np.ndarray, "lags lags"], angle: Grid) -> Share:
-    """By the model's response at these angles per sample."""
-    past = np.linalg.solve(products[2:, 2:], products[2:, :2])
-    new = products[:2, :2] - products[:2, 2:] @ past
-    if not new[0, 0] > _EXACT * products[0, 0]:
-        return Share(np.zeros(angle.size), np.zeros(angle.size))
-    # From the innovations of output and input to the input.
-    late = np.exp(-1j * angle[:, None] * np.arange(1, _ORDER + 1))
-    taken = np.einsum("fk,kij->fji", late, past.reshape(_ORDER, 2, 2))
-    from_output, from_input = paths = np.linalg.inv(np.eye(2) - taken)[:, 1].T
-    power = np.maximum(np.einsum("if,ij,jf->f", paths.conj(), new, paths).real, 1e-300)
-    both = new[0, 0] * np.abs(from_output + new[1, 0] / new[0, 0] * from_input) ** 2
-    alone = max(new[0, 0] - new[0, 1] ** 2 / max(new[1, 1], 1e-300), 0.0)
-    return Share(both / power, alone * np.abs(from_output) ** 2 / power)
+def deembed(
+    closed: FrequencyResponse,
+    controller: Model,
+    *,
+    entry: Literal["set-point", "plant input"] = "set-point",
+) -> FrequencyResponse:
+    """Calculate the plant from a measured closed loop whose controller is known.
+
+    With T = G C / (1 + G C) measured from the set-point, G = T / (C (1 - T)); with
+    P = G / (1 + G C) measured from the plant input, G = P / (1 - P C). Random errors are propagated
+    to first order.
+
+    **Arguments:**
+
+    - `closed`: the `FrequencyResponse` of one output to the injected signal.
+    - `controller`: has `frequency_response(omega)`, from minus the output to the plant input, shape
+        `(frequencies, 1, 1)`; it is taken as exact.
+    - `entry`: where the signal was injected, `"set-point"` or `"plant input"`.
+
+    **Returns:** the `FrequencyResponse` of the plant, with a remark where the loop amplifies the
+    errors of the closed loop more than ten times.
+
+    **Raises:**
+
+    - `ValueError`: for another entry, or responses with more than one input or output.
+    """
+    measured = np.asarray(closed.response)
+    feedback = np.asarray(controller.frequency_response(jnp.asarray(closed.omega)))
+    if measured.shape[1:] != (1, 1) or feedback.shape != measured.shape:
+        raise ValueError(
+            f"deembed needs one input and one output, but the response has shape {measured.shape} "
+            f"and the controller's {feedback.shape} (frequencies, outputs, inputs): select "
+            "channels with jq.records.select"
+        )
+    if entry == "set-point":
+        rest = 1 - measured
+        plant, slope = measured / (feedback * rest), 1 / (feedback * rest**2)
+    elif entry == "plant input":
+        rest = 1 - measured * feedback
+        plant, slope = measured / rest, 1 / rest**2
+    else:
+        raise ValueError(f"entry is {entry!r}: use 'set-point' or 'plant input'")
+    amplified = np.abs(slope * measured / plant)
+    lost, remarks = np.asarray(closed.omega)[amplified[:, 0, 0] > _AMPLIFIED], list(closed.remarks)
+    if lost.size:
+        text = (
+            f"the closed loop hardly depends on the plant {{where}}: its errors are amplified more "
+            f"than {_AMPLIFIED:g} times there. Leave these frequencies out, or inject the signal "
+            "at the plant input"
+        )
+        remarks.append(Remark(text, lost, kind="amplified errors"))
+    errors = closed.errors.scaled(jnp.asarray(slope[:, 0, 0]))
+    return dataclasses.replace(
+        closed,
+        response=jnp.asarray(plant),
+        random_error=closed.random_error * jnp.asarray(amplified),
+        errors=errors,
+        remarks=tuple(remarks),
+    )
+
+
+class FeedbackBias(eqx.Module):
+    """The bias of the direct estimate by noise that a controller C feeds back.
+
+    With g^2 the coherence of reference and input, the direct estimate is
+    H1 = g^2 G + (1 - g^2) (-1/C). `noise_share` is 1 - g^2, `joint` is G, and `inverse` is -1/C,
+    estimated from the parts of input and output that the reference does not explain.
+    """
+
+    omega: Grid  # rad/s
+    direct: Response
+    joint: Response
+    inverse: Response
+    noise_share: Grid  # of the input's power, 0 to 1
+
+    @property
+    def bias(self) -> Response:
+        """Relative error of the direct estimate, H1 / G - 1."""
+        return self.direct / self.joint - 1
+
+    def __str__(self) -> str:
+        worst, largest = int(np.argmax(self.noise_share)), int(np.argmax(np.abs(self.bias)))
+        share, size = 100 * self.noise_share, 100 * np.abs(self.bias)
+        lines = [
+            f"feedback: {np.median(share):.2g} % of the input's power is fed-back noise (median), "
+            f"at most {share[worst]:.2g} % at {in_hertz(self.omega[[worst]])}",
+            f"  bias of the direct estimate: {np.median(size):.2g} % (median), at most "
+            f"{size[largest]:.2g} % at {in_hertz(self.omega[[largest]])}",
+        ]
+        if np.max(self.noise_share) > _SIGNIFICANT:
+            lines.append("  use the joint estimate, the default for a record with a reference")
+        return "\n".join(lines)
+
+
+def feedback_bias(
+    record: Record | Sequence[Record],
+    omega: Float[ArrayLike, " frequencies"] | None = None,
+    *,
+    welch: Welch | None = None,
+) -> FeedbackBias:
+    """Estimate how far feedback biases the direct estimate of a plant.
+
+    Input and output are split into the part that the reference explains and the rest (Wellstead,
+    1981, "Non-parametric methods of system identification"; Forssell and Ljung, 1999, "Closed-loop
+    identification revisited").
+
+    **Arguments:**
+
+    - `record`: one `Record` or several, with one input, one output and one external reference.
+    - `omega`: frequencies in rad/s; by default those of `welch`.
+    - `welch`: window and overlap, by default `jq.spectra.Welch()`.
+
+    **Returns:** a `FeedbackBias`, which prints as a summary.
+
+    **Raises:**
+
+    - `ValueError`: for other channels, and for frequencies that the window does not resolve.
+    """
+    records = [record] if isinstance(record, Record) else list(record)
+    check_compatible(records)
+    check_references(records)
+    first = records[0]
+    if len(first.input_names) != 1 or len(first.output_names) != 1:
+        raise ValueError(
+            f"feedback_bias needs one input and one output, but the record has "
+            f"{first.input_names} and {first.output_names}: select them with jq.records.select"
+        )
+    density = spectral_density(records, omega, welch=welch)
+    u, y, r = first.names
+    power, spread = np.asarray(density.power(u)), np.asarray(density.power(r))
+    cross, from_u, from_y = (np.asarray(density.cross(*pair)) for pair in ((u, y), (r, u), (r, y)))
+    explained = np.abs(from_u) ** 2 / spread
+    joint = from_y / from_u
+    rest = np.maximum(power - explained, 1e-300)
+    return FeedbackBias(
+        np.asarray(density.omega),
+        cross / power,
+        joint,
+        (cross - np.conj(from_u) * from_y / spread) / rest,
+        np.clip(1 - explained / power, 0.0, 1.0),
+    )

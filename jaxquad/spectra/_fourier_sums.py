@@ -1,8 +1,8 @@
-"""Fourier sums of tapered windows of several lengths, at any frequencies.
+"""Fourier sums of tapered windows of several lengths, at any frequencies; windows and their places.
 
 A raised cosine is a constant and two waves: behind it, the sum at w is made of those of plain
 windows at w and w +- 2 pi / length. Those are differences of running sums over blocks of samples,
-which all windows share, so the cost depends neither on their overlap nor on the number of tapers.
+so the cost depends neither on the overlap of windows nor on the number of tapers.
 Of a block only the few even and odd functions count that these frequencies can tell apart: with
 c = w block / 2, about 2 c / pi + O(log c) of them (Slepian; Landau and Widom, 1980).
 """
@@ -16,16 +16,90 @@ from jaxtyping import Bool, Complex, Float, Int
 
 from jaxquad._core import require_x64
 
-from ._windows import Layout, waves, window
+
+Grid = Float[np.ndarray, " frequencies"]
+Layout = tuple[tuple[int, tuple[int, ...]], ...]  # length and starts of each set of windows
+
+_SHAPES = {"hann": (0.5, 0.5), "hamming": (0.54, 0.46), "rectangular": (1.0, 0.0)}
+
+
+def window(name: str, samples: int) -> Float[np.ndarray, " window"]:
+    """A periodic raised-cosine window of `samples` points: "hann", "hamming" or "rectangular"."""
+    level, cosine, sine = waves(name)
+    angle = 2 * np.pi * np.arange(samples) / samples
+    return level - cosine * np.cos(angle) - sine * np.sin(angle)
+
+
+def waves(name: str) -> tuple[float, float, float]:
+    """level - cosine cos a - sine sin a of a window, a = 2 pi n / samples; primes stand for
+    d/da."""
+    plain = name.rstrip("'")
+    (level, cosine), sine = coefficients(plain), 0.0
+    for _ in range(len(name) - len(plain)):
+        level, cosine, sine = 0.0, sine, -cosine
+    return level, cosine, sine
+
+
+def coefficients(name: str) -> tuple[float, float]:
+    """Level and cosine amplitude of a window: level - cosine cos(2 pi n / samples)."""
+    if name not in _SHAPES:
+        raise ValueError(f"there is no window {name!r}: use one of {', '.join(_SHAPES)}")
+    return _SHAPES[name]
+
+
+@ft.lru_cache(maxsize=256)
+def segment_starts(samples: int, length: int, overlap: float) -> tuple[int, ...]:
+    """First samples of windows that overlap by at least `overlap`, spread evenly to both ends."""
+    step = max(int(round(length * (1 - overlap))), 1)
+    count = -(-(samples - length) // step) + 1
+    return tuple(int(start) for start in np.round(np.linspace(0, samples - length, count)))
+
+
+_BLOCKS = (32, 1024)  # samples to a block that windows of several lengths share
+
+
+@ft.lru_cache(maxsize=64)
+def lattice_windows(
+    samples: int, lengths: tuple[int, ...], overlap: float, highest: float
+) -> Layout:
+    """Windows near `lengths` that overlap by about `overlap`, of whole blocks where that pays.
+
+    A block is about 50 rad long at the `highest` frequency (rad per sample), and counted from the
+    record's end; the first window of each length starts at the first sample.
+    """
+    if not 0 <= overlap < 1:
+        raise ValueError(f"overlap {overlap} is not in [0, 1): 0.5 or 0.8 are usual")
+    for length in lengths:
+        if not 2 <= length <= samples:
+            raise ValueError(
+                f"a window of {length} samples does not fit a record of {samples}: give lengths "
+                f"of 2 to {samples} samples"
+            )
+    long = [length for length in lengths if length >= 16 * _BLOCKS[0]]
+    common = 1
+    if long:  # the block that divides all lengths, or else changes them by least
+        ideal = min(50 / max(highest, 1e-9), min(long) / 8, _BLOCKS[1])
+        sizes = np.arange(max(int(ideal / 2), _BLOCKS[0]), max(int(1.5 * ideal), _BLOCKS[0]) + 1)
+        change = [max(abs(round(n / b) * b / n - 1) for n in long) for b in sizes]
+        best = np.flatnonzero(np.array(change) <= min(change) + 1e-12)
+        common = int(sizes[best[np.argmin(np.abs(sizes[best] - ideal))]])
+    layout = []
+    for length in lengths:
+        block = common if length in long else 1
+        length = min(round(length / block), samples // block) * block
+        step, last = max(int(round(length * (1 - overlap))), 1), samples - length
+        ideal = np.linspace(0, last, -(-last // step) + 1)
+        starts = last - np.round((last - ideal) / block).astype(int) * block
+        layout.append((length, tuple(sorted({max(int(s), 0) for s in (0, *starts[1:])}))))
+    return tuple(layout)
 
 
 _SHORT = 128  # samples below which a window is summed directly
-_BLOCKS = (32, 1024)  # samples to a block
+_AT_ONCE = 128  # blocks, about, whose sums stay in the processor's cache
 _TOLERANCE = 6e-14  # of a block's waves; leaves 2e-13 of the largest Fourier sum
 _THIN = 256  # samples that show a constant well enough
 _TRENDS = ("none", "constant", "linear")
 
-Angles = Float[np.ndarray, " frequencies"]
 Sums = Complex[np.ndarray, "frequencies _ windows"]
 
 
@@ -39,7 +113,7 @@ class Taper(NamedTuple):
 
 def fourier_sums(
     signals: tuple[Float[np.ndarray, "samples _"], ...],
-    angle: Angles,
+    angle: Grid,
     windows: Layout,
     tapers: tuple[Taper, ...],
     *,
@@ -48,48 +122,13 @@ def fourier_sums(
 ) -> list[list[Complex[np.ndarray, "frequencies segments _"]]]:
     """`sum_n taper[n] x[start + n] exp(-j angle (origin + start + n))`, by taper and by length.
 
-    `signals` lie side by side, `angle` is in rad per sample, and the phase is that of a record
-    whose first sample is number `origin`. `detrend` removes the "constant" or the "linear"
-    least-squares trend of every window before the taper, or "none". Accurate to about 2e-13 of the
-    largest sum. Raises `ValueError` for windows outside the record or frequencies above the Nyquist
-    frequency, `PrecisionError` in 32 bits. In memory, the windows of one channel are neighbours.
+    `signals` lie side by side, `angle` is in rad per sample. `detrend` removes the "constant" or
+    the "linear" trend of every window before the taper, or "none". Accurate to about 2e-13 of the
+    largest sum. In memory, the windows of one channel are neighbours.
     """
     require_x64("a transform")
     angle = np.asarray(angle, float)
     samples = len(signals[0])
-    _check(samples, angle, windows, detrend)
-    rows, end = np.empty((sum(x.shape[1] for x in signals), samples)), 0
-    for part in signals:
-        columns = np.asarray(part, float).T
-        begin, end = end, end + len(columns)
-        # Near each channel's mean: no trend is left of it, but its rounding errors would be.
-        few = columns[:, :: max(samples // _THIN, 1)] if detrend != "none" else np.zeros((1, 1))
-        np.subtract(columns, np.mean(few, axis=1, keepdims=True), out=rows[begin:end])
-    sums = [
-        [np.empty((angle.size, taper.channels, len(s)), complex) for _, s in windows[taper.first :]]
-        for taper in tapers
-    ]
-    long = [group for group in windows if group[0] >= _SHORT]
-    blocks = _share_blocks(samples, angle, long) if long else None
-    running = [_Channel(row, blocks, detrend) for row in rows] if blocks else []
-    for number, (length, starts) in enumerate(windows):
-        mine = [(t.shape, part[number - t.first]) for t, part in zip(tapers, sums, strict=True)
-                if t.first <= number]  # fmt: skip
-        if blocks is None or length < _SHORT:
-            _sum_directly(rows, angle, length, starts, mine, detrend)
-            continue
-        placed = _place_windows(blocks, length, starts)
-        for c, channel in enumerate(running):
-            few = [(shape, part[:, c]) for shape, part in mine if c < part.shape[1]]
-            channel.sum_windows(placed, few)
-    if origin:
-        turn = np.exp(-1j * origin * angle)[:, None, None]
-        for part in (part for parts in sums for part in parts):
-            part *= turn
-    return [[np.swapaxes(part, 1, 2) for part in parts] for parts in sums]
-
-
-def _check(samples: int, angle: Angles, windows: Layout, detrend: str) -> None:
     if detrend not in _TRENDS:
         raise ValueError(f"detrend is {detrend!r}: use none, constant or linear")
     if not angle.size or not np.all(np.abs(angle) <= np.pi):
@@ -107,6 +146,37 @@ def _check(samples: int, angle: Angles, windows: Layout, detrend: str) -> None:
                 f"{max(starts, default=None)} do not fit a record of {samples} samples: starts "
                 f"must lie between 0 and {samples - length}, and a window must hold 2 samples"
             )
+    rows, end = np.empty((sum(x.shape[1] for x in signals), samples)), 0
+    for part in signals:
+        columns = np.asarray(part, float).T
+        begin, end = end, end + len(columns)
+        # Near each channel's mean: no trend is left of it, but its rounding errors would be.
+        few = columns[:, :: max(samples // _THIN, 1)] if detrend != "none" else np.zeros((1, 1))
+        np.subtract(columns, np.mean(few, axis=1, keepdims=True), out=rows[begin:end])
+    sums = [
+        [np.empty((angle.size, taper.channels, len(s)), complex) for _, s in windows[taper.first :]]
+        for taper in tapers
+    ]
+    long = [group for group in windows if group[0] >= _SHORT]
+    blocks = _share_blocks(samples, angle, long) if long else None
+    placed = [_place_windows(blocks, *group) for group in long] if blocks else []
+    trends = _TRENDS.index(detrend)
+    running = [_Channel(row, blocks, placed, trends) for row in rows] if blocks else []
+    for number, (length, starts) in enumerate(windows):
+        mine = [(t.shape, part[number - t.first]) for t, part in zip(tapers, sums, strict=True)
+                if t.first <= number]  # fmt: skip
+        if blocks is None or length < _SHORT:
+            _sum_directly(rows, angle, length, starts, mine, detrend)
+            continue
+        part = _place_windows(blocks, length, starts)
+        for c, channel in enumerate(running):
+            few = [(shape, sums[:, c]) for shape, sums in mine if c < sums.shape[1]]
+            channel.sum_windows(part, few)
+    if origin:
+        turn = np.exp(-1j * origin * angle)[:, None, None]
+        for part in (part for parts in sums for part in parts):
+            part *= turn
+    return [[np.swapaxes(part, 1, 2) for part in parts] for parts in sums]
 
 
 class _Blocks(NamedTuple):
@@ -119,27 +189,8 @@ class _Blocks(NamedTuple):
     reach: float  # rad per sample, of the shifted frequencies
 
 
-class _Waves(NamedTuple):
-    """exp(-j w n) on blocks at some frequencies, as coefficients of the blocks' functions."""
-
-    even: Float[np.ndarray, "frequencies even"]
-    odd: Float[np.ndarray, "frequencies odd"]
-    phase: Complex[np.ndarray, "frequencies blocks"]  # at the blocks' middles
-
-    def sums(
-        self, coefficients: Sequence[Float[np.ndarray, "_ blocks"]]
-    ) -> Complex[np.ndarray, "_ blocks"]:
-        """Fourier sums of blocks, but for the phase of their middles."""
-        sums = np.empty((len(self.even), coefficients[0].shape[1]), complex)
-        sums.real, sums.imag = self.even @ coefficients[0], self.odd @ coefficients[1]
-        return sums
-
-
-def _share_blocks(samples: int, angle: Angles, windows: Sequence) -> _Blocks:
-    """Blocks of about 50 rad, at whose ends as many windows as possible begin and end.
-
-    But for the first of each length, windows lie on blocks where one divides all their steps.
-    """
+def _share_blocks(samples: int, angle: Grid, windows: Sequence) -> _Blocks:
+    """Blocks of about 50 rad, at whose ends as many windows as possible begin and end."""
     highest = float(np.max(np.abs(angle)))
     ideal = int(np.clip(50 / max(highest, 1e-9), *_BLOCKS))
     origin = windows[0][1][-1]
@@ -165,6 +216,23 @@ def _block_functions(size: int, reach: float) -> tuple[np.ndarray, np.ndarray]:
     return functions[0], functions[1]
 
 
+class _Waves(NamedTuple):
+    """exp(-j w n) on blocks at some frequencies."""
+
+    even: Float[np.ndarray, "waves even"]  # coefficients of the blocks' functions
+    odd: Float[np.ndarray, "waves odd"]
+    phase: Complex[np.ndarray, "waves blocks"]  # at the blocks' middles
+
+    def sums(
+        self, even: np.ndarray, odd: np.ndarray, blocks: slice | np.ndarray
+    ) -> Complex[np.ndarray, "waves blocks"]:
+        """Fourier sums of blocks with these coefficients."""
+        sums = np.empty((len(self.even), even.shape[1]), complex)
+        sums.real, sums.imag = self.even @ even, self.odd @ odd
+        sums *= self.phase[:, blocks]
+        return sums
+
+
 @ft.lru_cache(maxsize=16)
 def _block_waves(blocks: _Blocks, shift: float) -> _Waves:
     """At all frequencies; with a shift, at these less it and then at these and it."""
@@ -179,33 +247,54 @@ def _block_waves(blocks: _Blocks, shift: float) -> _Waves:
     return _Waves(np.cos(place) @ even, -np.sin(place) @ odd, phase)
 
 
-class _Channel:
-    """One channel's blocks, their coefficients, and its running sums."""
+class _Windows(NamedTuple):
+    """Where windows of one length begin and end in the blocks."""
 
-    def __init__(self, row: Float[np.ndarray, " samples"], blocks: _Blocks, detrend: str):
-        self.shared, self.trends = blocks, _TRENDS.index(detrend)
+    length: int
+    start: Int[np.ndarray, " windows"]
+    shift: float  # rad per sample, of the taper's waves
+    ends: Int[np.ndarray, " ends"]  # samples at which windows begin or end, rising
+    turn: Complex[np.ndarray, " windows"]  # phase of the taper's waves at the starts
+    middle: Complex[np.ndarray, "frequencies windows"]  # phase there
+    place: Int[np.ndarray, " ends"]  # the blocks of the ends
+    part: Int[np.ndarray, " parts"]  # which ends lie within a block
+    inside: Bool[np.ndarray, "parts samples"]  # the samples of these blocks before them
+    first: Int[np.ndarray, " windows"]  # number of each window's begin among the ends
+    last: Int[np.ndarray, " windows"]
+
+
+@ft.lru_cache(maxsize=16)
+def _place_windows(blocks: _Blocks, length: int, starts: tuple[int, ...]) -> _Windows:
+    start, shift = np.array(starts), 2 * np.pi / length
+    ends, number = np.unique(np.concatenate([start, start + length]), return_inverse=True)
+    place, beyond = np.divmod(ends + blocks.lead, blocks.size)
+    part = np.flatnonzero(beyond)
+    inside = np.arange(blocks.size) < beyond[part, None]
+    middle = np.exp(-1j * np.array(blocks.angle)[:, None] * (start + length / 2))
+    first, last = number[: start.size], number[start.size :]
+    turn = np.exp(1j * shift * start)
+    return _Windows(length, start, shift, ends, turn, middle, place, part, inside, first, last)
+
+
+class _Channel:
+    """One channel's blocks, their coefficients, and its sums without a taper."""
+
+    def __init__(self, row: np.ndarray, blocks: _Blocks, windows: Sequence[_Windows], trends: int):
+        self.row, self.shared, self.trends = row, blocks, trends
         padded = np.zeros(blocks.count * blocks.size)
         padded[blocks.lead : blocks.lead + row.size] = row
         self.blocks = padded.reshape(blocks.count, blocks.size)
         functions = _block_functions(blocks.size, blocks.reach)
         self.coefficients = [function.T @ self.blocks.T for function in functions]
-        still = _block_waves(blocks, 0.0)
-        self.still = np.zeros((len(still.even), blocks.count + 1), complex)  # running sums
-        np.cumsum(still.sums(self.coefficients) * still.phase, axis=1, out=self.still[:, 1:])
-        time = np.arange(row.size) - row.size / 2
-        moments = [row, row * time][: self.trends]
-        self.moments = [np.concatenate([[0.0], np.cumsum(part)]) for part in moments]
+        self.edges = np.unique(np.concatenate([part.place for part in windows]))
+        self.still = self._running(_block_waves(blocks, 0.0), self.edges)
 
-    def sum_windows(
-        self,
-        windows: "_Windows",
-        into: Sequence[tuple[str, Complex[np.ndarray, "frequencies windows"]]],
-    ) -> None:
-        """Fill in the sums behind each taper."""
+    def sum_windows(self, windows: _Windows, into: Sequence[tuple[str, np.ndarray]]) -> None:
+        """Fill in the sums behind each taper, by frequency and window."""
         still, below, above = self._plain(windows)
         below, above = below * windows.turn.conj(), above * windows.turn
-        trends = self._trends(windows.start, windows.length)
         both, odd = below + above, 0.5j * (below - above)
+        trends = self._trends(windows)
         for shape, sums in into:
             level, cosine, sine = waves(shape)
             np.multiply(both, -cosine / 2, out=sums)
@@ -215,78 +304,49 @@ class _Channel:
                 sums += sine * odd
             if self.trends:
                 angle = self.shared.angle
-                coefficients = _trend_sums(angle, windows.length, shape, self.trends)
-                sums -= coefficients @ trends * windows.middle
+                of_trends = _trend_sums(angle, windows.length, shape, self.trends)
+                sums -= of_trends @ trends * windows.middle
 
-    def _plain(self, windows: "_Windows") -> Complex[np.ndarray, "3 frequencies windows"]:
-        """Sums without a taper: at all frequencies, at these less the shift, and more."""
-        count, place, used = len(self.still), windows.place, windows.used
+    def _running(self, waves: _Waves, edges: np.ndarray) -> Complex[np.ndarray, "waves edges"]:
+        """Sums from the first of these blocks to before each of them."""
+        running, count = np.zeros((len(waves.even), edges.size), complex), edges.size - 1
+        groups = min(-(-(edges[-1] - edges[0]) // _AT_ONCE), count)
+        for few in np.array_split(np.arange(count), groups) if count else ():
+            used = slice(edges[few[0]], edges[few[-1] + 1])
+            sums = waves.sums(*(rows[:, used] for rows in self.coefficients), used)
+            running[:, few + 1] = np.add.reduceat(sums, edges[few] - used.start, axis=1)
+        return np.cumsum(running, axis=1)
+
+    def _plain(self, windows: _Windows) -> Complex[np.ndarray, "3 frequencies windows"]:
+        """Sums without a taper: at all frequencies, and at these less and plus the shift."""
         still, shifted = (_block_waves(self.shared, d) for d in (0.0, windows.shift))
-        running = np.zeros((3 * count, place.size), complex)
-        running[:count] = self.still[:, place]
-        if windows.steps.size:
-            moving = shifted.sums([rows[:, used] for rows in self.coefficients])
-            moving *= shifted.phase[:, used]
-            sums = np.cumsum(np.add.reduceat(moving, windows.steps, axis=1), axis=1)
-            later = windows.step > 0
-            running[count:, later] = sums[:, windows.step[later] - 1]
-        part = windows.part
-        if part.size:
-            samples = (self.blocks[place[part]] * windows.inside).T
+        edges, step = np.unique(windows.place, return_inverse=True)
+        moving = self._running(shifted, edges)[:, step]
+        running = np.concatenate(
+            [self.still[:, np.searchsorted(self.edges, windows.place)], moving]
+        )
+        if windows.part.size:
+            place = windows.place[windows.part]
+            samples = (self.blocks[place] * windows.inside).T
             functions = _block_functions(self.shared.size, self.shared.reach)
             few = [function.T @ samples for function in functions]
-            rest = [wave.sums(few) * wave.phase[:, place[part]] for wave in (still, shifted)]
-            running[:, part] += np.concatenate(rest)
+            parts = [wave.sums(*few, place) for wave in (still, shifted)]
+            running[:, windows.part] += np.concatenate(parts)
         plain = running[:, windows.last] - running[:, windows.first]
-        return plain.reshape(3, count, -1)
+        return plain.reshape(3, -1, windows.start.size)
 
-    def _trends(
-        self, start: Int[np.ndarray, " windows"], length: int
-    ) -> Float[np.ndarray, "trends windows"]:
+    def _trends(self, windows: _Windows) -> Float[np.ndarray, "trends windows"]:
         """Mean and slope of each window."""
-        parts = [part[start + length] - part[start] for part in self.moments]
+        length, ends, row = windows.length, windows.ends, self.row[: windows.ends[-1]]
+        parts = []
+        for k in range(self.trends):
+            moment = row * (np.arange(row.size) - self.row.size / 2) if k else row
+            running = np.append(0.0, np.cumsum(np.add.reduceat(moment, ends[:-1])))
+            parts.append(running[windows.last] - running[windows.first])
         if self.trends > 1:
-            middle = start + (length - 1) / 2 - (self.moments[0].size - 1) / 2
+            middle = windows.start + (length - 1) / 2 - self.row.size / 2
             parts[1] = (parts[1] - parts[0] * middle) * 12 / (length * (length**2 - 1.0))
-        return np.stack([parts[0] / length, *parts[1:]]) if parts else np.zeros((0, start.size))
-
-
-class _Windows(NamedTuple):
-    """Where windows of one length begin and end in the blocks."""
-
-    length: int
-    start: Int[np.ndarray, " windows"]
-    shift: float  # rad per sample, of the taper's waves
-    turn: Complex[np.ndarray, " windows"]  # their phase at the starts
-    middle: Complex[np.ndarray, "frequencies windows"]  # phase there
-    place: Int[np.ndarray, " ends"]  # blocks with an end, rising
-    part: Int[np.ndarray, " parts"]  # which ends lie within a block
-    inside: Bool[np.ndarray, "parts samples"]  # the samples of these blocks before them
-    used: slice  # blocks from the first to before the last end
-    steps: Int[np.ndarray, " steps"]  # of these, at which new sums begin
-    step: Int[np.ndarray, " ends"]  # number of each end's block among those with an end
-    first: Int[np.ndarray, " windows"]  # number of each window's begin among the ends
-    last: Int[np.ndarray, " windows"]
-
-
-@ft.lru_cache(maxsize=16)
-def _place_windows(blocks: _Blocks, length: int, starts: tuple[int, ...]) -> _Windows:
-    start, shift = np.array(starts), 2 * np.pi / length
-    ends, number = np.unique(
-        np.concatenate([start, start + length]) + blocks.lead, return_inverse=True
-    )
-    place, beyond = np.divmod(ends, blocks.size)
-    filled, step = np.unique(place, return_inverse=True)
-    part = np.flatnonzero(beyond)
-    inside = np.arange(blocks.size) < beyond[part, None]
-    angle = np.array(blocks.angle)
-    turn = np.exp(1j * shift * start)
-    middle = np.exp(-1j * angle[:, None] * (start + length / 2))
-    used, steps = slice(int(filled[0]), int(filled[-1])), filled[:-1] - filled[0]
-    first, last = number[: start.size], number[start.size :]
-    return _Windows(
-        length, start, shift, turn, middle, place, part, inside, used, steps, step, first, last
-    )
+        return np.stack([parts[0] / length, *parts[1:]]) if parts else np.zeros((0, 1))
 
 
 @ft.lru_cache(maxsize=32)
@@ -300,7 +360,7 @@ def _trend_sums(
 
 def _sum_directly(
     rows: Float[np.ndarray, "channels samples"],
-    angle: Angles,
+    angle: Grid,
     length: int,
     starts: tuple[int, ...],
     into: Sequence[tuple[str, Sums]],
@@ -321,12 +381,9 @@ def _sum_directly(
 
 
 def _from_middle(
-    segments: Float[np.ndarray, "channels windows samples"], angle: Angles
+    segments: Float[np.ndarray, "channels windows samples"], angle: Grid
 ) -> Complex[np.ndarray, "frequencies channels windows"]:
-    """Fourier sums with phases from the middle of a window.
-
-    Within short blocks and then over the blocks, so that few exponentials are needed.
-    """
+    """Fourier sums with phases from the middle of a window, in two steps: few exponentials."""
     *many, length = segments.shape
     block = max(int(np.sqrt(length)), 1)
     count = -(-length // block)

@@ -1,16 +1,44 @@
-from collections.abc import Sequence
-from typing import Literal, Protocol, runtime_checkable
+"""Frequency responses: estimates of records, and tables that were measured elsewhere."""
+
+import functools as ft
+import itertools
+from collections.abc import Callable, Sequence
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Complex, Float
 
-from jaxquad._core import pytree_node, require_float64
+from jaxquad._core import pytree_node, require_float64, require_x64
+from jaxquad.records import Record
 
-from ._checks import in_hertz
 from ._error_covariance import ErrorCovariance, independent_errors
-from ._remarks import points_dominated, Remark, remarks_on_used
+from ._estimators import (
+    check_band,
+    check_compatible,
+    check_distinct,
+    check_excitation,
+    check_references,
+    COHERENT,
+    Composite,
+    DOMINATED,
+    Estimator,
+    Grid,
+    in_hertz,
+    JointInputOutput,
+    Levels,
+    LocalPolynomial,
+    Method,
+    Pairs,
+    Periodic,
+    Remark,
+    Remarks,
+    Responses,
+    Square,
+    Welch,
+)
 
 
 class Distortion(eqx.Module):
@@ -23,11 +51,11 @@ class Distortion(eqx.Module):
     "System Identification", 2nd ed., section 4.3.1.
     """
 
-    omega: Float[np.ndarray, " frequencies"]  # rad/s
-    amplitude: Float[np.ndarray, "frequencies outputs"]
-    noise: Float[np.ndarray, "frequencies outputs"]
-    total: Float[np.ndarray, "frequencies outputs"]
-    nonlinear: Float[np.ndarray, "frequencies outputs"]
+    omega: Grid  # rad/s
+    amplitude: Levels
+    noise: Levels
+    total: Levels
+    nonlinear: Levels
     significant: Bool[np.ndarray, " outputs"]  # whether the scatter exceeds that of the noise
     output_names: tuple[str, ...] = eqx.field(static=True)
     realisations: int = eqx.field(static=True)
@@ -93,15 +121,15 @@ class FrequencyResponse:
     errors: ErrorCovariance
     direct_coherence: Float[Array, "frequencies outputs inputs"]  # input to output, no reference
     multiple_coherence: Float[Array, "frequencies outputs"]  # of the output with all inputs
-    method: Literal["direct", "joint"] = eqx.field(static=True)
+    method: Method = eqx.field(static=True)
     input_names: tuple[str, ...] = eqx.field(static=True)
     output_names: tuple[str, ...] = eqx.field(static=True)
     remarks: Sequence[Remark] = eqx.field(static=True, default=())
     integrators: int = eqx.field(static=True, default=0)  # removed before windowing
     resolution: float = eqx.field(static=True, default=0.0)  # one cycle in a window, rad/s
     distortion: Distortion | None = None  # of a periodic excitation
-    log_noise_covariance: Float[np.ndarray, "frequencies frequencies"] | None = None
-    divided: Float[np.ndarray, "frequencies outputs inputs"] | None = None  # 0 to 1; 0 without
+    log_noise_covariance: Square | None = None
+    divided: Pairs | None = None  # 0 to 1; 0 without
     dt: float = eqx.field(static=True, default=0.0)  # s; 0 where nothing was sampled
     hold: float | None = eqx.field(static=True, default=None)  # s
     fed_back: bool = eqx.field(static=True, default=False)  # the records had references: a loop
@@ -147,6 +175,13 @@ class FrequencyResponse:
         grid, values, coherent, error = _read_table(
             omega, response, coherence, random_error, averages
         )
+
+        def names(kind: str, chosen: Sequence[str], letter: str, count: int) -> tuple[str, ...]:
+            names = tuple(chosen) or tuple(f"{letter}{k}" for k in range(count))
+            if len(names) != count:
+                raise ValueError(f"{kind} has {len(names)} names and the response {count} channels")
+            return names
+
         variance = 2 * (error * np.abs(values)) ** 2
         _, outputs, inputs = values.shape
         return cls(
@@ -158,17 +193,17 @@ class FrequencyResponse:
             direct_coherence=jnp.asarray(coherent),
             multiple_coherence=jnp.asarray(coherent.max(axis=2)),
             method="direct",
-            input_names=_names("input_names", input_names, "u", inputs),
-            output_names=_names("output_names", output_names, "y", outputs),
+            input_names=names("input_names", input_names, "u", inputs),
+            output_names=names("output_names", output_names, "y", outputs),
         )
 
     @property
-    def magnitude_db(self) -> Float[np.ndarray, "frequencies outputs inputs"]:
+    def magnitude_db(self) -> Pairs:
         """20 log10 of the magnitude."""
         return 20 * np.log10(np.abs(np.asarray(self.response)))
 
     @property
-    def phase_deg(self) -> Float[np.ndarray, "frequencies outputs inputs"]:
+    def phase_deg(self) -> Pairs:
         """Phase in degrees, unwrapped along frequency."""
         return np.degrees(np.unwrap(np.angle(np.asarray(self.response)), axis=0))
 
@@ -176,14 +211,26 @@ class FrequencyResponse:
         self, used: Bool[np.ndarray, "frequencies outputs inputs"]
     ) -> tuple[Remark, ...]:
         """Those of the remarks that concern the points in use, restricted to these, each once."""
-        omega = np.asarray(self.omega)
-        return remarks_on_used(self.remarks, omega, used, self.output_names, self.input_names)
+        omega, kept = np.asarray(self.omega), []
+        for remark in self.remarks:
+            mine = np.any(used, axis=(1, 2))
+            if remark.pair is not None:
+                output, source = remark.pair
+                mine = used[:, self.output_names.index(output), self.input_names.index(source)]
+            part = remark.within(omega[mine]) if np.any(mine) else None
+            kept += [] if part is None else [part]
+        return tuple(dict.fromkeys(kept))
 
     @property
     def of_controller(self) -> Bool[np.ndarray, "frequencies outputs inputs"]:
         """Points that remarks name as dominated by feedback: there, the response is -1/C."""
-        names = self.output_names, self.input_names
-        return points_dominated(self.remarks, np.asarray(self.omega), *names)
+        dominated, omega = np.zeros(self.response.shape, bool), np.asarray(self.omega)
+        for remark in (remark for remark in self.remarks if remark.kind == DOMINATED):
+            every = itertools.product(self.output_names, self.input_names)
+            for output, source in [remark.pair] if remark.pair else every:
+                place = self.output_names.index(output), self.input_names.index(source)
+                dominated[np.isin(omega, remark.omega), *place] = True
+        return dominated
 
     def relative_covariance(
         self, output: int = 0, input: int = 0
@@ -197,7 +244,7 @@ class FrequencyResponse:
         return covariance / np.outer(response, response.conj())
 
     @property
-    def error_exponent(self) -> Float[np.ndarray, "frequencies outputs inputs"]:
+    def error_exponent(self) -> Pairs:
         """The power p of |measurement / model| in the random error relative to a model.
 
         Noise of a numerator is relative to the measured one: error |measurement| / |model|, p = 1.
@@ -212,21 +259,14 @@ class FrequencyResponse:
         lines = [f"frequency response, {_METHODS[self.method]}, {omega.size} frequencies"]
         for o, output in enumerate(self.output_names):
             for i, source in enumerate(self.input_names):
-                good = omega[coherence[:, o, i] >= 0.6]
+                good = omega[coherence[:, o, i] >= COHERENT]
                 where = f", {in_hertz(good)}" if good.size else ""
                 lines.append(
                     f"  {source} -> {output}: coherence above 0.6 at {good.size} frequencies{where}"
                 )
-        coherent = coherence >= 0.6
+        coherent = coherence >= COHERENT
         shown = self.remarks_about(coherent) if np.any(coherent) else self.remarks
         return "\n".join(lines + [f"  ! {remark}" for remark in shown])
-
-
-def _names(kind: str, chosen: Sequence[str], letter: str, count: int) -> tuple[str, ...]:
-    names = tuple(chosen) or tuple(f"{letter}{k}" for k in range(count))
-    if len(names) != count:
-        raise ValueError(f"{kind} has {len(names)} names and the response {count} channels")
-    return names
 
 
 def _read_table(
@@ -290,3 +330,127 @@ def _like(name: str, numbers: ArrayLike, values: np.ndarray) -> np.ndarray:
             f"{name} has the shape {np.shape(numbers)} and the response {values.shape}: give one "
             "number, one for each frequency, or one for each number of the response"
         ) from None
+
+
+class Estimate(NamedTuple):
+    """What an estimator makes of records; nan and infinite errors where it is undetermined."""
+
+    omega: Grid
+    response: Responses
+    coherence: Pairs
+    direct_coherence: Pairs
+    multiple_coherence: Levels
+    errors: ErrorCovariance
+    random_error: Pairs
+    log_noise_covariance: Square
+    remarks: Callable[[], tuple[Remark, ...]]
+    divided: Pairs | None = None
+    distortion: Distortion | None = None
+    resolution: float = 0.0
+
+
+def frequency_response(
+    record: Record | Sequence[Record],
+    omega: Float[ArrayLike, " frequencies"] | float | int | None = None,
+    *,
+    estimator: Estimator | None = None,
+) -> FrequencyResponse:
+    """Estimate the frequency responses of all outputs to all inputs.
+
+    **Arguments:**
+
+    - `record`: one `Record`, or several with the same channels and sample rate, which are taken
+        together.
+    - `omega`: frequencies in rad/s, increasing, or a single one; by default 100 log-spaced ones
+        from two cycles of the longest record to a tenth of the sample rate (the excited lines with
+        `jq.spectra.Periodic`).
+    - `estimator`: one of `jq.spectra.LocalPolynomial`, `Composite`, `Welch`, `Periodic` and
+        `JointInputOutput`. By default local polynomials, by the joint input-output method where the
+        record has references, else directly from input to output (H1, equation (13) in
+        docs/equations.md). Feedback biases the direct estimate towards -1/C.
+
+    **Returns:** a `FrequencyResponse`. Several inputs are conditioned on each other.
+
+    **Raises:**
+
+    - `ValueError`: for frequencies that the records do not resolve, a channel that is constant or
+        given twice, and a joint estimate without one reference for each input.
+    - `PrecisionError`, a `ValueError`: JAX runs in 32 bits; call `jq.enable_x64()` first.
+
+    !!! Example
+
+        ```python
+        record = jq.read("log15.npz", inputs="M", outputs="q", references="x0", start=50, stop=76)
+        response = jq.frequency_response(record, np.geomspace(1.0, 60.0, 80))
+        print(response)
+        ```
+    """
+    from ._local_polynomial import estimate_local_polynomial
+    from ._periodic import estimate_periodic
+    from ._welch import average_windows
+
+    require_x64("a frequency response")
+    records = [record] if isinstance(record, Record) else list(record)
+    check_compatible(records)
+    check_distinct(records)
+    first, method = records[0], "direct"
+    grid = None if omega is None else np.atleast_1d(np.asarray(omega, float))
+    check_band(grid, first.dt)
+    if estimator is None:
+        estimator = JointInputOutput() if first.reference_names else LocalPolynomial()
+    if not isinstance(estimator, Estimator):
+        raise ValueError(
+            f"estimator is {estimator!r}: give an object, such as jq.spectra.Welch() or "
+            "jq.spectra.JointInputOutput(jq.spectra.LocalPolynomial())"
+        )
+    if isinstance(estimator, JointInputOutput):
+        check_references(records)
+        method, estimator = "joint", estimator.spectra
+    if isinstance(estimator, Welch | Composite):
+        estimate = average_windows(records, grid, estimator, method)
+    else:
+        check_excitation(records, method)
+        of_records = (
+            estimate_periodic if isinstance(estimator, Periodic) else estimate_local_polynomial
+        )
+        estimate = of_records(records, grid, estimator, method)
+    # Not jnp.asarray: it compiles a program for each new shape. Each array once, in one go.
+    names = (
+        "omega",
+        "response",
+        "coherence",
+        "random_error",
+        "direct_coherence",
+        "multiple_coherence",
+    )
+    put = jax.device_put({name: getattr(estimate, name) for name in names})
+    return FrequencyResponse(
+        **put,
+        errors=estimate.errors,
+        method=method,
+        input_names=first.input_names,
+        output_names=first.output_names,
+        remarks=Remarks(ft.partial(_find_remarks, records, method, estimate)),
+        integrators=0 if isinstance(estimator, Periodic) else estimator.integrators,
+        resolution=estimate.resolution,
+        distortion=estimate.distortion,
+        log_noise_covariance=estimate.log_noise_covariance,
+        divided=estimate.divided,
+        dt=first.dt,
+        hold=first.hold,
+        fed_back=bool(first.reference_names),
+        input_units=first.input_units,
+        output_units=first.output_units,
+    )
+
+
+def _find_remarks(
+    records: Sequence[Record], method: Method, estimate: Estimate
+) -> tuple[Remark, ...]:
+    from ._feedback import remarks_on_feedback
+    from ._linearity import remarks_on_linearity
+
+    remarks = remarks_on_feedback(records, method, estimate)
+    if estimate.distortion is None:  # periods show their own
+        remarks += remarks_on_linearity(records, method, estimate)
+    return remarks + estimate.remarks()

@@ -1,13 +1,20 @@
-"""A rational model of whole records with the transients of their ends, from all bins at once."""
+"""A rational model of whole records with the transients of their ends, from all bins at once.
+
+Local fits follow what it leaves, and the errors are those of both together.
+"""
 
 import functools as ft
 import hashlib
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Complex, Float, Int
+from jaxtyping import Bool, Complex, Float, Int
 
-from ._local_fit import Bins
+from ._estimators import diagonal, Grid
+from ._local_fit import Bins, left_power, LocalFit, window_slices
+from ._local_windows import SharedErrors
+from ._noise import Noise
 from ._rational_fit import (
     columns_of,
     descend,
@@ -32,8 +39,11 @@ _EVEN = 4.0  # ratio of the noise's powers below which it counts as white
 _BANDWIDTH, _NEIGHBOURS = 0.2, 12  # of running powers: in ln(omega), and bins a side at least
 _LEAST = 1e-6  # input, or noise, to its root mean square over the bins
 _LIKELIER = 10.0  # twice the logarithm of a ratio of likelihoods that chance seldom reaches
+_NEAR, _AROUND = 0.05, 0.7  # a mode's neighbourhood and beyond, in ln(omega)
+_MOST_FOLLOWED = 0.8  # share of the residuals' freedom
+_PIECE = 8192  # bins whose slopes are taken at once
+_MOVING, _LARGE = 4.0, 10.0  # ratios of powers to the noise's: of the end, and of what models leave
 
-Grid = Float[np.ndarray, " frequencies"]
 Places = Int[np.ndarray, " places"]
 Levels = Float[np.ndarray, " bins"]
 
@@ -41,9 +51,9 @@ Levels = Float[np.ndarray, " bins"]
 class GlobalModel(NamedTuple):
     """Y = (sum_i B_i U_i + C_r) / A of one output, polynomials in x = (exp(-j omega dt) - 1)/scale.
 
-    Inputs that are held, or linear between samples, reach a system of finite order exactly so, with
-    all their aliases; C_r is the difference of the states at the ends of record r. The errors of
-    the real parameters are Re(drive V), V the transform of the output's noise at `places`.
+    So a system of finite order answers to inputs that are held, or linear between samples; C_r is
+    the difference of the states at the ends of record r. Errors of the real parameters are Re(drive
+    V).
     """
 
     solved: Solved
@@ -98,15 +108,13 @@ class GlobalModel(NamedTuple):
 def global_models(
     bins: Bins, inputs: slice, outputs: slice, highest: float, dt: float, most: int
 ) -> list[GlobalModel | None]:
-    """One model for each output, of one order more, up to `most`, than has the least criterion.
+    """One model for each output, of one order more than has the least criterion; `None` for chance.
 
-    The criterion asks for more than Akaike's, under which a pole and a zero settle where the noise
-    of single bins happens to rise, and for less than a Bayesian one, which stops where what is left
-    hides in that noise; in a local window that would be a bias. It cannot see what is of the size
-    of the noise, as half a sample of a delay: so the order is the next one, which takes most of it.
-    `None` where a model explains no more than chance allows. The bins reach five times `highest`
-    (rad/s). Above 20000 of them one of each n is taken: each is an equation of its own, so thinning
-    costs precision, never resolution. The order is chosen with 4000 at most.
+    The criterion lies between Akaike's, under which a pole and a zero settle where the noise of
+    single bins rises, and a Bayesian one, which stops where what is left hides in that noise. It
+    cannot see what is of the size of the noise, as half a sample of a delay: so the order is the
+    next one. Of many bins one of each n is taken: each is an equation of its own, so that costs
+    precision alone.
     """
     reach = int(np.searchsorted(bins.omega, highest_modelled(highest), "right"))
     places = _thin(reach, _MOST_BINS)
@@ -127,11 +135,8 @@ def weighted_model(
     most: int,
     noise: Float[np.ndarray, " places"],
 ) -> GlobalModel | None:
-    """The model of the same bins that count by `noise`, the output's power at the model's places.
-
-    What the first model leaves can hide response: where it fits the loud bins alone, what it leaves
-    of the others counts as their noise, and they never matter.
-    """
+    """The model of the same bins that count by `noise`: by what a first model leaves, quiet ones do
+    not."""
     equations = _equations(bins, model.places, inputs, output, model.scale, model.dt)
     omega, weight = bins.omega[model.places], 1 / np.sqrt(noise)
     white = equations.weighted(weight).pick(_thin(len(omega), _TRIAL_BINS))
@@ -161,10 +166,8 @@ def highest_modelled(highest: float) -> float:
 
 
 def _thin(count: int, most: int) -> Places:
-    """At most so many of `count` bins, one of each n neighbours.
-
-    Not every n-th: of a periodic input's lines it would take all, or none.
-    """
+    """At most so many of `count` bins, one of each n neighbours: not every n-th, of periodic
+    lines."""
     step = -(-count // most)
     first = np.arange(0, count, step)
     shift = np.floor(step * (0.6180339887 * np.arange(first.size) % 1.0)).astype(int)
@@ -192,10 +195,8 @@ class _Task:
 
 @ft.lru_cache(maxsize=2)
 def _identify_kept(task: _Task) -> Settled | None:
-    """A fit with another delay of the outputs asks for the model of the inputs once more.
-
-    One of 20000 bins takes 20 MB.
-    """
+    """A fit with another delay of the outputs asks for the model of the inputs again; one takes 20
+    MB."""
     return task.identify()
 
 
@@ -210,10 +211,7 @@ def _identify(equations: Equations, omega: Levels, most: int) -> Settled | None:
         return None
 
     def value(order: int) -> float:
-        """Price and likelihood of an order's model and smoothed noise together.
-
-        In weights without the peak that gusts make through a light mode, further poles describe it.
-        """
+        """Price and likelihood together with the noise: gusts through a light mode peak in it."""
         left = first.solved[order].left * np.sqrt(rough)
         noise = noise_left(grid, left, first.solved[order].below, np.ones_like(grid))
         return PRICE * equations.parameters(order) - 2 * _log_likelihood(left, noise)
@@ -254,10 +252,8 @@ def _settle(
 
 
 def rough_noise(equations: Equations, omega: Levels) -> Levels:
-    """Power of what local rational functions, of one pole in a few bins, leave of the output.
-
-    Without a pole a light mode would leave much, and its bins would hardly count.
-    """
+    """Power of what local rational functions leave; without their pole a light mode would leave
+    much."""
     factors = np.concatenate([equations.u, equations.owner])
     count, columns = omega.size, 2 * len(factors) + 1
     length = min(2 * columns, count)
@@ -285,8 +281,7 @@ def noise_left(
 ) -> Levels:
     """Running power of what a model leaves; that before its poles where it is clearly likelier.
 
-    `below` are the values of the model's denominator: gusts pass the poles of the plant, and a
-    light mode makes a peak of them that is narrower than a running power.
+    `below` is the denominator: gusts pass the poles, and peak more narrowly than a running power.
     """
     after = running_power(omega, left, freedom)
     before = running_power(omega, left * below, freedom) / np.abs(below) ** 2
@@ -311,3 +306,174 @@ def running_power(omega: Levels, values: Complex[np.ndarray, " bins"], freedom: 
         np.concatenate([[0.0], np.cumsum(part)]) for part in (np.abs(values) ** 2, freedom)
     )
     return (power[last] - power[first]) / np.maximum(count[last] - count[first], 1.0)
+
+
+class Rest(NamedTuple):
+    """Bins without what the models of the `moved` channels explain by the `sources`."""
+
+    bins: Bins
+    models: tuple[GlobalModel | None, ...]  # one for each moved channel
+    sources: slice
+    moved: slice
+
+    def without_followed(
+        self, omega: Grid, half_width: Grid, order: int, fit: LocalFit
+    ) -> LocalFit:
+        """The fit, its residuals corrected for noise that models follow and it would not have
+        followed."""
+        scatter, freedom = np.array(fit.scatter), fit.freedom
+        # A long record has many times the bins that the windows reach.
+        reach = int(np.max(window_slices(omega, half_width, self.bins)[1]))
+        sources = Bins(
+            self.bins.omega[:reach], self.bins.record[:reach],
+            self.bins.values[:reach, self.sources], self.bins.records,
+            self.bins.largest[self.sources],
+        )  # fmt: skip
+        for c, model in enumerate(self.models):
+            if model is None:
+                continue
+            inside = model.places < reach
+            follow = np.zeros((reach, model.follow.shape[1]), complex)
+            follow[model.places[inside]] = model.follow[inside]
+            lost = 0.5 * left_power(omega, half_width, sources, follow, order)
+            share = np.minimum(lost / np.maximum(fit.freedom, 1.0), _MOST_FOLLOWED)
+            scatter[:, c] /= np.sqrt(1 - share)[:, None]
+            scatter[:, :, c] /= np.sqrt(1 - share)[:, None]
+            freedom = np.minimum(freedom, fit.freedom * (1 - share))
+        return fit._replace(scatter=scatter, freedom=freedom)
+
+    def add_models(self, omega: Grid, fit: LocalFit) -> LocalFit:
+        """The fit with the models' responses added back."""
+        inputs, response = fit.response.shape[2], np.array(fit.response)
+        for c, model in enumerate(self.models):
+            if model is not None:
+                response[:, c] += model.response(omega, inputs)
+        return fit._replace(response=response)
+
+
+def subtract_models(
+    bins: Bins, sources: slice, moved: slice, highest: float, dt: float, most: int
+) -> Rest:
+    """Fit a model of order up to `most` to each moved channel, and take it off; 0 for none."""
+    none = (None,) * (moved.stop - moved.start)
+    models = global_models(bins, sources, moved, highest, dt, most) if most else none
+    return take_off(bins, sources, moved, models)
+
+
+def take_off(
+    bins: Bins, sources: slice, moved: slice, models: Sequence[GlobalModel | None]
+) -> Rest:
+    """The bins without what `models` explain of the moved channels."""
+    values = np.array(bins.values)
+    for channel, model in enumerate(models, start=moved.start):
+        if model is None:
+            continue
+        for start in range(0, model.reach, _PIECE):
+            rows = slice(start, min(start + _PIECE, model.reach))
+            values[rows, channel] -= model.at_bins(bins, sources, rows)[0]
+    return Rest(bins._replace(values=values), tuple(models), sources, moved)
+
+
+def response_left(
+    rest: Rest, omega: Grid, half_width: Grid, fit: LocalFit
+) -> Float[np.ndarray, " moved"]:
+    """The most that a model leaves in any window, to what `fit` leaves: noise is 1 to 6; or 0."""
+    first, last = window_slices(omega, half_width, rest.bins)
+    running = np.cumsum(np.abs(rest.bins.values[:, rest.moved]) ** 2, axis=0)
+    running = np.concatenate([np.zeros((1, running.shape[1])), running])
+    power = (running[last] - running[first]) / np.maximum(last - first, 1)[:, None]
+    noise = diagonal(fit.scatter)
+    modelled = (fit.freedom > 0)[:, None] & (noise > 0)
+    modelled = modelled & np.array([model is not None for model in rest.models])
+    return np.max(np.where(modelled, power / np.where(modelled, noise, 1.0), 0.0), axis=0)
+
+
+def weighted_models(
+    rest: Rest, bins: Bins, which: Bool[np.ndarray, " moved"], noise: Noise, most: int
+) -> list[GlobalModel | None]:
+    """The models, `which` of them fitted to the `bins` again, which now count by the `noise`."""
+    models = list(rest.models)
+    for c, model in enumerate(rest.models):
+        if model is None or not which[c]:
+            continue
+        omega, channel = bins.omega[model.places], rest.moved.start + c
+        power = noise._replace(power=noise.power[:, c : c + 1]).power_at(omega)[:, 0]
+        power = np.where(omega > noise.omega[-1], model.noise, power)
+        models[c] = weighted_model(model, bins, rest.sources, channel, most, power) or model
+    return models
+
+
+def shared_errors(
+    rest: Rest,
+    bins: Bins,
+    omega: Grid,
+    fit: LocalFit,
+    noise: Noise,
+    left: Complex[np.ndarray, "frequencies outputs moved"],
+    right: Complex[np.ndarray, "frequencies sources inputs"],
+) -> SharedErrors | None:
+    """Errors of the models' parameters in left (models + `fit`) right; `None` without models.
+
+    A local fit follows what a wrong parameter leaves in its window: only the difference remains.
+    """
+    used = [(c, model) for c, model in enumerate(rest.models) if model is not None]
+    if not used:
+        return None
+    counts = [0 if model is None else len(model.drive) for model in rest.models]
+    ends, inputs = np.cumsum([0, *counts]).tolist(), fit.response.shape[2]
+    slopes = np.zeros((omega.size, len(counts), inputs, ends[-1]), complex)
+    effect = np.nan_to_num(fit.effect)
+    first, last = fit.first, fit.first + effect.shape[2]
+    for c, model in used:
+        followed = np.zeros((*effect.shape[:2], counts[c]), complex)
+        for start in range(0, model.reach, _PIECE):
+            stop = min(start + _PIECE, model.reach)
+            at_bins = model.at_bins(bins, rest.sources, slice(start, stop))[1]
+            for f in np.flatnonzero((first < stop) & (last > start)):
+                low, high = max(first[f], start), min(last[f], stop)
+                part = effect[f, :, low - first[f] : high - first[f]]
+                followed[f] += part @ at_bins[low - start : high - start]
+        slopes[:, c, :, ends[c] : ends[c + 1]] = model.response_slopes(omega, inputs) - followed
+    slopes = np.einsum("foc,fcsp,fsi->foip", left, slopes, right, optimize=True)
+    places = used[0][1].places
+    roots = noise.root_at(bins.omega[places])
+    lines = roots / np.maximum(np.linalg.norm(roots, axis=2, keepdims=True), 1e-300)
+    for c, model in enumerate(rest.models):
+        lines[:, c] *= 0.0 if model is None else np.sqrt(model.noise)[:, None]
+    line = np.repeat(np.arange(len(counts)), counts)
+    drive = np.concatenate([model.drive for _, model in used])
+    return SharedErrors(slopes, drive, lines, line, places)
+
+
+def highest_looked_at(highest: float, grid: Grid) -> float:
+    """Frequency above which neither models of responses up to `highest` nor `left_moving` take
+    bins."""
+    return max(highest_modelled(highest), np.exp(_AROUND) * grid[-1])
+
+
+def left_moving(
+    rest: Rest, ends: Sequence[Float[np.ndarray, "_samples channels"]], grid: Grid, noise: Noise
+) -> Bool[np.ndarray, " grid"]:
+    """Where models leave a peak, far above the noise, of a channel that moves at a record's `ends`.
+
+    The local fits cannot tell the response from a mode that still rings, narrower than their
+    windows.
+    """
+    ringing, bins = np.zeros(grid.size, bool), rest.bins
+    place = np.log(bins.omega)
+    for c in range(len(rest.models)):
+        power = noise._replace(power=noise.power[:, c : c + 1]).power_at(bins.omega)[:, 0]
+        # All bins that were left out have the power of the last one.
+        level = float(np.sum(power) + bins.above * power[-1]) / (bins.omega.size + bins.above)
+        if not any(np.var(end[:, rest.moved.start + c]) > _MOVING * level for end in ends):
+            continue
+        values = np.abs(bins.values[:, rest.moved.start + c]) ** 2 / power
+        for f, centre in enumerate(np.log(grid)):
+            near, around = (
+                values[np.searchsorted(place, centre - far) : np.searchsorted(place, centre + far)]
+                for far in (_NEAR, _AROUND)
+            )
+            peak = float(np.mean(near)) if near.size else 0.0
+            usual = max(1.0, float(np.median(around)) if around.size else 1.0)
+            ringing[f] |= peak > _LARGE * usual
+    return ringing

@@ -3,22 +3,25 @@
 A static nonlinearity in front of the plant adds f(u) to its input, a plant that changes adds
 (t - mean) u. What the local linear model does not explain of these is looked for in the residual,
 both taken back through the identified response to the plant's input.
+
+While a sweep passes w(t), a linear plant answers at w(t) only; a static nonlinearity also at 2 w(t)
+and 3 w(t). These harmonics have the phase of the input, multiplied, so they are looked for in the
+residual as signals with an unknown factor, which noise seldom imitates.
 """
 
 from collections.abc import Sequence
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Complex, Float, Int, Real
 
 from jaxquad.records import Record
 
-from ._checks import in_hertz
-from ._harmonics import fast_length, interpolated, local_mean, remarks_on_harmonics, tones_of
-from ._remarks import Remark
+from ._estimators import COHERENT, Grid, in_hertz, Method, Remark, Response
+from ._frequency_response import Estimate
 
 
-_COHERENT, _FEWEST = 0.6, 8  # of points between which the response is interpolated
+_FEWEST = 8  # points between which the response is interpolated
 _CLEAR = 6.0  # standard errors from which a remark is made; linear records reached 3.3 and 4.4
 _SMALLEST = 0.05  # change of the gain from which a remark is made
 _DISTINCT_STATIC, _DISTINCT_CHANGE = 0.005, 0.1  # share of a signal that no linear model explains
@@ -33,84 +36,78 @@ _MORE = 4.0  # standard errors by which a second signal must add to the first
 _SMALL, _LARGE, _NEGATIVE = 20, 95, 5  # percentiles of the commands at which gains are compared
 _POWER = 1, 2, 1  # of x in the gains of v |v|, v^3, v^2, with x = |v|, |v|, v
 _DEPENDENT = 1e-3  # smallest singular value: dlnG/dln(omega) of an integrator is constant
-_PLACES = 64  # samples compared first
-_EXACT = 1e-9  # of the largest value
+_PLACES, _EXACT = 64, 1e-9  # samples compared first; of the largest value
 
-Method = Literal["direct", "joint"]
-Grid = Float[np.ndarray, " frequencies"]
-Samples = Float[np.ndarray, " samples"]
+_HARMONICS = (2, 3)
+_CHANCE = 5e-3  # of a remark on a linear record
+_SMALLEST_BIAS = 0.02  # bias of the gain from which a remark is made
+# Change of the gain over the third harmonic, by Fourier series: 2.4 to 2.9 for a deadband of 5 to
+# 20 %, 3 for friction and for a cubic; 1.1 to 1.4 where the peaks are cut off by 5 to 30 %.
+_BROKEN, _CLIPPED = 2.8, 1.3
+_CONCENTRATED = 0.9  # share of a sweep's power at its own frequency
+_CYCLES = 6.0  # cycles of a sweep
+_ACTIVE = 0.1  # of the largest amplitude
+_TRANSIENT = 21  # bins over which a transient of the record's ends is smooth
+_NEAR, _NEAREST = 0.1, 10  # bins on either side over which the noise is averaged: share, at least
+_BEYOND = 1.0  # neper, of the points between which a response is interpolated
+
+Signal = Float[np.ndarray, " samples"]
+Tone = Complex[np.ndarray, " samples"]
+Bins = Float[np.ndarray, " bins"]
 Columns = Complex[np.ndarray, "bins columns"]
-Responses = Complex[np.ndarray, "frequencies outputs inputs"]
+OfInputs = Complex[np.ndarray, "frequencies inputs"]
 
 
 def remarks_on_linearity(
-    records: Sequence[Record],
-    omega: Grid,
-    response: Responses,
-    coherence: Float[np.ndarray, "frequencies outputs inputs"],
-    method: Method,
+    records: Sequence[Record], method: Method, estimate: Estimate
 ) -> tuple[Remark, ...]:
-    """Remarks on pairs whose residual shows that the plant is not linear, or not constant.
-
-    Of a sweep these are its harmonics: there, time is no other signal than frequency.
-    """
-    remarks, measured = (), (omega, response, coherence)
-    for i in range(len(records[0].input_names)):
-        tones = tones_of(records, i, method)
-        if tones is None:
-            remarks += _remarks_on_added(records, i, *measured, method)
-        else:
-            remarks += remarks_on_harmonics(records, tones, i, *measured)
-    return remarks
-
-
-def _remarks_on_added(
-    records: Sequence[Record],
-    i: int,
-    omega: Grid,
-    response: Responses,
-    coherence: Float[np.ndarray, "frequencies outputs inputs"],
-    method: Method,
-) -> tuple[Remark, ...]:
-    """Remarks on outputs whose residual holds a function of input `i`, or this times time."""
-    remarks, first = [], records[0]
-    usable = np.isfinite(response).all(axis=2) & (coherence[:, :, i] >= _COHERENT)
-    outputs = [o for o in range(usable.shape[1]) if np.sum(usable[:, o]) >= _FEWEST]
-    if not outputs:
-        return ()
-    scale = float(np.sqrt(np.mean([np.var(record.inputs[:, i]) for record in records])))
-    spectra = [_Spectra.of(record, i, method, scale) for record in records]
-    u = np.concatenate([part.input for part in spectra])
-    for o in outputs:
-        pair, used = (first.output_names[o], first.input_names[i]), usable[:, o]
-        left = _left_over(spectra, omega[used], response[used, o], (o, i))
-        if left is None:
+    """Remarks on pairs that are not linear, or not constant; of a sweep these are its harmonics."""
+    remarks, first, omega = [], records[0], estimate.omega
+    finite = np.isfinite(estimate.response).all(axis=2)
+    for i, source in enumerate(first.input_names):
+        usable = finite & (estimate.coherence[:, :, i] >= COHERENT)
+        outputs = [o for o in range(usable.shape[1]) if np.sum(usable[:, o]) >= _FEWEST]
+        if not outputs:
             continue
-        static, change = _static(left, u / scale), _change(left, omega[used], method)
-        if static:  # `Periodic` suits an excitation that repeats
-            moving = [x.inputs if method == "direct" else x.references for x in records]
-            period = period_of(moving)
-            if period:
-                few = min(record.samples for record in records) // period <= 2
-                settings = f"{period * first.dt:.8g}{', discard=0' if few else ''}"
-                static += (
-                    f". The excitation repeats: jq.spectra.Periodic({settings}) tells noise from "
-                    "distortion"
-                )
-        texts = {"nonlinear": static, "changing": change}
-        remarks += [Remark(text, omega[used], pair, kind) for kind, text in texts.items() if text]
+        tones = _tones_of(records, i, method)
+        scale = float(np.sqrt(np.mean([np.var(record.inputs[:, i]) for record in records])))
+        spectra = [] if tones else [_Spectra.of(record, i, method, scale) for record in records]
+        for o in outputs:
+            pair, used = (first.output_names[o], source), usable[:, o]
+            measured = omega[used], estimate.response[used, o], (o, i)
+            if tones:
+                chance = _CHANCE / (len(_HARMONICS) * estimate.response[0].size)
+                texts = {"nonlinear": _say_harmonics(records, tones, *measured, chance)}
+            elif left := _left_over(spectra, *measured):
+                v = np.concatenate([part.input for part in spectra]) / scale
+                static = _say_static(left, v)
+                # `Periodic` suits an excitation that repeats.
+                moving = [x.inputs if method == "direct" else x.references for x in records]
+                if static and (period := period_of(moving)):
+                    few = min(record.samples for record in records) // period <= 2
+                    settings = f"{period * first.dt:.8g}{', discard=0' if few else ''}"
+                    static += (
+                        f". The excitation repeats: jq.spectra.Periodic({settings}) tells noise "
+                        "from distortion"
+                    )
+                texts = {"nonlinear": static, "changing": _say_change(left, omega[used], method)}
+            else:
+                continue
+            remarks += [
+                Remark(text, omega[used], pair, kind) for kind, text in texts.items() if text
+            ]
     return tuple(remarks)
 
 
 class _Spectra(NamedTuple):
     """Transforms of one record, and the part of the input that moves it."""
 
-    grid: Float[np.ndarray, " bins"]  # rad/s
+    grid: Bins  # rad/s
     moving: Columns  # inputs, or references
     inputs: Columns
     outputs: Columns
     added: Columns  # u |u|, u^3, u^2, t u, each of the size of u
-    input: Samples  # u, without what noise adds to it in a joint estimate
+    input: Signal  # u, without what noise adds to it in a joint estimate
 
     @classmethod
     def of(cls, record: Record, i: int, method: Method, scale: float) -> "_Spectra":
@@ -155,20 +152,25 @@ class _LeftOver(NamedTuple):
 
     residual: Complex[np.ndarray, " bins"]
     added: Columns  # the signals looked for: u |u|, u^3, u^2, t u, t u dlnG/dln(omega)
-    leverage: Float[np.ndarray, " bins"]  # of the local linear model
-    weight: Float[np.ndarray, " bins"]  # inverse variance of the residual
+    leverage: Bins  # of the local linear model
+    weight: Bins  # inverse variance of the residual
     share: Float[np.ndarray, " columns"]  # of these signals' power
-    slope: Complex[np.ndarray, " frequencies"]  # dlnG/dln(omega)
+    slope: Response  # dlnG/dln(omega)
 
 
 def _left_over(
-    spectra: Sequence[_Spectra],
-    omega: Grid,
-    response: Complex[np.ndarray, "frequencies inputs"],
-    pair: tuple[int, int],
+    spectra: Sequence[_Spectra], omega: Grid, response: OfInputs, pair: tuple[int, int]
 ) -> _LeftOver | None:
     """`None` where no block has more bins than the local linear model has coefficients."""
-    slope, parts = log_slope(omega, response[:, pair[1]]), []
+    # dlnG/dln(omega), by straight lines through the points nearby; 0 where there are none.
+    place, one, parts = np.log(omega), response[:, pair[1]], []
+    logs = np.log(np.abs(one)) + 1j * np.unwrap(np.angle(one))
+    offset = place - place[:, None]
+    kernel = np.exp(-0.5 * (offset / _SMOOTH) ** 2)
+    m0, m1, m2 = (np.sum(kernel * offset**k, axis=1) for k in range(3))
+    spread, pull = m0 * m2 - m1**2, m0 * ((kernel * offset) @ logs) - m1 * (kernel @ logs)
+    alone = spread <= _ALONE * (m0 * _SMOOTH) ** 2
+    slope = np.where(alone, 0.0, pull / np.where(alone, 1.0, spread))
     for index, part in enumerate(spectra):
         first, last = np.searchsorted(part.grid, [omega[0], omega[-1]])
         band = slice(max(int(first), 1), int(last))
@@ -176,7 +178,7 @@ def _left_over(
         plant = interpolated(grid, omega, response)
         modelled = np.sum(plant * part.inputs[band], axis=1)
         residual = (part.outputs[band, pair[0]] - modelled) / plant[:, pair[1]]
-        steep = np.interp(np.log(grid), np.log(omega), slope)[:, None]
+        steep = np.interp(np.log(grid), place, slope)[:, None]
         added = np.hstack([part.added[band], part.added[band, -1:] * steep])
         owner = np.full(residual.size, index)
         parts.append((grid, owner, part.moving[band], residual, added))
@@ -206,31 +208,13 @@ def _left_over(
     return _LeftOver(left[:, 0], left[:, 1:], leverage, weight, share, slope)
 
 
-def log_slope(
-    omega: Grid, response: Complex[np.ndarray, " frequencies"]
-) -> Complex[np.ndarray, " frequencies"]:
-    """dlnG/dln(omega), by straight lines through the points nearby; 0 where there are none."""
-    place = np.log(omega)
-    logs = np.log(np.abs(response)) + 1j * np.unwrap(np.angle(response))
-    offset = place - place[:, None]
-    kernel = np.exp(-0.5 * (offset / _SMOOTH) ** 2)
-    m0, m1, m2 = (np.sum(kernel * offset**k, axis=1) for k in range(3))
-    spread, pull = m0 * m2 - m1**2, m0 * ((kernel * offset) @ logs) - m1 * (kernel @ logs)
-    alone = spread <= _ALONE * (m0 * _SMOOTH) ** 2
-    return np.where(alone, 0.0, pull / np.where(alone, 1.0, spread))
-
-
 class _Factors(NamedTuple):
     value: Float[np.ndarray, " columns"]
     covariance: Float[np.ndarray, "columns columns"]
 
     @classmethod
     def of(cls, left: _LeftOver, columns: Columns) -> "_Factors":
-        """Real factors of the columns in the residual.
-
-        The covariance is that of residuals of any variance at each bin (MacKinnon and White, 1985,
-        HC3).
-        """
+        """Real factors of columns in the residual; covariance HC3 (MacKinnon and White, 1985)."""
         weighted = np.conj(columns) * left.weight[:, None]
         inverse = np.linalg.inv(np.real(weighted.T @ columns))
         value = inverse @ np.real(weighted.T @ left.residual)
@@ -253,7 +237,7 @@ class _Gains(NamedTuple):
 
     @classmethod
     def at(
-        cls, left: _LeftOver, columns: list[int], v: Samples, x: Samples, percentiles: list[int]
+        cls, left: _LeftOver, columns: list[int], v: Signal, x: Signal, percentiles: list[int]
     ) -> "_Gains":
         """At two percentiles of x; factors must be real: no dynamics before a nonlinearity."""
         if np.min(left.share[columns]) < _DISTINCT_STATIC:
@@ -275,7 +259,7 @@ class _Gains(NamedTuple):
         return abs(self.high - self.low) / max(self.high, self.low)
 
 
-def _static(left: _LeftOver, v: Samples) -> str:
+def _say_static(left: _LeftOver, v: Signal) -> str:
     """What functions of the command v, of unit size, say of the gain."""
     size, percentiles = np.abs(v), [_SMALL, _LARGE]
     # By v |v|, v^3, or both where these explain more.
@@ -286,8 +270,13 @@ def _static(left: _LeftOver, v: Samples) -> str:
         odd = both if both.clear**2 > odd.clear**2 + _MORE**2 else odd
     even, texts = _Gains.at(left, [2], v, v, [_NEGATIVE, _LARGE]), []
     if odd.difference() > _SMALLEST:
-        where, cause = _FALLS if odd.high < odd.low else _RISES
-        texts.append(f"falls by about {100 * odd.difference():.2g} % from {where}, as {cause}")
+        where = "the largest commands to small ones, as a deadband or friction causes"
+        if odd.high < odd.low:
+            where = (
+                "small commands to the largest, as a saturation causes, or noise in the measured "
+                "input"
+            )
+        texts.append(f"falls by about {100 * odd.difference():.2g} % from {where}")
     if even.difference() > _SMALLEST:
         side = "smaller" if even.high < even.low else "larger"
         texts.append(
@@ -303,18 +292,9 @@ def _static(left: _LeftOver, v: Samples) -> str:
     )
 
 
-_FALLS = (
-    "small commands to the largest",
-    "a saturation causes, or noise in the measured input",
-)
-_RISES = "the largest commands to small ones", "a deadband or friction causes"
-
-
 def period_of(signals: Sequence[Float[np.ndarray, "_samples sources"]]) -> int:
-    """Samples of the shortest period with which all signals repeat exactly; 0 without one.
-
-    Every signal holds two whole periods at least.
-    """
+    """Samples of the shortest period, of two at least, with which all signals repeat exactly; or
+    0."""
     most = min(len(signal) for signal in signals) // 2
     lags, first = np.arange(4, most + 1), signals[0]
     near = _EXACT * max(float(np.max(np.abs(signal))) for signal in signals)
@@ -326,7 +306,7 @@ def period_of(signals: Sequence[Float[np.ndarray, "_samples sources"]]) -> int:
     return 0
 
 
-def _change(left: _LeftOver, omega: Grid, method: Method) -> str:
+def _say_change(left: _LeftOver, omega: Grid, method: Method) -> str:
     """What the input times time says of the response, in magnitude and phase."""
     if left.share[3] < _DISTINCT_CHANGE:
         return ""
@@ -354,3 +334,172 @@ def _change(left: _LeftOver, omega: Grid, method: Method) -> str:
         f"near {in_hertz(omega[[at]])} from its first half to its second, which the error bars "
         f"do not include. Identify the parts by themselves («start=», «stop=»){loop}"
     )
+
+
+def _say_harmonics(
+    records: Sequence[Record],
+    tones: Sequence[Tone],
+    omega: Grid,
+    response: OfInputs,
+    pair: tuple[int, int],
+    chance: float,
+) -> str:
+    """What the residual's harmonics of an input, whose parts are `tones`, say of the gain."""
+    from scipy.special import gammainccinv
+
+    fits = map(lambda record, tone: _harmonics(record, tone, omega, response, pair), records, tones)
+    parts = [fit for fit in fits if fit is not None]
+    if not parts:
+        return ""
+    weight = np.sum([weight for _, weight in parts], axis=0)
+    factor = np.sum([weight * factor for factor, weight in parts], axis=0) / weight
+    evidence = np.sum([weight * np.abs(factor) ** 2 for factor, weight in parts], axis=0)
+    size = np.where(evidence > gammainccinv(len(parts), chance), np.abs(factor), 0.0)
+    flattened = factor[1].real < -0.5 * np.abs(factor[1])
+    bias = max((_CLIPPED if flattened else _BROKEN) * size[1], size[0])
+    if not bias > _SMALLEST_BIAS:
+        return ""
+    harmonics = [
+        f"{100 * share:.2g} % at {name} its frequency"
+        for share, name in zip(size, ("twice", "three times"), strict=True)
+        if share
+    ]
+    kind = "a saturation" if flattened else "a deadband or friction"
+    kind = kind if size[1] else "an unsymmetric actuator"
+    return (
+        "the plant is not linear: the residual holds harmonics of the sweep, "
+        f"{' and '.join(harmonics)}, as {kind} causes. The gain is biased by about "
+        f"{100 * bias:.2g} %, which the error bars do not include, and differs at other "
+        "amplitudes. Repeat the sweep at another amplitude, or record what the actuator does (its "
+        "position or rpm) as the input"
+    )
+
+
+def _tones_of(records: Sequence[Record], i: int, method: Method) -> list[Tone] | None:
+    """The input's part at the frequency of a sweep; `None` unless all that moves it sweeps."""
+    tones = []
+    for record in records:
+        count = fast_length(record.samples)
+        source = record.inputs[:count, i] if method == "direct" else record.references[:count, i]
+        swept = phase_of_sweep(source)
+        if swept is None:
+            return None
+        phase, tone = swept
+        tones.append(tone if method == "direct" else _at_phase(record.inputs[:count, i], phase))
+    return tones
+
+
+def phase_of_sweep(signal: Signal) -> tuple[Signal, Tone] | None:
+    """The rising phase and the part of a tone of slow frequency; `None` where much power is
+    beside."""
+    centred = signal - np.mean(signal)
+    # The signal without its negative frequencies, doubled; scipy.signal takes 0.4 s to import.
+    share = np.zeros(signal.size)
+    share[: (signal.size + 1) // 2] = 2.0
+    share[0] = 1.0
+    if signal.size % 2 == 0:
+        share[signal.size // 2] = 1.0
+    analytic = np.fft.ifft(share * np.fft.fft(centred))
+    size = np.abs(analytic)
+    active = np.flatnonzero(size > _ACTIVE * np.max(size))
+    first, last = active[0], active[-1] + 1
+    turned = np.maximum.accumulate(np.unwrap(np.angle(analytic[first:last])))
+    turned = turned + 1e-6 * np.arange(turned.size)  # so that it can be inverted
+    if turned[-1] - turned[0] < 2 * np.pi * _CYCLES:
+        return None
+    # A phase in which the time at each value is the mean over a cycle around it.
+    time = np.arange(float(turned.size))
+    inner = (turned > turned[0] + np.pi) & (turned < turned[-1] - np.pi)
+    smooth = np.interp(time, np.where(inner, _mean_of_cycles(turned, time), time), turned)
+    phase = np.pad(smooth, (first, signal.size - last), mode="edge")
+    tone = _at_phase(centred, phase)
+    left = (centred - np.real(tone))[first:last]
+    power = np.sum(centred[first:last] ** 2)
+    return (phase, tone) if np.sum(left**2) < (1 - _CONCENTRATED) * power else None
+
+
+def _at_phase(signal: Signal, phase: Signal) -> Tone:
+    """The analytic part that turns with `phase`: averages over whole cycles pass no harmonics."""
+    rising = phase + 1e-9 * np.arange(phase.size)
+    wave = np.cos(rising) + 1j * np.sin(rising)
+    turned = 2 * (signal - np.mean(signal)) * np.conj(wave)
+    return _mean_of_cycles(rising, turned, twice=True) * wave
+
+
+def _mean_of_cycles(phase: Signal, values: Tone | Signal, *, twice: bool = False) -> Tone | Signal:
+    """Mean of the values over the cycle around each sample of a rising phase, linear between."""
+    step, samples = np.diff(phase), np.arange(float(phase.size))
+    low, high = np.maximum(phase - np.pi, phase[0]), np.minimum(phase + np.pi, phase[-1])
+    edges = []
+    for edge in (low, high):
+        before = np.minimum(np.interp(edge, phase, samples).astype(int), step.size - 1)
+        edges.append((before, (edge - phase[before]) / step[before]))
+    (begin, after_begin), (end, after_end) = edges
+    for _ in range(2 if twice else 1):
+        area = 0.5 * (values[1:] + values[:-1]) * step
+        total = np.concatenate([[0.0], np.cumsum(area)])
+        last, first = total[end] + after_end * area[end], total[begin] + after_begin * area[begin]
+        values = (last - first) / (high - low)
+    return values
+
+
+def _harmonics(
+    record: Record, tone: Tone, omega: Grid, response: OfInputs, pair: tuple[int, int]
+) -> tuple[Complex[np.ndarray, " harmonics"], Float[np.ndarray, " harmonics"]] | None:
+    """The harmonics at the plant's input, relative to its fundamental, and their inverse variance.
+
+    Least squares of the residual's bins on harmonics that have passed the plant; `None` for few
+    bins.
+    """
+    output, source = pair
+    count = tone.size
+    grid = 2 * np.pi / (count * record.dt) * np.arange(count // 2 + 1)
+    band = slice(*np.searchsorted(grid, [omega[0], omega[-1]]).tolist())
+    if band.stop - band.start < 3 * _TRANSIENT:
+        return None
+    plant = interpolated(grid[band], omega, response)
+    u, y = (
+        np.fft.rfft(x[:count], axis=0)[band] for x in (record.inputs, record.outputs[:, output])
+    )
+    turn = tone / np.maximum(np.abs(tone), 1e-300)
+    waves = [np.fft.fft(tone * turn ** (k - 1))[band] / 2 for k in _HARMONICS]
+    columns = np.stack([y - np.sum(plant * u, axis=1), *(plant[:, source] * w for w in waves)])
+    # Less parabolas through the bins around each (Savitzky, Golay 1964), at the ends the last one.
+    half = _TRANSIENT // 2
+    powers = np.linspace(-1, 1, _TRANSIENT)[:, None] ** np.arange(3)
+    fitted = powers @ np.linalg.pinv(powers)  # from the values in a window to those of its parabola
+    windows = np.lib.stride_tricks.sliding_window_view(columns, _TRANSIENT, axis=1)
+    first, last = windows[:, 0] @ fitted[:half].T, windows[:, -1] @ fitted[half + 1 :].T
+    sharp = columns - np.concatenate([first, windows @ fitted[half], last], axis=1)
+    left, harmonics = sharp[0], sharp[1:]
+    noise = np.maximum(local_mean(np.abs(left) ** 2, band.start), 1e-300)
+    weight = np.maximum(np.sum(np.abs(harmonics) ** 2 / noise, axis=1), 1e-300)
+    return np.sum(np.conj(harmonics) * left / noise, axis=1) / weight, weight
+
+
+def fast_length(samples: int) -> int:
+    """The longest length of at most `samples` with a fast Fourier transform."""
+    from scipy.fft import next_fast_len
+
+    return next(n for n in range(samples, 0, -1) if next_fast_len(n, real=True) == n)
+
+
+def interpolated(grid: Bins, omega: Grid, response: OfInputs) -> Complex[np.ndarray, "bins inputs"]:
+    """Smooth in magnitude and phase along log frequency, and near the points where a spline leaves
+    them."""
+    from scipy.interpolate import CubicSpline
+
+    size, angle = np.log(np.abs(response)), np.unwrap(np.angle(response), axis=0)
+    spline = CubicSpline(np.log(omega), size + 1j * angle)(np.log(grid))
+    low, high = np.min(size, axis=0) - _BEYOND, np.max(size, axis=0) + _BEYOND
+    spline.real = np.clip(spline.real, low, high)
+    return np.exp(spline)
+
+
+def local_mean(power: Bins, first: int) -> Bins:
+    """Over the bins within a tenth of their number on either side."""
+    place = np.arange(power.size)
+    reach = np.maximum(_NEAREST, (_NEAR * (first + place)).astype(int))
+    low, high = np.maximum(place - reach, 0), np.minimum(place + reach + 1, power.size)
+    total = np.concatenate([[0.0], np.cumsum(power)])
+    return (total[high] - total[low]) / (high - low)

@@ -11,16 +11,24 @@ from jaxtyping import Bool, Complex, Float, Int
 
 from jaxquad.records import Record
 
-
-Grid = Float[np.ndarray, " frequencies"]
-Edges = Int[np.ndarray, " frequencies"]
+from ._estimators import (
+    adjoint,
+    Covariances,
+    diagonal,
+    Grid,
+    Levels,
+    Pairs,
+    Places,
+    Response,
+    Responses,
+    Where,
+)
 
 
 class Bins(NamedTuple):
-    """Transforms of whole records, all bins in increasing order of frequency.
+    """Transforms of whole records over the root of their length, by increasing frequency.
 
-    Scaled by the root of the record's length: the noise is the same in a short record as in a long
-    one. The mean and the Nyquist bin are left out.
+    The mean and the Nyquist bin are left out.
     """
 
     omega: Float[np.ndarray, " bins"]  # rad/s
@@ -44,10 +52,7 @@ class Bins(NamedTuple):
 
 
 def record_bins(records: Sequence[Record], integrators: int, delay: float) -> Bins:
-    """Transform all channels as `Record.names` has them.
-
-    Outputs are differenced `integrators` times and advanced by `delay` (s); `recolour` undoes it.
-    """
+    """Transform all channels; outputs differenced, and advanced by `delay` in s: see `recolour`."""
     values, grids, owners = [], [], []
     for index, record in enumerate(records):
         columns = transformed_columns(record, integrators)
@@ -71,9 +76,7 @@ def record_bins(records: Sequence[Record], integrators: int, delay: float) -> Bi
     return Bins(omega, owner, joined, len(records), largest)
 
 
-def recolour(
-    omega: Grid, integrators: int, delay: float, dt: float
-) -> Complex[np.ndarray, " frequencies"]:
+def recolour(omega: Grid, integrators: int, delay: float, dt: float) -> Response:
     """Factor from a response to the outputs of `record_bins` to one to the recorded outputs."""
     lag = integrators // 2 * dt + delay
     return np.exp(-1j * lag * omega) / (1 - np.exp(-1j * dt * omega)) ** integrators
@@ -87,50 +90,10 @@ def transformed_columns(record: Record, n: int) -> Float[np.ndarray, "samples ch
     return np.hstack([record.inputs[centre], outputs, record.references[centre]])
 
 
-def window_slices(omega: Grid, half_width: Grid, bins: Bins) -> tuple[Edges, Edges]:
+def window_slices(omega: Grid, half_width: Grid, bins: Bins) -> tuple[Places, Places]:
     """First bin, and one past the last, of every window."""
     first = np.searchsorted(bins.omega, omega - half_width, "left")
     return first, np.searchsorted(bins.omega, omega + half_width, "right")
-
-
-def check_bins(omega: Grid, bins: Bins, columns: int, transient: int, freedom: int) -> None:
-    """Raise `ValueError` where the records hold too few bins, or do not cover `omega`."""
-    counts = np.bincount(bins.record, minlength=bins.records)
-    spare = int(np.sum(np.maximum(counts - transient, 0)))
-    if spare < columns + freedom:
-        raise ValueError(
-            f"the records have {counts.tolist()} Fourier bins, {spare} more than their transients "
-            f"need; the local fit needs {columns + freedom}. Record longer, or use a lower order"
-        )
-    if not (omega.size and np.all(np.diff(omega) > 0)):
-        raise ValueError(
-            f"{omega.size} frequencies: give one or more, in increasing order, in rad/s"
-        )
-    if omega[0] < 0.999 * bins.omega[0] or omega[-1] > 1.001 * bins.omega[-1]:
-        raise ValueError(
-            f"the frequencies run from {omega[0]:.4g} to {omega[-1]:.4g} rad/s, but the records "
-            f"hold one cycle of {bins.omega[0]:.4g} rad/s and reach {bins.omega[-1]:.4g} rad/s. "
-            "Keep the frequencies within, or record longer"
-        )
-
-
-def smallest_widths(omega: Grid, bins: Bins, columns: int, transient: int, freedom: int) -> Grid:
-    """Half-widths in rad/s of the smallest windows with `freedom` more bins than coefficients.
-
-    `columns` is the number of coefficients of the response, `transient` that of each record.
-    """
-    least, most = np.zeros_like(omega), np.full_like(omega, bins.omega[-1])
-    grids = [bins.omega[bins.record == r] for r in range(bins.records)]
-    for _ in range(40):
-        middle = (least + most) / 2
-        spare = np.zeros(omega.size, int)
-        for grid in grids:
-            first = np.searchsorted(grid, omega - middle, "left")
-            last = np.searchsorted(grid, omega + middle, "right")
-            spare += np.maximum(last - first - transient, 0)
-        enough = spare >= columns + freedom
-        least, most = np.where(enough, least, middle), np.where(enough, middle, most)
-    return most * (1 + 1e-9)
 
 
 _UNEXCITED = 1e-12  # of an input's largest bin: below, it is rounding errors
@@ -150,32 +113,30 @@ Columns = Complex[np.ndarray, "frequencies window columns"]
 
 
 class LocalFit(NamedTuple):
-    """Responses at the centre of each window, and the effect of noise on them.
+    """Responses at the centre of each window, and the effect of noise on them; nan if undetermined.
 
-    The error of output o to input i at f is `boost[f, o] sum_k effect[f, i, k] V_o[first[f] + k]`,
-    V the transform of the output's noise. Where the inputs do not determine the response, all
-    fields are nan.
+    The error of output o to input i at f is `boost[f, o] sum_k effect[f, i, k] V_o[first[f] + k]`.
     """
 
-    response: Complex[np.ndarray, "frequencies outputs inputs"]
+    response: Responses
     effect: Complex[np.ndarray, "frequencies inputs window"]
-    boost: Float[np.ndarray, "frequencies outputs"]
-    gain: Float[np.ndarray, "frequencies outputs inputs"]  # mean squared error for unit noise
-    first: Int[np.ndarray, " frequencies"]
-    scatter: Complex[np.ndarray, "frequencies outputs outputs"]  # residual products over freedom
-    freedom: Float[np.ndarray, " frequencies"]  # complex degrees of freedom
+    boost: Levels
+    gain: Pairs  # mean squared error for unit noise
+    first: Places
+    scatter: Covariances  # residual products over freedom
+    freedom: Grid  # complex degrees of freedom
     power: Complex[np.ndarray, "frequencies inputs inputs"]  # of the inputs, mean over the window
 
     @property
-    def determined(self) -> Bool[np.ndarray, " frequencies"]:
+    def determined(self) -> Where:
         """Whether the inputs determine the response."""
         return np.isfinite(self.response[:, 0, 0])
 
-    def rows(self, rows: Bool[np.ndarray, " frequencies"]) -> "LocalFit":
+    def rows(self, rows: Where) -> "LocalFit":
         """The fit at some of its frequencies."""
         return LocalFit(*(field[rows] for field in self))
 
-    def replace_rows(self, rows: Bool[np.ndarray, " frequencies"], part: "LocalFit") -> "LocalFit":
+    def replace_rows(self, rows: Where, part: "LocalFit") -> "LocalFit":
         """The fit with the frequencies `rows` replaced by `part`."""
         longest = max(self.effect.shape[2], part.effect.shape[2])
         old, new = (
@@ -199,11 +160,8 @@ def local_fit(
     order: int,
     shape: Literal["polynomial", "rational"],
 ) -> LocalFit:
-    """Fit the response and each record's transient around every frequency.
-
-    `shape` says whether both are polynomials of `order`, or such polynomials over a common
-    denominator of the first degree.
-    """
+    """Fit polynomials of `order`, or these over a linear denominator, to responses and
+    transients."""
     first, last = window_slices(omega, half_width, bins)
     longest, fields = max(int(np.max(last - first)), 1), []
     for chunk, window in _chunks(omega, half_width, bins, order):
@@ -236,10 +194,8 @@ def left_power(
     values: Complex[np.ndarray, "bins outputs"],
     order: int,
 ) -> Grid:
-    """Power of all `values` in each window that `local_fit` by polynomials would leave.
-
-    All channels of `bins` are the inputs; 0 where they do not determine a response.
-    """
+    """Power of `values` that `local_fit` by polynomials would leave, all `bins` inputs; 0 without
+    fit."""
     left, power = np.zeros(omega.size), np.sum(np.abs(values) ** 2, axis=1)
     for chunk, window in _chunks(omega, half_width, bins, order):
         u = bins.values[window.index] * window.used[:, :, None]
@@ -264,10 +220,8 @@ class _Window(NamedTuple):
 def _chunks(
     omega: Grid, half_width: Grid, bins: Bins, order: int
 ) -> Iterator[tuple[Int[np.ndarray, " chunk"], _Window]]:
-    """Frequencies whose windows are about as long, and these windows, padded.
-
-    A record with no more bins here than its transient has coefficients says nothing.
-    """
+    """Frequencies with windows of about one length, padded; records with too few bins take no
+    part."""
     first, last = window_slices(omega, half_width, bins)
     longest = max(int(np.max(last - first)), 1)
     places, size = np.argsort(last - first, kind="stable"), min(_CHUNK, max(_BINS // longest, 1))
@@ -286,13 +240,11 @@ def _excited(
     effect: Float[np.ndarray, "frequencies inputs"],
     u: Inputs,
     largest: Float[np.ndarray, " inputs"],
-) -> Bool[np.ndarray, " frequencies"]:
+) -> Where:
     """Whether each input's power in the window is near that which determines its response.
 
-    Beyond the end of a sweep the input's transform is what the ends of the record leak, as smooth
-    along frequency as a transient, and says nothing about the response: the ratio, the summed
-    squares of the `effect` times those of the input, is 1e9, or what rounding makes of it. A sweep
-    that reaches the frequency has 2 to 30.
+    Beyond a sweep's end an input leaks as smoothly as a transient: the ratio, 2 to 30 within, is
+    1e9.
     """
     power = np.abs(u) ** 2
     excited = np.all(np.max(power, axis=1) > (_UNEXCITED * largest) ** 2, axis=1)
@@ -307,12 +259,12 @@ def _products(x: Outputs) -> Complex[np.ndarray, "frequencies channels channels"
 class Solution(NamedTuple):
     """Response at place 0, how the noise of each bin enters it, and the residual."""
 
-    response: Complex[np.ndarray, "frequencies outputs inputs"]
+    response: Responses
     effect: Complex[np.ndarray, "frequencies inputs window"]
-    boost: Float[np.ndarray, "frequencies outputs"]  # of the effect on each output
+    boost: Levels  # of the effect on each output
     residual: Outputs
-    freedom: Float[np.ndarray, " frequencies"]  # complex
-    fine: Bool[np.ndarray, " frequencies"]  # whether the window determines the response
+    freedom: Grid  # complex
+    fine: Where  # whether the window determines the response
 
 
 def solve_polynomial(place: Places, u: Inputs, y: Outputs, owner: Owner, order: int) -> Solution:
@@ -321,12 +273,11 @@ def solve_polynomial(place: Places, u: Inputs, y: Outputs, owner: Owner, order: 
 
 
 def solve_rational(place: Places, u: Inputs, y: Outputs, owner: Owner, order: int) -> Solution:
-    """The same over a denominator 1 + a place, with a different `a` for each output.
+    """The same over 1 + a place (local rational method, McKelvey and Guerin, 2012), a for each
+    output.
 
-    `a` is first estimated from the linear equation error, then by Gauss-Newton steps on the output
-    error; the regressors of the last step say how the noise enters through `a`. All outputs use the
-    effect of the first, scaled to their own variance. Source: local rational method, McKelvey and
-    Guerin (2012).
+    By the linear equation error, then Gauss-Newton; all outputs use the effect of the first,
+    scaled.
     """
     columns, x = regressors(place, u, owner, order), place[:, :, None]
     normal = Normal.of(columns)
@@ -375,23 +326,22 @@ def regressors(place: Places, u: Inputs, owner: Owner, order: int) -> Columns:
 class Normal(NamedTuple):
     """Normal equations of some columns.
 
-    Their inverse is wrong by the square of the columns' condition. What it gives is corrected once
-    by what it leaves, after which it is as good as that of a QR decomposition up to a condition of
-    1e4, and good to some 1e-5 where columns are as dependent as is allowed.
+    What their inverse gives is corrected once by what it leaves: as good as a QR decomposition up
+    to a condition of 1e4, and good to some 1e-5 where columns are as dependent as is allowed.
     """
 
     columns: Columns
     adjoint: Complex[np.ndarray, "frequencies columns window"]
     inverse: Complex[np.ndarray, "frequencies columns columns"]
-    independent: Bool[np.ndarray, " frequencies"]
-    count: Int[np.ndarray, " frequencies"]  # of the columns that are not empty
+    independent: Where
+    count: Places  # of the columns that are not empty
 
     @classmethod
     def of(cls, columns: Columns) -> "Normal":
         """A record without bins here has empty columns, which take no part."""
-        adjoint = np.conj(np.swapaxes(columns, 1, 2))
-        gram = adjoint @ columns
-        length = np.sqrt(np.real(np.diagonal(gram, axis1=1, axis2=2)))
+        turned = adjoint(columns)
+        gram = turned @ columns
+        length = np.sqrt(diagonal(gram))
         empty = length == 0
         length = np.where(empty, 1.0, length)
         area = length[:, :, None] * length[:, None, :]
@@ -403,7 +353,7 @@ class Normal(NamedTuple):
         if not np.all(independent):
             value = np.linalg.eigvalsh(unit[~independent])
             independent[~independent] = value[:, 0] > _DEPENDENT**2 * value[:, -1]
-        return cls(columns, adjoint, inverse / area, independent, np.sum(~empty, axis=1))
+        return cls(columns, turned, inverse / area, independent, np.sum(~empty, axis=1))
 
     def left(self, y: Outputs) -> Outputs:
         """What the columns do not explain of `y`."""

@@ -3,19 +3,30 @@
 Source: Pintelon and Schoukens, System Identification, 2nd ed., ch. 7; docs/identification.md.
 """
 
+import functools as ft
 from collections.abc import Sequence
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Complex, Float
+from jaxtyping import Float
 
+from jaxquad._core import one_blas_thread
 from jaxquad.records import Record
 
-from ._error_covariance import ErrorCovariance
-from ._estimators import LocalPolynomial
-from ._feedback import COHERENT
-from ._global_rest import (
-    end_of,
+from ._estimators import (
+    adjoint,
+    COHERENT,
+    diagonal,
+    Grid,
+    LocalPolynomial,
+    Method,
+    Pairs,
+    Places,
+    Remark,
+    Where,
+)
+from ._frequency_response import Estimate
+from ._global_model import (
     highest_looked_at,
     left_moving,
     response_left,
@@ -24,15 +35,6 @@ from ._global_rest import (
     subtract_models,
     take_off,
     weighted_models,
-)
-from ._joint import (
-    check_count_of_references,
-    coherence_of_references,
-    DIVISIBLE,
-    find_unmoved,
-    joint_factors,
-    joint_fit,
-    share_of_inputs,
 )
 from ._local_fit import (
     Bins,
@@ -43,83 +45,70 @@ from ._local_fit import (
     transformed_columns,
     window_slices,
 )
-from ._local_noise import (
-    coloured_gain,
-    error_covariance,
-    multiple_coherence,
-    partial_coherence,
-    unresolved,
-)
 from ._local_windows import (
     choose_widths,
+    coloured_gain,
+    error_covariance,
     make_windows,
+    multiple_coherence,
+    partial_coherence,
+    power_alone,
     reach,
     Respond,
     Shape,
+    unresolved,
     WIDENED,
     WIDENINGS,
     Windows,
 )
 from ._noise import covariance_of_bands, Noise, smooth_noise, smoothed
-from ._remarks import Remark
 
 
+_DEPENDENT = 1e-6  # smallest singular value of the responses of the inputs, to the largest
+_DIVISIBLE = 0.15  # largest random error of an input's response to the references
 _SHARPER = 0.5  # ratio of residual powers that noise alone seldom reaches
 _MISSED = 100.0  # ratio of what a model leaves to the noise, from which it misses the response
 _REPAIRS, _BETTER = 2, 0.1  # the most, and how little of that ratio a better model leaves
 
-Grid = Float[np.ndarray, " frequencies"]
-Where = Bool[np.ndarray, " frequencies"]
-Pairs = Float[np.ndarray, "frequencies outputs inputs"]
-Method = Literal["direct", "joint"]
+_END, _FEWEST = 0.05, 20  # share of a record, and samples, that count as its end
+_CYCLES = 2.0  # of the longest record, in the lowest frequency by default
+
+_SHARP, _COHERENT = 0.3, 0.6  # random error and coherence of frequencies that fits rest on
+_GRID = 6.0  # frequencies that a record could tell apart in a grid that is not narrow by choice
+# Frequencies that a record tells apart, at least, where it holds fewer cycles of the lowest: below,
+# responses of sweeps in a closed loop were off by up to 180 claimed errors, above by 3 at most.
+_LEAST = {5.0: 15.0, 10.0: 2.0}
 
 
-class LocalEstimate(NamedTuple):
-    """Result of the local polynomial method; nan and infinite errors where undetermined.
-
-    `coherence` is the share of an output's power near each frequency that an input explains beyond
-    the other inputs; in the joint estimate, the smaller of the shares of input and output that the
-    references explain. `direct_coherence` is always from input to output.
-    """
-
-    response: Complex[np.ndarray, "frequencies outputs inputs"]
-    coherence: Pairs
-    direct_coherence: Pairs
-    multiple_coherence: Float[np.ndarray, "frequencies outputs"]  # of an output with all inputs
-    errors: ErrorCovariance
-    half_width: Grid  # rad/s
-    rational: Where  # where a rational function is used, at a resonance
-    log_noise_covariance: Float[np.ndarray, "frequencies frequencies"]
-    divided: Pairs | None  # of a joint estimate
-    remarks: tuple[Remark, ...]
-
-
+@one_blas_thread()
 def estimate_local_polynomial(
-    records: Sequence[Record], omega: Grid, options: LocalPolynomial, method: Method
-) -> LocalEstimate:
+    records: Sequence[Record], omega: Grid | None, options: LocalPolynomial, method: Method
+) -> Estimate:
     """Responses of all outputs to all inputs at increasing `omega` in rad/s, from all records.
 
-    "joint" uses the references, of which there must be as many as inputs. Raises `ValueError` for
-    records that are too short or do not cover the band, and for another number of references.
+    Coherence is that near each frequency; of the joint estimate, the smaller of input and output.
     """
     inputs, outputs = records[0].inputs.shape[1], records[0].outputs.shape[1]
-    if method == "joint":
-        check_count_of_references(records[0], inputs)
     bins, dt = record_bins(records, options.integrators, options.delay), records[0].dt
+    if omega is None:
+        lowest = 2 * np.pi * _CYCLES / max(record.duration for record in records)
+        omega = np.geomspace(lowest, 2 * np.pi / (10 * dt), 100)
     windows = make_windows(omega, bins, options, inputs)
-    looked_at = highest_looked_at(omega[-1], windows.grid)
-    bins = bins.up_to(max(windows.furthest(options.width), looked_at))
-    is_open = method == "direct" and not records[0].reference_names
-    orders = options.order, options.global_order
-    setup = Setup(bins, windows, inputs, outputs, *orders, method, is_open)
-    narrow, at = fit_narrow(setup, omega[-1], dt), windows.at
-    rest, sources = narrow.rest, narrow.sources
+    furthest = max(windows.furthest(options.width), highest_looked_at(omega[-1], windows.grid))
+    bins, at, joint = bins.up_to(furthest), windows.at, method == "joint"
+    setup = Setup(bins, windows, inputs, outputs, options.order, options.global_order, joint)
+    # Models, and narrow fits on the grid of windows of what they leave.
+    rest = subtract_models(bins, *setup.channels, omega[-1], dt, options.global_order)
+    rest, from_sources = _repair_models(setup, rest)
+    narrow, open_loop = setup.plant(from_sources), not joint and not records[0].reference_names
+    noise = setup.noise_of(narrow, open_loop=open_loop)
+    sources = setup.noise_of(from_sources) if joint else noise
     if options.width is not None:
         width, rational = np.full(at.size, float(options.width)), np.zeros(at.size, bool)
     else:
         widest = reach(windows.grid, windows.narrow, windows.widest, rest.bins, rest.sources)
         respond = setup.to_plant(rest, sources)
-        chosen = choose_widths(windows.grid, windows.least, widest, narrow.noise, respond)
+        chosen = choose_widths(windows.grid, windows.least, widest, noise, respond)
         width, rational = (part[at] for part in chosen)
     respond = setup.to_moved(rest)
     moved = respond(omega, width, "polynomial")
@@ -128,67 +117,60 @@ def estimate_local_polynomial(
         moved = moved.replace_rows(rational, part)
     # Where the fit leaves much more than the noise, and where an input hardly moves.
     far_off = unresolved(omega, moved, sources, at, bins, rest.moved) & (options.width is None)
-    unmoved = np.zeros_like(far_off)
-    if method == "joint":
-        unmoved = find_unmoved(moved, sources, at, inputs)
+    unmoved = find_unmoved(moved, sources, at, inputs) if joint else np.zeros_like(far_off)
     lost = far_off | unmoved
     blank = moved.rows(lost)
+    names = "response", "effect", "gain", "scatter"
     blank = blank._replace(
-        response=blank.response * np.nan,
-        effect=blank.effect * np.nan,
-        gain=blank.gain * np.nan,
-        scatter=blank.scatter * np.nan,
-        freedom=0 * blank.freedom,
+        **{name: getattr(blank, name) * np.nan for name in names}, freedom=0 * blank.freedom
     )
     moved = moved.replace_rows(lost, blank)
     plant = setup.plant(moved)
     back = recolour(omega, options.integrators, options.delay, dt)[:, None, None]
-    coherence, direct, multiple = _coherence(setup, narrow)
+    plain = setup._replace(joint=False)
+    respond = plain.to_moved(Rest(bins, (), *plain.channels) if joint else rest)
+    fit = respond(windows.grid, windows.narrow, "polynomial")  # from inputs to outputs
+    power = setup.noise_of(fit).power
+    direct, multiple = (of(fit, power)[at] for of in (partial_coherence, multiple_coherence))
+    coherence, finite = direct, np.isfinite(plant.response)
+    if joint:
+        spread = windows.grid, windows.narrow, from_sources, inputs
+        coherence = coherence_of_references(*spread)[at]
     coherent = np.any(coherence >= COHERENT, axis=(1, 2))
+    coherence = np.where(finite, coherence, 0.0)
     ringing = np.zeros(at.size, bool)
     if options.global_order:
-        ends = [end_of(transformed_columns(record, options.integrators)) for record in records]
+        columns = (transformed_columns(record, options.integrators) for record in records)
+        ends = [x[-max(int(_END * len(x)), _FEWEST) :].copy() for x in columns]
         ringing = left_moving(rest, ends, windows.grid, sources)[at]
     left, right = setup.factors(moved)
     models = shared_errors(rest, bins, omega, moved, sources, left, right)
-    edges = window_slices(windows.grid, windows.narrow, bins)
-    freedom = narrow.plant.freedom
+    edges, freedom = window_slices(windows.grid, windows.narrow, bins), narrow.freedom
     log_noise = smoothed(windows.grid, covariance_of_bands(*edges, freedom), freedom)
-    finite = np.isfinite(plant.response)
-    undetermined = ~np.all(finite, axis=(1, 2)) & ~lost
-    return LocalEstimate(
-        plant.response * back,
-        np.where(finite, coherence, 0.0),
+    errors = error_covariance(omega, plant, noise, at, bins, back, sources, left, models)
+    response = plant.response * back
+    with np.errstate(divide="ignore", invalid="ignore"):
+        error = np.where(finite, np.sqrt(errors.variance() / 2) / np.abs(response), np.inf)
+    sharp = finite & (error <= _SHARP) & (coherence >= _COHERENT)
+    remarks = ft.partial(
+        _remarks, sum(record.duration for record in records), omega,
+        np.any(sharp if sharp.any() else finite, axis=(1, 2)),
+        ~np.all(finite, axis=(1, 2)) & ~lost, far_off & coherent,
+        bool(np.any(unmoved) and not np.any(finite)), ringing & coherent & ~far_off,
+        None if options.width is None else windows.least[at],
+    )  # fmt: skip
+    return Estimate(
+        omega,
+        response,
+        coherence,
         np.where(finite, direct, 0.0),
         multiple,
-        error_covariance(omega, plant, narrow.noise, at, bins, back, sources, left, models),
-        width,
-        rational,
+        errors,
+        error,
         log_noise[np.ix_(at, at)],
-        share_of_inputs(left, sources, at, inputs) if method == "joint" else None,
-        _remark_on_lost(omega[undetermined], setup, options.width)
-        + _remark_on_resolution(omega[far_off & coherent])
-        + _remark_on_unmoved(unmoved, finite)
-        + _remark_on_ringing(omega[ringing & coherent & ~far_off]),
+        remarks,
+        divided=share_of_inputs(left, sources, at, inputs) if joint else None,
     )
-
-
-def _coherence(
-    setup: "Setup", narrow: "Narrow"
-) -> tuple[Pairs, Pairs, Float[np.ndarray, "frequencies outputs"]]:
-    """That of the estimate, that from inputs to outputs, and the latter's multiple coherence."""
-    windows, inputs, outputs = setup.windows, setup.inputs, setup.outputs
-    plain = narrow.rest
-    if setup.method == "joint":
-        plain = Rest(setup.bins, (), slice(0, inputs), slice(inputs, inputs + outputs))
-    fit = setup.to_moved(plain)(windows.grid, windows.narrow, "polynomial")
-    power = smooth_noise(windows.grid, windows.narrow, fit.scatter, fit.freedom).power
-    direct = partial_coherence(fit, power)[windows.at]
-    multiple = multiple_coherence(fit, power)[windows.at]
-    if setup.method == "direct":
-        return direct, direct, multiple
-    joint = coherence_of_references(windows.grid, windows.narrow, narrow.moved, inputs)
-    return joint[windows.at], direct, multiple
 
 
 class Setup(NamedTuple):
@@ -200,36 +182,32 @@ class Setup(NamedTuple):
     outputs: int
     order: int  # of the local polynomials
     global_order: int  # the most
-    method: Method
-    open_loop: bool  # no references are known, and none is asked for
+    joint: bool
 
     @property
     def channels(self) -> tuple[slice, slice]:
         """The channels that move, and those that are moved."""
         first = self.inputs + self.outputs
-        if self.method == "joint":
+        if self.joint:
             return slice(first, first + self.inputs), slice(0, first)
         return slice(0, self.inputs), slice(self.inputs, first)
 
     def plant(self, moved: LocalFit) -> LocalFit:
         """The fit from inputs to outputs, from that of what is moved."""
-        return joint_fit(moved, self.inputs) if self.method == "joint" else moved
+        return joint_fit(moved, self.inputs) if self.joint else moved
 
-    def factors(
-        self, moved: LocalFit
-    ) -> tuple[
-        Complex[np.ndarray, "frequencies outputs moved"],
-        Complex[np.ndarray, "frequencies sources inputs"],
-    ]:
+    def factors(self, moved: LocalFit) -> tuple[np.ndarray, np.ndarray]:
         """L and R in dG = L dT R, T from the sources to what they move."""
-        if self.method == "joint":
+        if self.joint:
             return joint_factors(moved, self.inputs)[1:]
-        count, outputs = moved.response.shape[:2]
-        left, right = np.eye(outputs, dtype=complex), np.eye(self.inputs, dtype=complex)
-        return (
-            np.broadcast_to(left, (count, outputs, outputs)),
-            np.broadcast_to(right, (count, self.inputs, self.inputs)),
-        )
+        count, *sizes = moved.response.shape
+        left, right = (np.broadcast_to(np.eye(n, dtype=complex), (count, n, n)) for n in sizes)
+        return left, right
+
+    def noise_of(self, fit: LocalFit, *, open_loop: bool = False) -> Noise:
+        """Of what narrow fits on the grid leave."""
+        windows, spread = self.windows, (fit.scatter, fit.freedom)
+        return smooth_noise(windows.grid, windows.narrow, *spread, open_loop=open_loop)
 
     def to_moved(self, rest: Rest) -> Respond:
         """Fits from the sources of `rest` to what they move."""
@@ -254,43 +232,17 @@ class Setup(NamedTuple):
         return respond
 
 
-class Narrow(NamedTuple):
-    """What models leave, and the narrow fits of it on the grid of windows."""
-
-    rest: Rest
-    moved: LocalFit  # from the sources
-    plant: LocalFit  # from inputs to outputs
-    noise: Noise  # of the outputs
-    sources: Noise  # of all that is moved
-
-
-def fit_narrow(setup: Setup, highest: float, dt: float) -> Narrow:
-    """With models of the bins up to five times `highest` in rad/s, of samples `dt` apart in s."""
-    rest = subtract_models(setup.bins, *setup.channels, highest, dt, setup.global_order)
-    rest, moved = _repair_models(setup, rest)
-    plant = setup.plant(moved)
-    noise = _noise_of(setup.windows, plant, open_loop=setup.open_loop)
-    sources = _noise_of(setup.windows, moved) if setup.method == "joint" else noise
-    return Narrow(rest, moved, plant, noise, sources)
-
-
-def _noise_of(windows: Windows, fit: LocalFit, *, open_loop: bool = False) -> Noise:
-    spread = fit.scatter, fit.freedom
-    return smooth_noise(windows.grid, windows.narrow, *spread, open_loop=open_loop)
-
-
 def _repair_models(setup: Setup, rest: Rest) -> tuple[Rest, LocalFit]:
     """What better models leave where those of `rest` miss the response, and the narrow fits of it.
 
-    A model can fit the loud bins alone: what it leaves of the quiet ones counts as their noise, and
-    they never matter. It may be many times the response there, which biases the local fits. The
-    better models' bins count by the noise of the local fits.
+    A model can fit the loud bins alone, and be many times the response at quiet ones, which biases
+    the local fits. The better models' bins count by the noise of the local fits.
     """
     fit, left = _narrowly(setup, rest)
     for _ in range(_REPAIRS):
         if not np.any(left > _MISSED):
             break
-        noise = _noise_of(setup.windows, fit)
+        noise = setup.noise_of(fit)
         models = weighted_models(rest, setup.bins, left > _MISSED, noise, setup.global_order)
         trial = take_off(setup.bins, rest.sources, rest.moved, models)
         repaired, after = _narrowly(setup, trial)
@@ -309,8 +261,7 @@ def _repair_models(setup: Setup, rest: Rest) -> tuple[Rest, LocalFit]:
 def _narrowly(setup: Setup, rest: Rest) -> tuple[LocalFit, Float[np.ndarray, " moved"]]:
     """Fits from the sources to what they move, and what models leave, to what the fits leave.
 
-    A window is widened where it determines nothing, as between the lines of a multisine; a rational
-    fit counts where its residual is so much smaller that there must be a resonance.
+    A rational fit counts where its residual is so much smaller that there must be a resonance.
     """
     grid, width = setup.windows.grid, setup.windows.narrow
     respond = setup.to_moved(rest)
@@ -322,7 +273,7 @@ def _narrowly(setup: Setup, rest: Rest) -> tuple[LocalFit, Float[np.ndarray, " m
         wider = np.where(lost, WIDENED * wider, wider)
         fit = fit.replace_rows(lost, respond(grid[lost], wider[lost], "polynomial"))
     rational = respond(grid, width, "rational")
-    left = [np.real(np.diagonal(one.scatter, axis1=1, axis2=2)) for one in (fit, rational)]
+    left = [diagonal(one.scatter) for one in (fit, rational)]
     with np.errstate(invalid="ignore"):
         sharper = np.any(left[1] < _SHARPER * left[0], axis=1)
     if np.any(sharper):
@@ -331,52 +282,131 @@ def _narrowly(setup: Setup, rest: Rest) -> tuple[LocalFit, Float[np.ndarray, " m
     return fit, response_left(rest, grid, width, fit)
 
 
-def _remark_on_lost(omega: Grid, setup: Setup, width: float | None) -> tuple[Remark, ...]:
-    if omega.size == 0:
-        return ()
-    remark = (
-        "undetermined {where}: the inputs "
-        "are not excited there, or cannot be separated from each other or from transients. Excite "
-        "them there, or leave these frequencies out"
-    )
-    if width is not None:
-        enough = np.max(setup.windows.least[np.searchsorted(setup.windows.grid, omega)])
-        remark += f"«wider|; or use a larger width: {enough:.4g} rad/s holds enough Fourier bins»"
-    return (Remark(remark, omega, kind="undetermined"),)
-
-
-def _remark_on_unmoved(
-    unmoved: Where, finite: Bool[np.ndarray, "frequencies outputs inputs"]
+def _remarks(
+    seconds: float,
+    omega: Grid,
+    used: Where,
+    undetermined: Where,
+    far_off: Where,
+    unmoved: bool,
+    ringing: Where,
+    least: Grid | None,
 ) -> tuple[Remark, ...]:
-    """Where no frequency is left, the reader needs to know why."""
-    if np.any(finite) or not np.any(unmoved):
-        return ()
-    text = (
-        "no response at any frequency: the references move the inputs too little to divide by "
-        f"(random errors above {100 * DIVISIBLE:.0f} %). Excite by the references, record longer, "
-        "or sample faster"
-    )
-    return (Remark(text, kind="no response"),)
+    """On a record too short for the frequencies in use, and on those that are lost and why."""
+    remarks, spacing = [], 2 * np.pi / seconds
+    if used.any() and omega[-1] - omega[0] >= _GRID * spacing:
+        low, high = float(omega[used][0]), float(omega[used][-1])
+        count, cycles = (high - low) / spacing, low / spacing
+        for least_cycles, least_count in _LEAST.items():
+            if cycles >= least_cycles or count >= least_count:
+                continue
+            needed = seconds * max(least_cycles / cycles, least_count / max(count, 1.0))
+            text = (
+                f"the record is too short: its {seconds:.3g} s tell {count:.1f} frequencies apart "
+                f"from {low:.3g} to {high:.3g} rad/s ({low / (2 * np.pi):.3g} to "
+                f"{high / (2 * np.pi):.3g} Hz; at least {least_count:.0f}), and hold {cycles:.1f} "
+                f"cycles of the lowest (at least {least_cycles:.0f}): 95 % intervals are too "
+                f"narrow there. Record at least {needed:.2g} s, or a wider band"
+            )
+            remarks.append(Remark(text, omega[used], kind="short record"))
+            break
+    if np.any(undetermined):
+        text = (
+            "undetermined {where}: the inputs "
+            "are not excited there, or cannot be separated from each other or from transients. "
+            "Excite them there, or leave these frequencies out"
+        )
+        if least is not None:
+            enough = np.max(least[undetermined])
+            text += f"«wider|; or use a larger width: {enough:.4g} rad/s holds enough Fourier bins»"
+        remarks.append(Remark(text, omega[undetermined], kind="undetermined"))
+    if np.any(far_off):
+        text = (
+            "no response {where}: the fit there leaves more than ten times the noise nearby, as "
+            "beside a mode that rings or a line (a tone, as of a rotor or the mains). Record "
+            "longer, and 3 to 10 s of rest at the end"
+        )
+        remarks.append(Remark(text, omega[far_off], kind="no response"))
+    if unmoved:  # Where no frequency is left, the reader needs to know why.
+        text = (
+            "no response at any frequency: the references move the inputs too little to divide by "
+            f"(random errors above {100 * _DIVISIBLE:.0f} %). Excite by the references, record "
+            "longer, or sample faster"
+        )
+        remarks.append(Remark(text, kind="no response"))
+    if np.any(ringing):
+        text = (
+            "the output still moves when the record ends, and a global model leaves more than ten "
+            "times the noise {where}: a mode that rings there, or a line (a tone, as of a rotor or "
+            "the mains), is mistaken for response. Record 3 to 10 s of rest at the end, sweep wider"
+            "«, or raise global_order»; leave the frequencies of a line out"
+        )
+        remarks.append(Remark(text, omega[ringing], kind="ringing"))
+    return tuple(remarks)
 
 
-def _remark_on_resolution(omega: Grid) -> tuple[Remark, ...]:
-    if omega.size == 0:
-        return ()
-    text = (
-        "no response {where}: the fit there leaves more than ten times the noise nearby, as beside "
-        "a mode that rings or a line (a tone, as of a rotor or the mains). Record longer, and "
-        "3 to 10 s of rest at the end"
-    )
-    return (Remark(text, omega, kind="no response"),)
+def joint_factors(fit: LocalFit, inputs: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Where T_ru has an inverse, [-G, 1], and that inverse: dG = [-G, 1] dT T_ru^-1."""
+    invertible = fit.determined
+    through = np.where(invertible[:, None, None], fit.response[:, :inputs], np.eye(inputs))
+    strength = np.linalg.svd(through, compute_uv=False)
+    invertible &= strength[:, -1] > _DEPENDENT * strength[:, 0]
+    back = np.linalg.inv(np.where(invertible[:, None, None], through, np.eye(inputs)))
+    response = fit.response[:, inputs:] @ back
+    outputs = response.shape[1]
+    ones = np.broadcast_to(np.eye(outputs), (len(back), outputs, outputs))
+    return invertible, np.concatenate([-response, ones], axis=2), back
 
 
-def _remark_on_ringing(omega: Grid) -> tuple[Remark, ...]:
-    if omega.size == 0:
-        return ()
-    text = (
-        "the output still moves when the record ends, and a global model leaves more than ten "
-        "times the noise {where}: a mode that rings there, or a line (a tone, as of a rotor or the "
-        "mains), is mistaken for response. Record 3 to 10 s of rest at the end, sweep wider"
-        "«, or raise global_order»; leave the frequencies of a line out"
-    )
-    return (Remark(text, omega, kind="ringing"),)
+def joint_fit(fit: LocalFit, inputs: int) -> LocalFit:
+    """G = T_ry T_ru^-1 of the fit from references to [inputs, outputs], with the error of v = y - G
+    u.
+
+    Source: Pintelon and Schoukens, System Identification, 2nd ed., section 2.6 and 7.2.7.
+    """
+    invertible, left, back = joint_factors(fit, inputs)
+    through, response = fit.response[:, :inputs], -left[:, :, :inputs]
+    blank = np.where(invertible, 1.0, np.nan)[:, None, None]
+    effect = np.swapaxes(back, 1, 2) @ fit.effect * blank
+    scatter = left @ fit.scatter @ adjoint(left) * blank
+    boosted = left * fit.boost[:, None, :]
+    boosted = diagonal(boosted @ fit.scatter @ adjoint(boosted))
+    boost = np.sqrt(boosted / np.maximum(diagonal(scatter), 1e-300))
+    gain = boost[:, :, None] ** 2 * np.vecdot(effect, effect).real[:, None, :]
+    power = through @ fit.power @ adjoint(through)
+    freedom = np.where(invertible, fit.freedom, 0.0)
+    return LocalFit(response * blank, effect, boost, gain, fit.first, scatter, freedom, power)
+
+
+def coherence_of_references(omega: Grid, half_width: Grid, fit: LocalFit, inputs: int) -> Pairs:
+    """Partial coherence of the joint estimate: the smaller of the shares of input and output.
+
+    Source: Bendat and Piersol, Random Data, ch. 7.
+    """
+    noise = smooth_noise(omega, half_width, fit.scatter, fit.freedom)
+    moved = noise.power[:, None, :inputs]
+    plant = joint_fit(fit, inputs)
+    alone = power_alone(plant)[:, None, :]
+    through = partial_coherence(plant, noise.power[:, inputs:])
+    return np.minimum(through, alone / (alone + moved))
+
+
+def share_of_inputs(left: np.ndarray, noise: Noise, at: Places, inputs: int) -> Pairs:
+    """Share of a joint estimate's squared error by the noise of T_ru, half of what both make
+    included."""
+    root = noise.root()[at]
+    total = left @ root
+    of_inputs = left[:, :, :inputs] @ root[:, :inputs]
+    power = np.vecdot(total, total).real
+    mine = np.sum(np.real(of_inputs * np.conj(total)), axis=2)
+    share = np.clip(mine / np.maximum(power, 1e-300), 0.0, 1.0)
+    return np.repeat(share[:, :, None], inputs, axis=2)
+
+
+def find_unmoved(moved: LocalFit, noise: Noise, at: Places, inputs: int) -> Where:
+    """Where references hardly move an input: the joint ratio of two noises is -1 over the
+    controller."""
+    invertible, _, back = joint_factors(moved, inputs)
+    effect = np.sum(np.abs(np.swapaxes(back, 1, 2) @ moved.effect) ** 2, axis=2)
+    relative = np.sqrt(noise.power[at][:, :inputs] * effect / 2)
+    return invertible & np.any(relative > _DIVISIBLE, axis=1)

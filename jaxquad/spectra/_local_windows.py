@@ -1,16 +1,24 @@
-"""The frequencies at which local fits are made, and how wide their windows may be."""
+"""Local fits: how wide their windows may be, and the errors and coherence from what they leave."""
 
+import dataclasses
 from collections.abc import Callable, Sequence
 from typing import Literal, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Complex, Float, Int
 
-from ._estimators import LocalPolynomial
-from ._local_fit import Bins, check_bins, LocalFit, smallest_widths, window_slices
+from ._error_covariance import ErrorCovariance, reach_of
+from ._estimators import diagonal, Grid, Levels, LocalPolynomial, Pairs, Places, Where
+from ._local_fit import Bins, LocalFit, window_slices
 from ._noise import Noise
 
 
+_CHANCE_OF_MISFIT = 1e-5  # of calling a residual a misfit
+_FALSE_ALARM = 1e-3  # chance that noise alone leaves any of a record's responses unresolved
+_HARMLESS = 1e-4  # share of the moved channel's power
+_FAR_OFF = 10.0  # residual power over that of the noise from which a response is unresolved
+_UNKNOWN = 1e60  # error of what is not determined: infinity, but products with zero are zero
+_TOGETHER = 1024  # bins whose drives are taken at a time: those of a long record are many
 _FREEDOM = 10  # complex degrees of freedom left over by the least window
 _NARROW = 0.15  # half-width, relative to the frequency, at which noise and powers are estimated
 WIDENED, WIDENINGS = 1.5, 6  # ratio and number of the steps from a window that is undetermined
@@ -27,10 +35,9 @@ _ACCURATE = 0.1  # largest relative error of a rational function that is used
 _DOMINATED = 30.0  # ratio of input powers from which a window's side outweighs its centre
 _STEP = 1.3  # of the half-widths that are tried
 
-Grid = Float[np.ndarray, " frequencies"]
-Where = Bool[np.ndarray, " frequencies"]
 Shape = Literal["polynomial", "rational"]
 Respond = Callable[[Grid, Grid, Shape], LocalFit]
+Left = Complex[np.ndarray, "frequencies outputs moved"]
 
 
 class Windows(NamedTuple):
@@ -63,12 +70,29 @@ def make_windows(
 ) -> Windows:
     """Around increasing `omega`. Raises `ValueError` where the bins are too few."""
     coefficients, transients = inputs * (options.order + 1), options.order + 1
-    check_bins(omega, bins, coefficients, transients, _FREEDOM)
+    counts = np.bincount(bins.record, minlength=bins.records)
+    spare = int(np.sum(np.maximum(counts - transients, 0)))
+    if spare < coefficients + _FREEDOM:
+        raise ValueError(
+            f"the records have {counts.tolist()} Fourier bins, {spare} more than their transients "
+            f"need; the local fit needs {coefficients + _FREEDOM}. Record longer, or use a lower "
+            "order"
+        )
+    if not (omega.size and np.all(np.diff(omega) > 0)):
+        raise ValueError(
+            f"{omega.size} frequencies: give one or more, in increasing order, in rad/s"
+        )
+    if omega[0] < 0.999 * bins.omega[0] or omega[-1] > 1.001 * bins.omega[-1]:
+        raise ValueError(
+            f"the frequencies run from {omega[0]:.4g} to {omega[-1]:.4g} rad/s, but the records "
+            f"hold one cycle of {bins.omega[0]:.4g} rad/s and reach {bins.omega[-1]:.4g} rad/s. "
+            "Keep the frequencies within, or record longer"
+        )
     first, last = max(omega[0] / 2, bins.omega[0]), min(omega[-1] * 2, bins.omega[-1])
     steps = _PER_OCTAVE * np.log2([first, last])
     octaves = np.arange(np.ceil(steps[0]), np.floor(steps[1]) + 1) / _PER_OCTAVE
     grid = np.union1d(omega, 2**octaves)
-    least = smallest_widths(grid, bins, coefficients, transients, _FREEDOM)
+    least = _smallest_widths(grid, bins, coefficients, transients)
     # Windows that reach half of the way to the next frequency leave nothing of a record out.
     density = bins.omega.size / (bins.omega[-1] - bins.omega[0])
     gaps = np.diff(grid)
@@ -78,18 +102,33 @@ def make_windows(
     return Windows(grid, np.searchsorted(grid, omega), least, narrow, most)
 
 
+def _smallest_widths(omega: Grid, bins: Bins, columns: int, transient: int) -> Grid:
+    """Half-widths of the smallest windows with enough more bins than response and transients
+    have."""
+    least, most = np.zeros_like(omega), np.full_like(omega, bins.omega[-1])
+    grids = [bins.omega[bins.record == r] for r in range(bins.records)]
+    for _ in range(40):
+        middle = (least + most) / 2
+        spare = np.zeros(omega.size, int)
+        for grid in grids:
+            first = np.searchsorted(grid, omega - middle, "left")
+            last = np.searchsorted(grid, omega + middle, "right")
+            spare += np.maximum(last - first - transient, 0)
+        enough = spare >= columns + _FREEDOM
+        least, most = np.where(enough, least, middle), np.where(enough, middle, most)
+    return most * (1 + 1e-9)
+
+
 def choose_widths(
     omega: Grid, least: Grid, reach: Grid, noise: Noise, respond: Respond
 ) -> tuple[Grid, Where]:
-    """Half-widths from `least` to `reach`, by intersecting confidence intervals.
+    """Half-widths from `least` to `reach`, by intersecting confidence intervals, and where
+    rational.
 
-    Also returns where a rational function is used.
     A wider window is used while its response agrees with those of all narrower ones within the
-    variance of their difference (Goldenshluger and Nemirovski, 1997), at the frequency and on
-    average over its neighbours. This test cannot see a bias of the size of the noise, so the window
-    used is one step smaller, where the bias is about five times smaller. Where the smallest window
-    leaves more than noise, as at a resonance, a rational function replaces the polynomial, if it is
-    accurate there.
+    variance of their difference (Goldenshluger and Nemirovski, 1997), also on average over its
+    neighbours. The test cannot see a bias of the size of the noise: the window is one step smaller,
+    its bias a fifth.
     """
     widest = np.maximum(reach, least)
     steps = int(np.ceil(np.log(np.max(widest / least)) / np.log(_RATIO) - 1e-9)) + 1
@@ -120,12 +159,10 @@ def _without_effect(fit: LocalFit) -> LocalFit:
 
 
 def _resonant(fits: Sequence[LocalFit], sharp: LocalFit, noise: Noise) -> Where:
-    """Where a polynomial is wrong and a rational function accurate.
-
-    The error of a rational function is linear in the noise only while it is small.
-    """
+    """Where a polynomial is wrong and a rational function accurate: its error linear in the
+    noise."""
     pairs = noise.power.shape[1] * sharp.response.shape[2]
-    left = np.real(np.diagonal(fits[0].scatter, axis1=1, axis2=2)) / noise.power
+    left = diagonal(fits[0].scatter) / noise.power
     wrong = np.any(left > _quantile(fits[0].freedom, noise, _CHANCE_ALONE)[:, None], axis=1)
     for wide in fits[1:2]:
         statistic, count = _differences(wide, fits[0], noise)
@@ -140,7 +177,7 @@ def _widest_unbiased(
     widths: Float[np.ndarray, "steps frequencies"],
     fits: Sequence[LocalFit],
     noise: Noise,
-) -> Int[np.ndarray, " frequencies"]:
+) -> Places:
     step, going = np.zeros(omega.size, int), np.ones(omega.size, bool)
     kernel = np.exp(-0.5 * ((np.log(omega)[:, None] - np.log(omega)) / _SMOOTHING) ** 2)
     pairs = noise.power.shape[1] * fits[0].response.shape[2]
@@ -181,10 +218,9 @@ def _differences(wide: LocalFit, narrow: LocalFit, noise: Noise) -> tuple[Grid, 
 def reach(omega: Grid, centre: Grid, widest: Grid, bins: Bins, columns: slice) -> Grid:
     """Half-widths in rad/s within which the excitation is even, `widest` at most.
 
-    Beyond the end of a sweep, a window that reaches back into the sweep's band takes the response
-    from there: smooth, with a small error, and wrong. So the mean power of each of the `columns` on
-    one side of `centre` (half-width) must not outweigh that at the centre, unless both sides do, as
-    between the lines of a multisine, where the response is interpolated.
+    Beyond a sweep's end, a window that reaches back takes the response from there: smooth, and
+    wrong. So the mean power on one side of `centre` must not outweigh that at the centre, unless
+    both do.
     """
     running = np.cumsum(np.abs(bins.values[:, columns]) ** 2, axis=0)
     running = np.concatenate([np.zeros((1, running.shape[1])), running])
@@ -204,3 +240,174 @@ def reach(omega: Grid, centre: Grid, widest: Grid, bins: Bins, columns: slice) -
         going &= np.all(np.maximum(low, high) <= _DOMINATED * even, axis=1)
         far, going = np.where(going, wider, far), going & (wider < widest)
     return far
+
+
+class SharedErrors(NamedTuple):
+    """Errors of real parameters that noise W of unit power has moved by Re(drive W), `roots` to a
+    bin.
+
+    The drive is that of one noise times its share of the roots: all at once would fill the memory.
+    """
+
+    slopes: Complex[np.ndarray, "frequencies outputs inputs parameters"]
+    single: Complex[np.ndarray, "parameters places"]
+    lines: Complex[np.ndarray, "places lines roots"]
+    line: Int[np.ndarray, " parameters"]  # that each parameter's noise has in `lines`
+    places: Int[np.ndarray, " places"]  # bins, rising
+
+    def drive_at(
+        self, taken: Int[np.ndarray, " taken"]
+    ) -> Complex[np.ndarray, "parameters taken roots"]:
+        """The drive by some of the `places`, numbers of which are `taken`."""
+        lines = np.swapaxes(self.lines[taken], 0, 1)
+        return self.single[:, taken, None] * lines[self.line]
+
+    def on_atoms(
+        self, reached: Bool[np.ndarray, " bins"]
+    ) -> tuple[np.ndarray, np.ndarray, Int[np.ndarray, " driven"]]:
+        """Slopes by the parameters' errors of unit size, their drive by atoms, and which atoms.
+
+        The bins that no local fit reaches are one more atom for each parameter, behind all bins.
+        """
+        level = np.sum(np.abs(self.lines) ** 2, axis=2)
+        pairs = zip(self.single, self.line, strict=True)
+        size = np.sqrt(0.5 * np.array([np.abs(row) ** 2 @ level[:, k] for row, k in pairs]))
+        size = np.where(size > 0, size, 1.0)
+        mine, parameters = reached[self.places], size.size
+        gram, others = np.zeros((parameters, parameters)), np.flatnonzero(~mine)
+        for first in range(0, others.size, _TOGETHER):
+            part = self.drive_at(others[first : first + _TOGETHER]).reshape(parameters, -1)
+            rows = np.ascontiguousarray(part).view(float)  # real and imaginary parts in turn
+            gram += rows @ rows.T
+        values, vectors = np.linalg.eigh(gram / np.outer(size, size))
+        drive = self.drive_at(np.flatnonzero(mine)) / size[:, None, None]
+        spare = np.zeros((parameters, parameters, drive.shape[2]), complex)
+        spare[:, :, 0] = vectors * np.sqrt(np.maximum(values, 0.0))
+        driven = np.concatenate([self.places[mine], reached.size + np.arange(parameters)])
+        return self.slopes * size, np.concatenate([drive, spare], axis=1), driven
+
+
+def error_covariance(
+    omega: Grid,
+    fit: LocalFit,
+    noise: Noise,
+    at: Places,
+    bins: Bins,
+    back: Complex[np.ndarray, "frequencies 1 1"],
+    sources: Noise,
+    left: Left,
+    models: SharedErrors | None,
+) -> ErrorCovariance:
+    """Errors of `fit`, recoloured by `back`; `at` is the place of each frequency in `noise`.
+
+    The atoms are the bins, each with its own noise: `left` times that of the `sources`. Where the
+    residual is larger than chance allows, so is the error. The same noise disturbs the `models`.
+    """
+    colour = _colour_of_noise(sources, left, omega, bins, fit)
+    effect = fit.effect * np.exp(0.5 * np.mean(np.log(colour), axis=2))[:, None, :]
+    scale = fit.boost * np.sqrt(_misfit(fit, noise, at, colour, _CHANCE_OF_MISFIT))
+    root = left @ sources.root()[at]
+    size = np.sqrt(noise.power[at]) * scale / np.maximum(np.linalg.norm(root, axis=2), 1e-300)
+    root = root * size[:, :, None]
+    finite = fit.determined
+    root = np.where(finite[:, None, None], root, np.eye(*root.shape[1:]))
+    effect = np.where(finite[:, None, None], effect * back, 0)
+    reach = reach_of(effect, fit.first)
+    effect = effect[:, :, : max(np.max(reach.last - reach.first), 1)].copy()
+    effect[~finite, :, 0] = _UNKNOWN
+    first = np.where(finite, fit.first, 0)
+    errors = ErrorCovariance(np.asarray(omega), effect, root, first=first)
+    if models is None:
+        return errors
+    slopes = np.where(finite[:, None, None, None], models.slopes * back[..., None], 0.0)
+    reached = reach.reached(bins.omega.size)
+    slopes, drive, driven = models._replace(slopes=slopes).on_atoms(reached)
+    return dataclasses.replace(errors, sensitivity=slopes, drive=drive, driven=driven)
+
+
+def _colour_of_noise(
+    sources: Noise, left: Left, omega: Grid, bins: Bins, fit: LocalFit
+) -> Float[np.ndarray, "frequencies window outputs"]:
+    """Power of `left` times the noise at the bins of each window, to that at its centre."""
+    places = _window_places(fit, bins)
+    lowest = np.min(places, initial=bins.omega.size - 1)
+    inside = bins.omega[lowest : np.max(places, initial=0) + 1]
+    if left.shape[1] == left.shape[2] == 1:
+        power = sources.power_at(inside)
+        return power[places - lowest] / sources.power_at(omega)[:, None, :]
+    roots = np.ascontiguousarray(np.swapaxes(sources.root_at(inside), 0, 1))
+    colour, moved = np.empty((*places.shape, left.shape[1])), len(roots)
+    for f, mine in enumerate(places):
+        parts = left[f] @ roots[:, mine - lowest].reshape(moved, -1)  # one product: many are slow
+        power = parts.real**2 + parts.imag**2
+        colour[f] = np.sum(power.reshape(-1, mine.size, moved), axis=2).T
+    centre = np.sum(np.abs(left @ sources.root_at(omega)) ** 2, axis=2)
+    return colour / np.maximum(centre, 1e-300)[:, None, :]
+
+
+def _window_places(fit: LocalFit, bins: Bins) -> Int[np.ndarray, "frequencies window"]:
+    """The bins of each window, padded."""
+    return np.minimum(fit.first[:, None] + np.arange(fit.effect.shape[2]), bins.omega.size - 1)
+
+
+def coloured_gain(fit: LocalFit, sources: Noise, left: Left, omega: Grid, bins: Bins) -> LocalFit:
+    """The fit with the gain of noise that is of unit power at the window's centre only."""
+    colour = _colour_of_noise(sources, left, omega, bins, fit)
+    gain = np.einsum("fik,fko->foi", np.abs(fit.effect) ** 2, colour)
+    return fit._replace(gain=fit.boost[:, :, None] ** 2 * gain)
+
+
+def partial_coherence(fit: LocalFit, noise: Levels) -> Pairs:
+    """Share of each output's power that an input explains beyond the other inputs, 0 to 1."""
+    response = np.where(fit.determined[:, None, None], fit.response, 0)
+    explained = np.abs(response) ** 2 * power_alone(fit)[:, None, :]
+    return explained / (explained + noise[:, :, None])
+
+
+def power_alone(fit: LocalFit) -> Float[np.ndarray, "frequencies inputs"]:
+    """Power of each input that no other input explains; 1 where nothing is determined."""
+    power = np.where(fit.determined[:, None, None], fit.power, np.eye(fit.power.shape[1]))
+    return 1 / diagonal(np.linalg.inv(power))
+
+
+def multiple_coherence(fit: LocalFit, noise: Levels) -> Levels:
+    """Share of each output's power that all inputs together explain, 0 to 1."""
+    finite = fit.determined[:, None, None]
+    response, power = np.where(finite, fit.response, 0), np.where(finite, fit.power, 0)
+    explained = np.real(np.einsum("foi,fij,foj->fo", response, power, np.conj(response)))
+    return explained / (explained + noise)
+
+
+def unresolved(
+    omega: Grid, fit: LocalFit, noise: Noise, at: Places, bins: Bins, moved: slice
+) -> Where:
+    """Where `fit` leaves residuals far above the noise, and more than a hundredth of what
+    `moved`."""
+    outputs = fit.response.shape[1]
+    left = np.broadcast_to(np.eye(outputs, dtype=complex), (omega.size, outputs, outputs))
+    colour = _colour_of_noise(noise, left, omega, bins, fit)
+    ratio = _misfit(fit, noise, at, colour, _FALSE_ALARM / (omega.size * outputs))
+    inside = np.any(fit.effect != 0, axis=1)[:, :, None]
+    values = np.abs(bins.values[:, moved]) ** 2
+    power = np.sum(values[_window_places(fit, bins)] * inside, axis=1) / np.sum(inside, axis=1)
+    left = diagonal(fit.scatter)
+    large = (ratio > _FAR_OFF) & (left > _HARMLESS * power)
+    return fit.determined & np.any(large, axis=1)
+
+
+def _misfit(
+    fit: LocalFit,
+    noise: Noise,
+    at: Places,
+    colour: Float[np.ndarray, "frequencies window outputs"],
+    chance: float,
+) -> Levels:
+    """Ratio of residuals to the noise where it is larger than chance allows, else 1."""
+    from scipy.special import fdtri
+
+    inside = np.any(fit.effect != 0, axis=1)
+    count = np.maximum(np.sum(inside, axis=1), 1)[:, None]
+    expected = noise.power[at] * np.sum(colour * inside[:, :, None], axis=1) / count
+    left = diagonal(fit.scatter) / expected
+    freedom = 2 * np.maximum(fit.freedom, 1.0), 2 * np.maximum(noise.freedom[at], 1.0)
+    return np.where(left > fdtri(*freedom, 1 - chance)[:, None], left, 1.0)

@@ -1,29 +1,53 @@
-"""The outputs' noise, smooth along frequency, and how well its power is known."""
+"""The outputs' noise, smooth along frequency, and how well its power is known.
+
+Leakage is told from noise: behind a window w, y = g * x has the transform
+sum_n j^n / n! G^(n) X_n, with X_n that of x behind the n-th derivative of w: the part beyond G X_0
+is leakage, of the slope and the curvature of G. It is the same in each draw of the noise, so the
+noise is what no combination of X_0, X_1, X_2 explains over the windows of one length. Y_1 is added
+to these: poles outlast any series in the slopes of G, but with them w y' = (w y)' - w' y has a
+transform that is linear in Y_1.
+"""
 
 import functools as ft
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple, TypeVar
 
 import numpy as np
-from jaxtyping import Complex, Float, Int
+from jaxtyping import Bool, Complex, Float
 
-from ._leakage import Rest
-from ._windows import leaked_power
+from ._estimators import (
+    adjoint,
+    Covariances,
+    diagonal,
+    Grid,
+    Levels,
+    Places,
+    power_of,
+    Responses,
+    Square,
+)
+from ._fourier_sums import coefficients
 
 
-Grid = Float[np.ndarray, " frequencies"]
-Square = Float[np.ndarray, "frequencies frequencies"]
-Levels = Float[np.ndarray, "frequencies outputs"]
-Groups = Float[np.ndarray, "frequencies outputs groups"]
-Covariances = Complex[np.ndarray, "frequencies outputs outputs"]
 Function = TypeVar("Function", bound=Callable)
 
 _BANDWIDTH = 0.2  # of the smoothing, in ln(omega)
 _WIDE = 2.0  # that of the correlations between outputs in open loop
 _UNLIKELY = 1e-4  # chance at which a residual counts as a misfit, or a line in the noise
-_FLOOR = 1e-26  # of the output's power: below it lies rounding
+_NEAR = 1e-2  # of a pole: its neighbourhood's rounding is below 1e-13
 _FEW = 256  # frequencies, of which a square takes half a megabyte
+_FLOOR = 1e-26  # of the output's power: below it lies rounding
+_RIDGE = 1e-12  # of the columns' size, so that empty ones do no harm
+_ROUNDING = 1e-7  # of a residual: the square is below rounding
+_WITHIN = 1e-6  # of its size: an output's slope that inputs explain so well adds nothing
+_FEW = 16  # windows taken at once: few others overlap them
+
+Rows = Complex[np.ndarray, "frequencies _ windows"]
+Gram = Complex[np.ndarray, "frequencies columns columns"]
+Groups = Float[np.ndarray, "frequencies outputs groups"]
+Overlap = Float[np.ndarray, "windows windows"]  # sums of the product of any two windows
+Resolved = Bool[np.ndarray, "groups frequencies"]
 
 
 class Noise(NamedTuple):
@@ -50,10 +74,10 @@ class Noise(NamedTuple):
 
     def root(self) -> Covariances:
         """Roots of the covariances, which change along frequency as slowly as they do."""
-        return np.sqrt(self.power)[:, :, None] * _hermitian_root(self.correlation)
+        return np.sqrt(self.power)[:, :, None] * hermitian_root(self.correlation)
 
 
-def _hermitian_root(covariance: Covariances) -> Covariances:
+def hermitian_root(covariance: Covariances) -> Covariances:
     # Not Cholesky's: along frequency the root must change as slowly as the matrix does.
     values, vectors = np.linalg.eigh(covariance)
     stretched = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
@@ -65,10 +89,9 @@ def smooth_noise(
 ) -> Noise:
     """Smooth residual covariances, each of `freedom` complex degrees of freedom, along frequency.
 
-    Powers are smoothed by local lines in log-log, corrected for the bias of the logarithm of a
-    chi-squared variable; correlations by positive weights, so that they stay positive semidefinite.
-    Residuals larger than chance allows are left out. Outputs in `open_loop` are correlated as in a
-    wide band, as far as the narrow ones agree with it.
+    Powers by local lines in log-log, without outliers or the logarithm's bias; correlations by
+    positive weights. In `open_loop` these are as in a wide band, as far as the narrow ones agree
+    with it.
     """
     from scipy.special import digamma, gammaincinv
 
@@ -127,14 +150,256 @@ def _correlation(
     return mixed / (size[:, :, None] * size[:, None, :])
 
 
-def noise_root(omega: Grid, rest: Rest, outputs: Groups, weights: Groups) -> Covariances:
-    """Hermitian root of the noise's covariance, from what is left of the outputs' windows.
+def kept_if_few(function: Function, frequencies: int) -> Function:
+    """The function with its `ft.lru_cache` for few frequencies, else without: squares are large."""
+    return function if frequencies <= _FEW else inspect.unwrap(function)
 
-    It is smooth along frequency: local straight lines, which leave a power law unchanged.
-    `outputs` are the outputs' own energies, and `weights` says how much a length counts.
+
+def kernels(omega: Grid) -> Float[np.ndarray, "3 frequencies frequencies"]:
+    """Weights of neighbours, times 1, the distance in ln(omega) and its square."""
+    return kept_if_few(_kernels_of, omega.size)(tuple(omega.tolist()))
+
+
+@ft.lru_cache(maxsize=4)
+def _kernels_of(omega: tuple[float, ...]) -> Float[np.ndarray, "3 frequencies frequencies"]:
+    place = np.log(omega)
+    offset = place[None, :] - place[:, None]
+    kernel = np.exp(-0.5 * (offset / _BANDWIDTH) ** 2)
+    return np.stack([kernel, kernel * offset, kernel * offset**2])
+
+
+def smoothed(omega: Grid, covariance: Square, weight: Grid) -> Square:
+    """Covariance of the logarithm of noise powers, of `weight` degrees of freedom, after
+    smoothing."""
+    near = kernels(omega)
+    m0, m1, m2 = (near @ weight)[:, :, None]
+    # A single frequency has no slope: the small term keeps the line flat there.
+    spread = m2 + 1e-3 * _BANDWIDTH**2 * m0 + 1e-300
+    size = spread * m0 - m1**2 + 1e-300
+    lines = (near[0] * (spread / size) - near[1] * (m1 / size)) * weight  # rows sum to one
+    return lines @ covariance @ lines.T
+
+
+def covariance_of_bands(first: Places, last: Places, freedom: Grid) -> Square:
+    """Of the logarithm of mean residual powers over bins: bands share as much of it as of their
+    bins."""
+    count = np.maximum(last - first, 1)
+    shared = np.minimum(last[:, None], last) - np.maximum(first[:, None], first)
+    overlap = np.maximum(shared, 0) / np.sqrt(np.outer(count, count))
+    return overlap / np.sqrt(np.outer(np.maximum(freedom, 1.0), np.maximum(freedom, 1.0)))
+
+
+def covariance_of_windows(
+    angle: Grid,
+    levels: Float[np.ndarray, "frequencies groups"],
+    shape: str,
+    lengths: tuple[int, ...],
+) -> Square:
+    """Of the logarithm of residual powers of all lengths, whose standard errors are `levels`."""
+    angles, shared = tuple(angle.tolist()), kept_if_few(_shared_power, angle.size)
+    parts = (
+        shared(shape, length, angles) * level * level[:, None]
+        for level, length in zip(levels.T, lengths, strict=True)
+    )
+    return ft.reduce(np.add, parts)
+
+
+@ft.lru_cache(maxsize=12)
+def _shared_power(shape: str, length: int, angle: tuple[float, ...]) -> Square:
+    """Squared correlation of white noise behind windows of this length at two frequencies (rad)."""
+    places = np.array(angle)
+    level, cosine = coefficients(shape)
+    cycles = (places[:, None] - places) * length / (2 * np.pi)
+    terms = level**2 + cosine**2 / 2, level * cosine, cosine**2 / 4  # of the squared window
+    # sinc(c - k) + sinc(c + k) for k = 0, 1, 2 have one sine in common, but poles at whole cycles.
+    square = cycles**2
+    poles = square * (square - 1) * (square - 4)
+    near = np.abs(poles) < _NEAR
+    poles = np.where(near, 1.0, poles)
+    ratio = terms[0] * (square - 1) * (square - 4)
+    ratio += 2 * square * (terms[2] * (square - 1) - terms[1] * (square - 4))
+    correlation = np.sin(np.pi * cycles) * cycles * ratio / (np.pi * poles)
+    close = cycles[near]
+    correlation[near] = terms[0] * np.sinc(close)
+    for k in (1, 2):
+        correlation[near] += terms[k] * (np.sinc(close - k) + np.sinc(close + k))
+    return (correlation / terms[0]) ** 2
+
+
+class Slopes(NamedTuple):
+    """Transforms behind the derivatives of the windows of one length."""
+
+    first: Complex[np.ndarray, "frequencies _ channels"]  # derivative: inputs, then outputs
+    second: Complex[np.ndarray, "frequencies _ inputs"]
+
+
+class Rest(NamedTuple):
+    """What is left of the outputs' windows: sums of `conj(a) b`, by window length.
+
+    `trace` is the energy that unit noise leaves.
     """
+
+    products: Complex[np.ndarray, "frequencies outputs outputs groups"]
+    trace: Groups
+    freedom: Groups  # complex
+    fits: "tuple[Fit, ...]"
+
+
+class Fit(NamedTuple):
+    """Least squares of the outputs on inputs and leakage in windows of one length.
+
+    An output's slope counts only for this output: q is what the common columns A leave of it, of
+    unit length. Products with the overlap O of the windows say what noise does.
+    """
+
+    solver: Gram
+    fitted: Complex[np.ndarray, "frequencies columns both"]  # of the outputs, then of their slopes
+    inverse: Float[np.ndarray, "frequencies slopes"]  # of the length of q before
+    along: Complex[np.ndarray, "frequencies slopes"]  # coefficients of q
+    aa: Gram  # A^H O A
+    aq: Complex[np.ndarray, "frequencies columns slopes"]  # A^H O q
+    qq: Float[np.ndarray, "frequencies slopes"]  # q^H O q
+
+    def bias(self, outputs: int, inputs: int) -> tuple[np.ndarray, np.ndarray]:
+        """What leakage adds to the response, and its mean square under unit noise."""
+        # The response took too much of the inputs: the first coefficients of what is left, less
+        # `through` times those to its own column.
+        taken, through = np.split(np.swapaxes(self.fitted[:, :inputs], 1, 2), [outputs], axis=1)
+        through, to_x = through * self.inverse[:, :, None], self.solver[:, :inputs]
+        plain = np.real(np.sum((to_x @ self.aa) * np.conj(to_x), axis=2))[:, None]
+        if not through.shape[1]:
+            return -taken, np.repeat(np.maximum(plain, 0.0), outputs, axis=1)
+        mixed = 2 * np.real(np.conj(through) * np.swapaxes(to_x @ self.aq, 1, 2))
+        square = plain - mixed + power_of(through) * self.qq[:, :, None]
+        return through * self.along[:, :, None] - taken, np.maximum(square, 0.0)
+
+
+def shows_leakage(windows: int, inputs: int) -> bool:
+    """Whether there are enough windows of one length to tell leakage from noise."""
+    return windows >= 3 * inputs + 3
+
+
+def without_leakage(
+    windows: Sequence[tuple[np.ndarray, np.ndarray]],
+    response: Responses,
+    slopes: Sequence[Slopes],
+    overlap: Overlap,
+    resolved: Resolved,
+) -> Rest:
+    """Outputs less all that inputs and leakage explain, by window length, from where it is
+    `resolved`.
+
+    A length with too few windows for its leakage keeps it, as noise; its slopes do not matter.
+    """
+    parts, first = [], 0
+    for pair, derivatives, where in zip(windows, slopes, resolved, strict=True):
+        # What a window does not resolve lies below what it does, and has no weight.
+        few = slice(int(np.argmax(where)), None)
+        x, y, x1, x2 = (np.swapaxes(part[few], 1, 2) for part in (*pair, *derivatives))
+        inputs, count = x.shape[1:]
+        columns, both = x, y - response[few] @ x
+        if shows_leakage(count, inputs):
+            columns = np.concatenate([x, x1[:, :inputs], x2], axis=1)
+            both = np.concatenate([both, x1[:, inputs:]], axis=1)
+        mine = slice(first, first + count)
+        columns = np.ascontiguousarray(columns)
+        parts.append(_least_squares(both, columns, y.shape[1], overlap[mine, mine]))
+        first += count
+    *sums, fits = zip(*parts, strict=True)
+    products, trace, freedom = (padded(part, len(response)) for part in sums)
+    return Rest(products, np.where(trace > 0, trace, 1.0), np.maximum(freedom, 0.5), fits)
+
+
+def padded(parts: Sequence[np.ndarray], frequencies: int) -> np.ndarray:
+    """Side by side, with zeros at the lowest frequencies that some lack."""
+    joined = np.zeros((frequencies, *parts[0].shape[1:], len(parts)), parts[0].dtype)
+    for k, part in enumerate(parts):
+        joined[frequencies - len(part) :, ..., k] = part
+    return joined
+
+
+def _least_squares(
+    both: Rows,
+    columns: Complex[np.ndarray, "frequencies columns windows"],
+    outputs: int,
+    overlap: Overlap,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, Fit]:
+    """`Rest` of one length: each output on the columns, and on its own slope, behind it in `both`.
+
+    With P the projection and O the overlap: tr(P O), the degrees of freedom tr(P O)^2 / tr(P O P
+    O).
+    """
+    count, conjugate = columns.shape[1], np.conj(columns)
+    weighed = _times_overlap(columns, overlap)
+    # One product of all: many small ones take as long to begin as to make.
+    stacked = conjugate @ np.swapaxes(np.concatenate([columns, weighed, both], axis=1), 1, 2)
+    gram, aa = stacked[:, :, :count], stacked[:, :, count : 2 * count]
+    power = diagonal(gram)
+    units = 1 / np.maximum(np.sqrt(power), 1e-100)
+    units = units[:, :, None] * units[:, None, :]
+    solver = np.linalg.inv(gram * units + _RIDGE * np.eye(count)) * units
+    fitted = solver @ stacked[:, :, 2 * count :]
+    rest = both - np.swapaxes(fitted, 1, 2) @ columns
+    size, left = (np.sqrt(_inner(part, part)) for part in (both, rest))
+    # Nearly dependent columns leave a part of themselves: orthogonal to all else, so its square
+    # counts.
+    least = diagonal(solver) * power
+    if np.any(2e-16 * np.max(least, axis=1, keepdims=True) * size > _ROUNDING * left):
+        rest -= np.swapaxes(solver @ (conjugate @ np.swapaxes(rest, 1, 2)), 1, 2) @ columns
+        left = np.sqrt(_inner(rest, rest))
+    rest, q, length = rest[:, :outputs], rest[:, outputs:], left[:, outputs:]
+    inverse = np.where(length > _WITHIN * size[:, outputs:], 1 / np.maximum(length, 1e-300), 0.0)
+    q = q * inverse[:, :, None]
+    along = np.vecdot(q, rest[:, : q.shape[1]])
+    if q.shape[1]:
+        rest = rest - q * along[:, :, None]
+    weighed_q = _times_overlap(q, overlap)
+    products = np.conj(weighed) @ np.swapaxes(np.concatenate([weighed, q], axis=1), 1, 2)
+    aa_twice, aq = products[:, :, :count], products[:, :, count:]
+    qq, qq_twice = _inner(q, weighed_q), _inner(weighed_q, weighed_q)
+    through = solver @ aa
+    trace = (np.trace(overlap) - _trace(solver, aa))[:, None]
+    square = np.sum(overlap**2) - 2 * _trace(solver, aa_twice)
+    square = (square + _trace(through, adjoint(through)))[:, None]
+    if q.shape[1]:
+        crossed = qq_twice - np.sum(np.conj(aq) * (solver @ aq), axis=1).real
+        trace, square = trace - qq, square - 2 * crossed + qq**2
+    freedom = np.maximum(trace**2 / square, 0.5)
+    if not q.shape[1]:
+        trace, freedom = (np.repeat(part, outputs, axis=1) for part in (trace, freedom))
+    products = np.conj(rest) @ np.swapaxes(rest, 1, 2)
+    return products, trace, freedom, Fit(solver, fitted, inverse, along, aa, aq, qq)
+
+
+def _times_overlap(rows: Rows, overlap: Overlap) -> Rows:
+    """Rows times the overlap of the windows, a few windows with those that overlap them."""
+    flat = rows.reshape(-1, rows.shape[2])
+    weighed = np.empty_like(flat)
+    for first in range(0, len(overlap), _FEW):
+        few = slice(first, first + _FEW)
+        places = np.flatnonzero(np.any(overlap[few], axis=0))
+        others = slice(places[0], places[-1] + 1)
+        weighed[:, few] = flat[:, others] @ overlap[others, few].astype(complex)
+    return weighed.reshape(rows.shape)
+
+
+def _inner(
+    a: Complex[np.ndarray, "*rows terms"], b: Complex[np.ndarray, "*rows terms"]
+) -> Float[np.ndarray, "*rows"]:
+    """The real part of `conj(a) b`, summed over the last axis."""
+    return np.vecdot(a.view(float), b.view(float))
+
+
+def _trace(a: Gram, b: Gram) -> Grid:
+    """The real part of the trace of the product of `a` with the adjoint of `b`."""
+    a, b = (np.ascontiguousarray(part).reshape(len(part), -1) for part in (a, b))
+    return _inner(a, b)
+
+
+def noise_root(omega: Grid, rest: Rest, outputs: Groups, weights: Groups) -> Covariances:
+    """Hermitian root of the noise's covariance, from what is left, by local lines in log-log."""
     freedom = rest.freedom
-    near = _kernels(omega)
+    near = kernels(omega)
     energy = np.real(np.einsum("foog->fog", rest.products))
     # The logarithm of a chi-squared variable is biased by digamma(f) - ln(f).
     low = -1 / (2 * freedom) - 1 / (12 * freedom**2)
@@ -151,80 +416,8 @@ def noise_root(omega: Grid, rest: Rest, outputs: Groups, weights: Groups) -> Cov
     scale = np.sqrt(np.mean(weights, axis=1, keepdims=True) / (energy + 1e-280))
     unit = np.sum(np.conj(rest.products) * (scale[:, :, None] * scale[:, None]), axis=3)
     smooth = (near[0] @ unit.reshape(len(unit), -1).view(float)).view(complex).reshape(unit.shape)
-    deviation = np.sqrt(np.maximum(np.real(np.diagonal(smooth, axis1=1, axis2=2)), 1e-300))
+    deviation = np.sqrt(np.maximum(diagonal(smooth), 1e-300))
     coherency = smooth / (deviation[:, :, None] * deviation[:, None, :])
-    diagonal = np.arange(count)
-    coherency[:, diagonal, diagonal] = 1.0  # also of an output that the inputs explain exactly
-    return _hermitian_root(coherency * (root[:, :, None] * root[:, None, :]))
-
-
-def kept_if_few(function: Function, frequencies: int) -> Function:
-    """The function with its `ft.lru_cache` for few frequencies, else without: squares are large."""
-    return function if frequencies <= _FEW else inspect.unwrap(function)
-
-
-def _kernels(omega: Grid) -> Float[np.ndarray, "3 frequencies frequencies"]:
-    """Weights of neighbours, times 1, the distance in ln(omega) and its square."""
-    return kept_if_few(_kernels_of, omega.size)(tuple(omega.tolist()))
-
-
-@ft.lru_cache(maxsize=4)
-def _kernels_of(omega: tuple[float, ...]) -> Float[np.ndarray, "3 frequencies frequencies"]:
-    place = np.log(omega)
-    offset = place[None, :] - place[:, None]
-    kernel = np.exp(-0.5 * (offset / _BANDWIDTH) ** 2)
-    return np.stack([kernel, kernel * offset, kernel * offset**2])
-
-
-def smoothed(omega: Grid, covariance: Square, weight: Grid) -> Square:
-    """Covariance of the logarithm of noise powers after smoothing along frequency.
-
-    `covariance` is that of the single ones, each of `weight` complex degrees of freedom.
-    """
-    near = _kernels(omega)
-    m0, m1, m2 = (near @ weight)[:, :, None]
-    # A single frequency has no slope: the small term keeps the line flat there.
-    spread = m2 + 1e-3 * _BANDWIDTH**2 * m0 + 1e-300
-    size = spread * m0 - m1**2 + 1e-300
-    lines = (near[0] * (spread / size) - near[1] * (m1 / size)) * weight  # rows sum to one
-    return lines @ covariance @ lines.T
-
-
-def covariance_of_bands(
-    first: Int[np.ndarray, " frequencies"], last: Int[np.ndarray, " frequencies"], freedom: Grid
-) -> Square:
-    """Of the logarithm of mean residual powers over the bins `first` to before `last`.
-
-    Residuals of `n` bins have `freedom` complex degrees of freedom: their mean has a relative
-    variance of 1 / freedom. Two bands share as much of it as they share of their bins.
-    """
-    count = np.maximum(last - first, 1)
-    shared = np.minimum(last[:, None], last) - np.maximum(first[:, None], first)
-    overlap = np.maximum(shared, 0) / np.sqrt(np.outer(count, count))
-    return overlap / np.sqrt(np.outer(np.maximum(freedom, 1.0), np.maximum(freedom, 1.0)))
-
-
-def covariance_of_windows(
-    angle: Grid,
-    levels: Float[np.ndarray, "frequencies groups"],
-    shape: str,
-    lengths: tuple[int, ...],
-) -> Square:
-    """Of the logarithm of mean residual powers over windows of several lengths.
-
-    All lengths see the same noise, each with its own resolution; `levels` are the standard errors
-    that they contribute. `angle` is in rad per sample.
-    """
-    angles, shared = tuple(angle.tolist()), kept_if_few(_shared_power, angle.size)
-    parts = (
-        shared(shape, length, angles) * level * level[:, None]
-        for level, length in zip(levels.T, lengths, strict=True)
-    )
-    return ft.reduce(np.add, parts)
-
-
-@ft.lru_cache(maxsize=12)
-def _shared_power(shape: str, length: int, angle: tuple[float, ...]) -> Square:
-    """What windows of this length have in common at two frequencies, in rad per sample."""
-    places = np.array(angle)
-    return leaked_power(shape, length, places[:, None] - places)
+    place = np.arange(count)
+    coherency[:, place, place] = 1.0  # also of an output that the inputs explain exactly
+    return hermitian_root(coherency * (root[:, :, None] * root[:, None, :]))

@@ -3,8 +3,9 @@
 Source: Pintelon and Schoukens, System Identification, 2nd ed., sections 2.5 and 4.3.1.
 """
 
+import functools as ft
 from collections.abc import Sequence
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
@@ -13,10 +14,21 @@ from jaxquad._core import Message
 from jaxquad.records import Record
 
 from ._error_covariance import ErrorCovariance
-from ._estimators import Periodic
-from ._frequency_response import Distortion
+from ._estimators import (
+    adjoint,
+    Covariances,
+    diagonal,
+    Grid,
+    Levels,
+    Method,
+    Periodic,
+    Places,
+    Remark,
+    Responses,
+    Where,
+)
+from ._frequency_response import Distortion, Estimate
 from ._noise import smooth_noise, smoothed
-from ._remarks import Remark
 
 
 _CHANCE = 1e-4  # of taking noise for an excited line, for distortion, or for a line in the noise
@@ -26,19 +38,11 @@ _ROUNDING = 1e-24  # power of rounding errors, to that of the output
 _UNKNOWN = 1e60  # error of what is not determined: infinity, but products with zero are zero
 _UNSETTLED = 4.0  # power of the first period's departure, to that of the noise
 
-Lines = Int[np.ndarray, " frequencies"]
 Averages = Complex[np.ndarray, "frequencies _ realisations"]  # over a record's periods
-Levels = Float[np.ndarray, "frequencies outputs"]
-Pairs = Float[np.ndarray, "frequencies outputs inputs"]
-Covariances = Complex[np.ndarray, "frequencies outputs outputs"]
 
 
 class Periods(NamedTuple):
-    """Transforms of one record's periods: their mean, and the covariance of a single one.
-
-    Scaled so that noise of unit variance has unit power; channels are in the order of
-    `Record.names`.
-    """
+    """Transforms of a record's periods, scaled so that noise of unit variance has unit power."""
 
     mean: Complex[np.ndarray, "lines channels"]
     covariance: Complex[np.ndarray, "lines channels channels"]  # of a single period
@@ -47,10 +51,7 @@ class Periods(NamedTuple):
 
 
 def record_periods(record: Record, options: Periodic) -> Periods:
-    """Transform the periods that are kept, at all harmonics below the Nyquist frequency.
-
-    Raises `ValueError` where fewer than two are left.
-    """
+    """Transform the periods that are kept, at all harmonics below the Nyquist frequency."""
     samples = options.samples(record)
     count = record.samples // samples - options.discard
     if count < 2:
@@ -89,7 +90,7 @@ def excited_lines(periods: Sequence[Periods], channels: slice) -> Int[np.ndarray
     from scipy.special import fdtri
 
     power = np.mean([np.abs(one.mean[:, channels]) ** 2 for one in periods], axis=0)
-    noise = np.real(np.diagonal(pooled(periods), axis1=1, axis2=2))[:, channels]
+    noise = diagonal(pooled(periods))[:, channels]
     noise = noise * np.mean([1 / one.count for one in periods])
     freedom = 2.0 * sum(one.count - 1 for one in periods)
     clear = power > fdtri(2.0 * len(periods), freedom, 1 - _CHANCE / len(power)) * noise
@@ -101,9 +102,9 @@ class Fit(NamedTuple):
 
     u: Complex[np.ndarray, "frequencies inputs realisations"]
     y: Complex[np.ndarray, "frequencies outputs realisations"]
-    response: Complex[np.ndarray, "frequencies outputs inputs"]
+    response: Responses
     effect: Complex[np.ndarray, "frequencies inputs realisations"]
-    determined: Bool[np.ndarray, " frequencies"]
+    determined: Where
 
 
 class Scatter(NamedTuple):
@@ -122,28 +123,21 @@ class Scatter(NamedTuple):
         return np.maximum(total - self.noise, 0.0)
 
 
-def instrumental(u: Averages, y: Averages, z: Averages) -> Fit:
-    """G = Y Z^H (U Z^H)^-1 at each line."""
-    adjoint = np.conj(np.swapaxes(z, 1, 2))
-    cross = u @ adjoint
-    size = np.linalg.norm(u, axis=2)[:, :, None] * np.linalg.norm(z, axis=2)[:, None, :]
-    strength = np.linalg.svd(cross / np.maximum(size, 1e-300), compute_uv=False)
-    determined = strength[:, -1] > _DEPENDENT * np.maximum(strength[:, 0], 1e-300)
-    inverse = np.linalg.inv(np.where(determined[:, None, None], cross, np.eye(u.shape[1])))
-    effect = np.swapaxes(adjoint @ inverse, 1, 2)
-    response = np.swapaxes(effect @ np.swapaxes(y, 1, 2), 1, 2)
-    return Fit(u, y, response, effect, determined)
-
-
-def estimate_scatter(
-    omega: Float[np.ndarray, " frequencies"], fit: Fit, periods: Sequence[Periods], lines: Lines
-) -> Scatter:
+def estimate_scatter(omega: Grid, fit: Fit, periods: Sequence[Periods], lines: Places) -> Scatter:
     """Noise between periods, from v = y - G u, and scatter between realisations.
 
-    With input noise and feedback, v is what perturbs G: its variance is that of Pintelon and
-    Schoukens, eq. 2-25, with the covariance of input and output.
+    With input noise and feedback, v is what perturbs G (Pintelon and Schoukens, eq. 2-25).
     """
-    from scipy.special import fdtri
+    from scipy.special import fdtri, gammaincinv
+
+    def smooth(covariance: Covariances, freedom: float) -> tuple[Levels, Covariances]:
+        """Powers and roots, smooth along frequency except at lines that stand out."""
+        spacing = np.gradient(omega) if omega.size > 1 else omega
+        counts = np.where(fit.determined, freedom, 0.0)
+        smooth = smooth_noise(omega, spacing, covariance, counts)
+        raw, high = diagonal(covariance), gammaincinv(freedom, 1 - _CHANCE) / freedom
+        power = np.where(raw > high * smooth.power, raw, smooth.power)
+        return power, smooth._replace(power=power).root()
 
     inputs, outputs = fit.u.shape[1], fit.y.shape[1]
     count = 1 / float(np.mean([1 / one.count for one in periods]))
@@ -151,133 +145,40 @@ def estimate_scatter(
     ones = np.broadcast_to(np.eye(outputs), (len(lines), outputs, outputs))
     left, channels = np.concatenate([-fit.response, ones], axis=2), slice(0, inputs + outputs)
     covariance = pooled(periods)[lines][:, channels, channels] / count
-    noise = left @ covariance @ np.conj(np.swapaxes(left, 1, 2))
-    power, root = _smooth(omega, noise, freedom, fit.determined)
+    noise = left @ covariance @ adjoint(left)
+    power, root = smooth(noise, freedom)
     spare = float(fit.u.shape[2] - inputs)
     if spare <= 0:
         return Scatter(power, None, np.zeros(outputs, bool), root, count, freedom)
     residual = fit.y - fit.response @ fit.u
-    between = residual @ np.conj(np.swapaxes(residual, 1, 2)) / spare
-    total, total_root = _smooth(omega, between, spare, fit.determined)
-    ratio = np.sum(_diagonal(between) / power * fit.determined[:, None], axis=0)
+    between = residual @ adjoint(residual) / spare
+    total, total_root = smooth(between, spare)
+    ratio = np.sum(diagonal(between) / power * fit.determined[:, None], axis=0)
     size = 2.0 * max(np.sum(fit.determined), 1)
     ratio = 2 * ratio / size
     significant = ratio > fdtri(size * spare, size * freedom, 1 - _CHANCE)
     # Rounding errors repeat from period to period, and not from one realisation to the next.
     output = np.mean(np.abs(fit.y) ** 2, axis=(0, 2))
-    significant &= np.mean(_diagonal(between), axis=0) > _ROUNDING * output
+    significant &= np.mean(diagonal(between), axis=0) > _ROUNDING * output
     if np.any(significant):
         larger = np.sqrt(np.maximum(power, total) / total)
         return Scatter(power, total, significant, total_root * larger[:, :, None], count, spare)
     return Scatter(power, total, significant, root, count, freedom)
 
 
-def _smooth(
-    omega: Float[np.ndarray, " frequencies"],
-    covariance: Covariances,
-    freedom: float,
-    determined: Bool[np.ndarray, " frequencies"],
-) -> tuple[Levels, Covariances]:
-    """Powers and roots, smooth along frequency except at lines that stand out."""
-    from scipy.special import gammaincinv
-
-    spacing = np.gradient(omega) if omega.size > 1 else omega
-    smooth = smooth_noise(omega, spacing, covariance, np.where(determined, freedom, 0.0))
-    raw = _diagonal(covariance)
-    high = gammaincinv(freedom, 1 - _CHANCE) / freedom
-    power = np.where(raw > high * smooth.power, raw, smooth.power)
-    return power, smooth._replace(power=power).root()
-
-
-def _diagonal(x: Covariances) -> Levels:
-    return np.real(np.diagonal(x, axis1=1, axis2=2))
-
-
-class PeriodicEstimate(NamedTuple):
-    """Responses at the excited lines; nan and a huge error where undetermined."""
-
-    omega: Float[np.ndarray, " frequencies"]  # rad/s
-    response: Complex[np.ndarray, "frequencies outputs inputs"]
-    coherence: Pairs
-    direct_coherence: Pairs
-    multiple_coherence: Levels  # of an output with all inputs
-    errors: ErrorCovariance
-    distortion: Distortion
-    log_noise_covariance: Float[np.ndarray, "frequencies frequencies"]
-    remarks: tuple[Remark, ...]
-
-
 def estimate_periodic(
     records: Sequence[Record],
     omega: Float[np.ndarray, " response"] | None,
     options: Periodic,
-    method: Literal["direct", "joint"],
-) -> PeriodicEstimate:
+    method: Method,
+) -> Estimate:
     """Responses of all outputs to all inputs, by default at all lines that are excited.
 
     With Z the period averages of the references ("joint") or of the inputs ("direct") over the
-    records, G = Y Z^H (U Z^H)^-1. For one input and one record that is Y / U, which is not biased
-    by noise that is fed back to the input either: only its average over the periods remains. Raises
-    `ValueError` for fewer records than inputs, and for an `omega` that is not an excited line.
+    records, G = Y Z^H (U Z^H)^-1. For one input and one record that is Y / U, which fed-back noise
+    does not bias either: only its average over the periods remains.
     """
     inputs, outputs = records[0].inputs.shape[1], records[0].outputs.shape[1]
-    _check(records, inputs, options, method)
-    periods = [record_periods(record, options) for record in records]
-    first = inputs + outputs if method == "joint" else 0
-    instruments, samples = slice(first, first + inputs), options.samples(records[0])
-    harmonics = np.arange(1, (samples - 1) // 2 + 1)  # below the Nyquist frequency
-    grid = 2 * np.pi * harmonics / (samples * records[0].dt)
-    lines = _choose_lines(excited_lines(periods, instruments), grid, omega)
-    averages, omega = np.stack([one.mean[lines] for one in periods], axis=2), grid[lines]
-    u, y, z = averages[:, :inputs], averages[:, inputs : inputs + outputs], averages[:, instruments]
-    fit = instrumental(u, y, z)
-    scatter = estimate_scatter(omega, fit, periods, lines)
-    determined = fit.determined[:, None, None]
-    # Coherence is that of one period: the share of an output that an input explains, and of the
-    # joint estimate the smaller of that and of the repeated share of the input.
-    power = np.einsum("fir,fjr->fij", u, np.conj(u)) / u.shape[2]
-    inverse = np.linalg.inv(np.where(determined, power, np.eye(inputs)))
-    alone = 1 / np.real(np.diagonal(inverse, axis1=1, axis2=2))
-    explained = np.abs(fit.response) ** 2 * alone[:, None, :]
-    left = scatter.noise * scatter.periods + scatter.nonlinear()
-    direct = np.where(determined, explained / (explained + left[:, :, None]), 0.0)
-    jitter = np.real(np.diagonal(pooled(periods)[lines], axis1=1, axis2=2))[:, :inputs]
-    steady = np.minimum(direct, (alone / (alone + jitter))[:, None, :] * determined)
-    together = np.mean(np.abs(np.nan_to_num(fit.response) @ u) ** 2, axis=2)
-    # The noise of each line is independent: as many atoms as inputs at each.
-    kernel = np.einsum("fir,fjr->fij", fit.effect, np.conj(fit.effect))
-    kernel = np.where(determined, kernel, _UNKNOWN**2 * np.eye(inputs))
-    values, vectors = np.linalg.eigh(kernel)
-    effect = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
-    noise = np.where(determined, scatter.root, np.eye(outputs))
-    weight = np.where(fit.determined, scatter.freedom, 1e-9)
-    blank = np.nan if scatter.total is None else 1.0
-    total = scatter.noise if scatter.total is None else scatter.total
-    return PeriodicEstimate(
-        omega,
-        np.where(determined, fit.response, np.nan),
-        steady if method == "joint" else direct,
-        direct,
-        together / (together + scatter.noise * scatter.periods + scatter.nonlinear()),
-        ErrorCovariance(omega, effect, noise, first=inputs * np.arange(omega.size)),
-        Distortion(
-            omega,
-            np.sqrt(np.mean(np.abs(fit.response @ u) ** 2, axis=2)),
-            np.sqrt(scatter.noise),
-            np.sqrt(total) * blank,
-            np.sqrt(scatter.nonlinear()) * blank,
-            scatter.significant,
-            records[0].output_names,
-            len(records),
-        ),
-        smoothed(omega, np.eye(omega.size) / scatter.freedom, weight),
-        _remarks(omega, fit, scatter, periods),
-    )
-
-
-def _check(
-    records: Sequence[Record], inputs: int, options: Periodic, method: Literal["direct", "joint"]
-) -> None:
     sizes = {options.samples(record) for record in records}
     if len(sizes) > 1:
         raise ValueError(
@@ -291,39 +192,87 @@ def _check(
                 "«jq.spectra.LocalPolynomial()»"
             )
         )
-    count = records[0].references.shape[1]
-    if method == "joint" and count != inputs:
-        raise ValueError(
-            f"the joint estimate of {inputs} inputs needs as many external references; the record "
-            f"has {count}: {list(records[0].reference_names)}"
-        )
-
-
-def _choose_lines(
-    lines: Int[np.ndarray, " excited"],
-    grid: Float[np.ndarray, " lines"],
-    omega: Float[np.ndarray, " response"] | None,
-) -> Int[np.ndarray, " chosen"]:
-    """The excited lines, or those of `omega`."""
+    periods = [record_periods(record, options) for record in records]
+    first = inputs + outputs if method == "joint" else 0
+    instruments, samples = slice(first, first + inputs), options.samples(records[0])
+    harmonics = np.arange(1, (samples - 1) // 2 + 1)  # below the Nyquist frequency
+    grid = 2 * np.pi * harmonics / (samples * records[0].dt)
+    lines = excited_lines(periods, instruments)
     if lines.size == 0:
         raise ValueError(
             "no harmonic of the period exceeds the noise in the input. Check the period; for an "
             "excitation that is not periodic use another estimator"
         )
-    if omega is None:
-        return lines
-    nearest = lines[np.argmin(np.abs(grid[lines][None, :] - omega[:, None]), axis=1)]
-    off = np.abs(grid[nearest] - omega) > 1e-6 * omega + 1e-6 * grid[0]
-    if np.any(off):
-        raise ValueError(
-            f"{omega[off][0]:.6g} rad/s is not an excited line; the nearest one is "
-            f"{grid[nearest][off][0]:.6g} rad/s. Without omega all {lines.size} lines are used"
-        )
-    return nearest
+    if omega is not None:
+        excited = lines
+        lines = lines[np.argmin(np.abs(grid[lines][None, :] - omega[:, None]), axis=1)]
+        off = np.abs(grid[lines] - omega) > 1e-6 * omega + 1e-6 * grid[0]
+        if np.any(off):
+            raise ValueError(
+                f"{omega[off][0]:.6g} rad/s is not an excited line; the nearest one is "
+                f"{grid[lines][off][0]:.6g} rad/s. Without omega all {excited.size} lines are used"
+            )
+    averages, omega = np.stack([one.mean[lines] for one in periods], axis=2), grid[lines]
+    u, y, z = averages[:, :inputs], averages[:, inputs : inputs + outputs], averages[:, instruments]
+    # G = Y Z^H (U Z^H)^-1 at each line.
+    cross = u @ adjoint(z)
+    size = np.linalg.norm(u, axis=2)[:, :, None] * np.linalg.norm(z, axis=2)[:, None, :]
+    strength = np.linalg.svd(cross / np.maximum(size, 1e-300), compute_uv=False)
+    fine = strength[:, -1] > _DEPENDENT * np.maximum(strength[:, 0], 1e-300)
+    inverse = np.linalg.inv(np.where(fine[:, None, None], cross, np.eye(inputs)))
+    effect = np.swapaxes(adjoint(z) @ inverse, 1, 2)
+    fit = Fit(u, y, np.swapaxes(effect @ np.swapaxes(y, 1, 2), 1, 2), effect, fine)
+    scatter = estimate_scatter(omega, fit, periods, lines)
+    determined = fit.determined[:, None, None]
+    # Coherence is that of one period: the share of an output that an input explains, and of the
+    # joint estimate the smaller of that and of the repeated share of the input.
+    power = np.einsum("fir,fjr->fij", u, np.conj(u)) / u.shape[2]
+    inverse = np.linalg.inv(np.where(determined, power, np.eye(inputs)))
+    alone = 1 / diagonal(inverse)
+    explained = np.abs(fit.response) ** 2 * alone[:, None, :]
+    left = scatter.noise * scatter.periods + scatter.nonlinear()
+    direct = np.where(determined, explained / (explained + left[:, :, None]), 0.0)
+    jitter = diagonal(pooled(periods)[lines])[:, :inputs]
+    steady = np.minimum(direct, (alone / (alone + jitter))[:, None, :] * determined)
+    together = np.mean(np.abs(np.nan_to_num(fit.response) @ u) ** 2, axis=2)
+    # The noise of each line is independent: as many atoms as inputs at each.
+    kernel = np.einsum("fir,fjr->fij", fit.effect, np.conj(fit.effect))
+    kernel = np.where(determined, kernel, _UNKNOWN**2 * np.eye(inputs))
+    values, vectors = np.linalg.eigh(kernel)
+    effect = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
+    noise = np.where(determined, scatter.root, np.eye(outputs))
+    weight = np.where(fit.determined, scatter.freedom, 1e-9)
+    blank = np.nan if scatter.total is None else 1.0
+    total = scatter.noise if scatter.total is None else scatter.total
+    errors = ErrorCovariance(omega, effect, noise, first=inputs * np.arange(omega.size))
+    response = np.where(determined, fit.response, np.nan)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        relative = np.sqrt(errors.variance() / 2) / np.abs(response)
+    return Estimate(
+        omega,
+        response,
+        steady if method == "joint" else direct,
+        direct,
+        together / (together + left),
+        errors,
+        np.where(np.isfinite(response), relative, np.inf),
+        smoothed(omega, np.eye(omega.size) / scatter.freedom, weight),
+        ft.partial(_remarks, omega, fit, scatter, periods),
+        distortion=Distortion(
+            omega,
+            np.sqrt(np.mean(np.abs(fit.response @ u) ** 2, axis=2)),
+            np.sqrt(scatter.noise),
+            np.sqrt(total) * blank,
+            np.sqrt(scatter.nonlinear()) * blank,
+            scatter.significant,
+            records[0].output_names,
+            len(records),
+        ),
+    )
 
 
 def _remarks(
-    omega: Float[np.ndarray, " frequencies"], fit: Fit, scatter: Scatter, periods: Sequence[Periods]
+    omega: Grid, fit: Fit, scatter: Scatter, periods: Sequence[Periods]
 ) -> tuple[Remark, ...]:
     remarks, lost = [], omega[~fit.determined]
     if lost.size:

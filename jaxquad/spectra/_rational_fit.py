@@ -106,10 +106,8 @@ def columns_of(
 
 
 def descend(equations: Equations, basis: Basis, denominator: Powers, least_gain: float) -> Solved:
-    """Gauss-Newton steps of the denominator, until one gains too little; the rest is linear.
-
-    Source: variable projection (Golub and Pereyra, 1973) as simplified by Kaufman (1975).
-    """
+    """Gauss-Newton steps of the denominator (variable projection: Golub, Pereyra 1973; Kaufman
+    1975)."""
     from scipy.linalg.lapack import dgeqrf  # pyright: ignore[reportAttributeAccessIssue]
 
     solved, span = _project(equations, basis, denominator)
@@ -136,8 +134,8 @@ def descend(equations: Equations, basis: Basis, denominator: Powers, least_gain:
 class _Span(NamedTuple):
     """What rows span, with the Cholesky factor of the products of these rows at unit length.
 
-    That takes a third of the time of a QR decomposition, which there is where the products would
-    lose too many digits.
+    A QR decomposition takes three times as long: it is for products that would lose too many
+    digits.
     """
 
     rows: Rows
@@ -255,8 +253,7 @@ class Orders(NamedTuple):
 def search_orders(equations: Equations, most: int) -> Orders:
     """From 0 upwards, each order from the one below with one pole more.
 
-    Linear estimates of every order are no better places to begin: the noise draws their poles to
-    the stability limit, or beyond it, and the last digit of a record chooses among them.
+    Linear estimates are no better places to begin: the noise draws their poles to instability.
     """
     solved = {0: solve_linear(equations, make_basis(equations, 1), np.ones(1))}
     _climb(equations, solved, most, {}, _THOROUGH, _PATIENCE)
@@ -283,11 +280,7 @@ def _climb(
     thorough: int,
     patience: int,
 ) -> None:
-    """Add orders to those `solved` until too many in a row have no better criterion.
-
-    Each begins with a pole more than the one below, or with that of `starts`, of other weights,
-    where it leaves less.
-    """
+    """Add orders, from a pole more or from `starts`, until too many have no better criterion."""
     order, worse = max(solved), 0
     least = _criterion(equations, solved[order])
     while order < _most(equations, most) and not _is_exact(equations, solved[order]):
@@ -307,11 +300,8 @@ def _climb(
 
 
 def next_order(equations: Equations, orders: Orders, most: int) -> Powers:
-    """Where a descent of the order next above the best one begins: its new pole is at infinity.
-
-    That is where half a sample of a delay is. The best order's where a higher one is too much, or
-    where it leaves rounding alone.
-    """
+    """Where a descent of the order above the best one begins: a pole at infinity, as half a
+    sample's delay."""
     best = orders.solved[orders.best]
     if orders.best >= _most(equations, most) or _is_exact(equations, best):
         return best.denominator
@@ -319,10 +309,7 @@ def next_order(equations: Equations, orders: Orders, most: int) -> Powers:
 
 
 def _with_pole(equations: Equations, solved: Solved) -> Powers:
-    """The denominator with a real pole more, at that of a few places where it leaves least.
-
-    Polynomials over A (1 - x/p) are those of one degree less over A, and a constant over the same.
-    """
+    """The denominator with a real pole more, at that of a few places where it leaves least."""
     size = np.abs(equations.x)
     places = np.geomspace(np.min(size), np.max(size), _PLACES)
     basis = make_basis(equations, len(solved.denominator))

@@ -3,7 +3,7 @@
 import functools as ft
 import itertools
 from collections.abc import Sequence
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -11,21 +11,33 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Complex, Float
 
-from jaxquad._core import one_blas_thread, require_x64
+from jaxquad._core import Message, one_blas_thread, require_x64
 from jaxquad.records import Record
 
-from ._average import average, Averaged, Channels
-from ._checks import check_band, check_compatible, check_excitation, in_hertz
-from ._error_covariance import ErrorCovariance, place_windows, window_products
-from ._estimators import Composite, Welch
-from ._feedback import remarks_on_feedback
-from ._fourier_sums import fourier_sums, Taper
-from ._frequency_response import FrequencyResponse
-from ._leakage import cross_products, shows_leakage, Slopes
-from ._linearity import remarks_on_linearity
-from ._noise import covariance_of_windows, smoothed
-from ._remarks import Remark, Remarks
-from ._windows import coefficients, lattice_windows, Layout, segment_starts
+from ._average import average, Averaged, Channels, Segments
+from ._error_covariance import ErrorCovariance, place_windows
+from ._estimators import (
+    adjoint,
+    check_band,
+    check_compatible,
+    check_excitation,
+    Composite,
+    Grid,
+    in_hertz,
+    Method,
+    Remark,
+    Welch,
+)
+from ._fourier_sums import (
+    coefficients,
+    fourier_sums,
+    lattice_windows,
+    Layout,
+    segment_starts,
+    Taper,
+)
+from ._frequency_response import Estimate
+from ._noise import covariance_of_windows, shows_leakage, Slopes, smoothed
 
 
 _ROUNDING = 1e-14  # of a Fourier sum, relative to the largest value summed
@@ -33,28 +45,10 @@ _CORRELATED = 0.5  # average coherence of inputs above which Tischler & Remple, 
 _LOST = 0.9999
 _LEAKED = 3.0  # bias over random error, averaged over a third of an octave, that is remarked
 _AVERAGED = 0.2  # in ln(omega)
-_CYCLES = 2.0  # in a window, below which leakage outweighs what more averages gain
 _FEW = (
     "only {count:.1f} independent windows: the coherence is near 1 for any signals, and the error "
     "bars are rough. Record longer, or use a shorter window"
 )
-
-Grid = Float[np.ndarray, " frequencies"]
-Pairs = Float[np.ndarray, "frequencies outputs inputs"]
-Method = Literal["direct", "joint"]
-
-
-class Segments(NamedTuple):
-    """Transforms of one set of windows for each length, in absolute phase.
-
-    Channels are in the order of `Record.names`: inputs, outputs, references. `groups` are the
-    lengths and starts in samples, of the records one after the other, with gaps wider than any
-    window. `slopes` are those behind the derivatives of the windows.
-    """
-
-    transforms: tuple[Complex[np.ndarray, "frequencies windows channels"], ...]
-    slopes: tuple[Slopes, ...]  # empty where they are not needed, or nothing follows from them
-    groups: Layout
 
 
 def transform_records(
@@ -63,21 +57,32 @@ def transform_records(
     """Transform all channels of all records; no window spans two records.
 
     With two `derivatives`, behind those of the windows too, from the first length on whose windows
-    can tell leakage from noise: the first on all channels but references, the second on inputs.
+    can tell leakage from noise: the first on inputs and outputs, the second on inputs.
     """
     require_x64("a frequency response")
-    layouts, shape = _layouts(records, omega, members), members[0].shape
-    inputs, outputs = len(records[0].input_names), len(records[0].output_names)
+    first, welch, dt = records[0], members[0], records[0].dt
+    # A single window keeps its length to the sample; several share blocks of samples.
+    lengths = tuple(member.length(records) for member in members)
+    samples = [record.samples - welch.integrators for record in records]
+    if len(members) == 1:
+        n, overlap = lengths[0], welch.overlap
+        layouts = [((n, segment_starts(count, n, overlap)),) for count in samples]
+    else:
+        options = welch.overlap, float(np.max(omega)) * dt
+        lengths = tuple(n for n, _ in lattice_windows(min(samples), lengths, *options))
+        layouts = [lattice_windows(count, lengths, *options) for count in samples]
+    inputs, outputs = len(first.input_names), len(first.output_names)
     counts = [sum(len(mine) for _, mine in groups) for groups in zip(*layouts, strict=True)]
     enough = [shows_leakage(count, inputs) for count in counts]
-    first = enough.index(True) if any(enough) else len(counts)
-    slopes = Taper(f"{shape}'", inputs + outputs, first), Taper(f"{shape}''", inputs, first)
-    tapers = Taper(shape, len(records[0].names)), *slopes[:derivatives]
+    start = enough.index(True) if any(enough) else len(counts)
+    shape = welch.shape
+    slopes = Taper(f"{shape}'", inputs + outputs, start), Taper(f"{shape}''", inputs, start)
+    tapers = Taper(shape, len(first.names)), *slopes[:derivatives]
     parts, starts, origin = [], [[] for _ in members], 0
     for record, layout in zip(records, layouts, strict=True):
-        parts.append(_transform_record(record, omega, members[0], layout, origin, tapers))
+        parts.append(_transform_record(record, omega, welch, layout, origin, tapers))
         for mine, (_, local) in zip(starts, layout, strict=True):
-            mine += [origin + start for start in local]
+            mine += [origin + place for place in local]
         origin += record.samples + max(length for length, _ in layout)
     groups = tuple((n, tuple(mine)) for (n, _), mine in zip(layouts[0], starts, strict=True))
 
@@ -95,22 +100,6 @@ def transform_records(
     return Segments(joined, (none,) * (len(joined) - len(derived)) + derived, groups)
 
 
-def _layouts(records: Sequence[Record], omega: Grid, members: Sequence[Welch]) -> list[Layout]:
-    """Lengths and starts for each record.
-
-    A single window keeps its length to the sample; several take lengths that share blocks of
-    samples, because their exact lengths do not matter.
-    """
-    lengths = tuple(member.length(records) for member in members)
-    samples = [record.samples - members[0].integrators for record in records]
-    overlap = members[0].overlap
-    if len(members) == 1:
-        return [((lengths[0], segment_starts(n, lengths[0], overlap)),) for n in samples]
-    highest = float(np.max(omega)) * records[0].dt
-    shared = tuple(n for n, _ in lattice_windows(min(samples), lengths, overlap, highest))
-    return [lattice_windows(n, shared, overlap, highest) for n in samples]
-
-
 def _transform_record(
     record: Record,
     omega: Grid,
@@ -120,7 +109,7 @@ def _transform_record(
     tapers: tuple[Taper, ...],
 ) -> list[list[Complex[np.ndarray, "frequencies _ _"]]]:
     """By taper and then by length; the outputs differenced, and earlier by the delay."""
-    n, late = welch.integrators, welch.delay_samples(record)
+    n, late = welch.integrators, int(round(welch.delay / record.dt))
     outputs = np.diff(record.outputs, n, axis=0)
     if late:
         outputs = np.concatenate([outputs[late:], np.repeat(outputs[-1:], late, axis=0)])
@@ -145,11 +134,21 @@ def frequencies_for(
     welch: Welch,
 ) -> Grid:
     """`omega` or the default of `welch`, rad/s; `ValueError` where the window is too short."""
+    length, dt = welch.length(records), records[0].dt
+    seconds = length * dt
     if omega is None:
-        return welch.default_omega(records)
+        # Below three cycles in a window, leakage exceeds the random error of a good record.
+        if length <= 30:
+            raise ValueError(
+                Message(
+                    f"a window of {length} samples is too short for frequencies up to a tenth of "
+                    "the sample rate: use a longer window («window_length=»)«, or give the "
+                    "frequencies (omega=)»"
+                )
+            )
+        return np.geomspace(6 * np.pi / seconds, 2 * np.pi / (10 * dt), 100)
     omega = np.atleast_1d(np.asarray(omega, dtype=float))
-    check_band(omega, records[0].dt)
-    seconds = welch.length(records) * records[0].dt
+    check_band(omega, dt)
     lowest = 2 * np.pi / seconds
     if omega[0] < 0.999 * lowest:
         raise ValueError(
@@ -160,42 +159,10 @@ def frequencies_for(
     return omega
 
 
-def _check_windows(
-    independent: Sequence[float],
-    segments: Segments,
-    channels: Channels,
-    sums: Complex[np.ndarray, "groups frequencies channels channels"],
-    omega: Grid,
-    records: Sequence[Record],
-    welch: Welch,
-) -> None:
-    """Raise `ValueError` for too few windows, a constant channel, or rounding errors only."""
-    for count, (_, starts) in zip(independent, segments.groups, strict=True):
-        if len(starts) <= channels.inputs or count < channels.inputs:
-            raise ValueError(
-                f"{count:.1f} independent windows are too few for {channels.inputs} inputs: use "
-                f"a window shorter than 1/{channels.inputs + 2} of the record, or record longer"
-            )
-    # Mean power of the inputs and of the instruments, in the longest windows.
-    power = np.real(np.diagonal(sums[0], axis1=1, axis2=2)).T / len(segments.groups[0][1])
-    first, last = channels.inputs, channels.inputs + channels.outputs
-    power = np.concatenate([power[:first], power[last : last + channels.instruments]])
-    names = records[0].input_names + records[0].reference_names[: channels.instruments]
-    largest = check_excitation(records, "joint" if channels.instruments else "direct")
-    gain = coefficients(welch.shape)[0] * welch.length(records)
-    for name, level in zip(names, np.sqrt(power), strict=False):
-        lost = np.flatnonzero(~(level > _ROUNDING * gain * largest[records[0].names.index(name)]))
-        if lost.size:
-            raise ValueError(
-                f"no excitation at {in_hertz(omega[lost[:1]])}: the spectrum of {name!r} is zero "
-                "there. Keep the frequencies within the band that was excited"
-            )
-
-
 @one_blas_thread()
 def average_windows(
     records: Sequence[Record], omega: Grid | None, spectra: Welch | Composite, method: Method
-) -> FrequencyResponse:
+) -> Estimate:
     """Response by averages over tapered windows of one or several lengths."""
     single = isinstance(spectra, Welch)
     members = (spectra,) if single else spectra.windowed(records, omega)
@@ -204,89 +171,59 @@ def average_windows(
     first, dt, groups = records[0], records[0].dt, segments.groups
     instruments = len(first.reference_names) if method == "joint" else 0
     channels = Channels(len(first.input_names), len(first.output_names), instruments)
-    independent = _independent(records, groups)
-    sums = np.stack([cross_products(part) for part in segments.transforms])
-    _check_windows(independent, segments, channels, sums, omega, records, welch)
     lengths = [length for length, _ in groups]
-    level, cosine = coefficients(welch.shape)
-    energy = level**2 + cosine**2 / 2
-    resolving = np.array([np.inf, *lengths[1:]])  # the longest window is used everywhere
-    averaged = average(
-        segments.transforms,
-        sums,
-        segments.slopes,
-        channels,
-        omega,
-        window_products(groups, welch.shape),
-        np.array([2 * dt / (energy * length) for length in lengths]),  # to one-sided densities
-        (omega * dt)[None, :] * resolving[:, None] >= 2 * np.pi * _CYCLES,
-        np.maximum(np.array(independent) - channels.inputs + 1, 0.5),
-    )
+    independent = sum(record.samples for record in records) / np.array(lengths)  # n_d
+    sums = np.stack([adjoint(part) @ part for part in segments.transforms])
+    for count, (_, starts) in zip(independent, groups, strict=True):
+        if len(starts) <= channels.inputs or count < channels.inputs:
+            raise ValueError(
+                f"{count:.1f} independent windows are too few for {channels.inputs} inputs: use "
+                f"a window shorter than 1/{channels.inputs + 2} of the record, or record longer"
+            )
+    # Mean power of the inputs and of the instruments, in the longest windows.
+    power = np.real(np.diagonal(sums[0], axis1=1, axis2=2)) / len(groups[0][1])
+    largest = check_excitation(records, method)
+    for name in first.input_names + first.reference_names[:instruments]:
+        place = first.names.index(name)
+        least = _ROUNDING * coefficients(welch.shape)[0] * welch.length(records) * largest[place]
+        lost = np.flatnonzero(~(np.sqrt(power[:, place]) > least))
+        if lost.size:
+            raise ValueError(
+                f"no excitation at {in_hertz(omega[lost[:1]])}: the spectrum of {name!r} is zero "
+                "there. Keep the frequencies within the band that was excited"
+            )
+    options = channels, omega, dt, welch.shape, independent
+    averaged = average(segments, sums, *options)
     weights = np.mean(averaged.share, axis=(1, 2))
     freedom = np.mean(averaged.freedom, axis=1)
     levels = weights / np.sqrt(freedom)
     noise = covariance_of_windows(omega * dt, levels, welch.shape, tuple(lengths))
     windows = place_windows(groups, welch.shape, dt, omega[-1] - omega[0])
     counts = tuple(len(starts) for _, starts in groups)
-    # Each array once, in one go.
-    fields = (omega, averaged.response, averaged.coherence, averaged.random_error,
-              averaged.direct_coherence, averaged.multiple_coherence)  # fmt: skip
-    on_device = jax.device_put({id(field): field for field in fields})
-    grid, response, coherence, random_error, direct, multiple = (
-        on_device[id(field)] for field in fields
+    errors = ErrorCovariance(
+        omega, averaged.effect, averaged.noise, averaged.share, windows, counts
     )
-    return FrequencyResponse(
-        omega=grid,
-        response=response,
-        coherence=coherence,
-        random_error=random_error,
-        errors=ErrorCovariance(
-            omega, averaged.effect, averaged.noise, averaged.share, windows, counts
-        ),
-        direct_coherence=direct,
-        multiple_coherence=multiple,
-        method=method,
-        input_names=first.input_names,
-        output_names=first.output_names,
-        remarks=Remarks(ft.partial(_remarks, records, omega, groups, averaged, method)),
-        integrators=welch.integrators,
-        log_noise_covariance=smoothed(omega, noise, np.sum(weights * freedom, axis=1)),
+    return Estimate(
+        omega,
+        averaged.response,
+        averaged.coherence,
+        averaged.direct_coherence,
+        averaged.multiple_coherence,
+        errors,
+        averaged.random_error,
+        smoothed(omega, noise, np.sum(weights * freedom, axis=1)),
+        ft.partial(_remarks, first, omega, averaged, float(np.max(independent))),
         resolution=2 * np.pi / (lengths[0] * dt),
-        dt=dt,
-        hold=first.hold,
-        fed_back=bool(first.reference_names),
-        input_units=first.input_units,
-        output_units=first.output_units,
     )
-
-
-def _independent(records: Sequence[Record], groups: Layout) -> list[float]:
-    """Windows that do not overlap, for each length (n_d)."""
-    return [sum(record.samples for record in records) / length for length, _ in groups]
 
 
 def _remarks(
-    records: Sequence[Record], omega: Grid, groups: Layout, averaged: Averaged, method: Method
+    record: Record, omega: Grid, averaged: Averaged, independent: float
 ) -> tuple[Remark, ...]:
-    first, most = records[0], max(_independent(records, groups))
-    response, coherence, error = averaged.response, averaged.coherence, averaged.random_error
-    names, direct = (first.output_names, first.input_names), averaged.direct_coherence
-    measured = omega, response, error, coherence, direct
-    remarks = remarks_on_feedback(records, method, *measured, names)
-    remarks += remarks_on_linearity(records, omega, response, coherence, method)
-    remarks += _remarks_on_inputs(omega, 1 - np.nan_to_num(averaged.alone), first.input_names)
-    remarks += _remarks_on_leakage(omega, averaged.leakage(), error, names)
-    return remarks + ((Remark(_FEW.format(count=most), kind="few windows"),) if most < 3 else ())
-
-
-def _remarks_on_inputs(
-    omega: Grid, coherence: Float[np.ndarray, "frequencies inputs"], names: Sequence[str]
-) -> tuple[Remark, ...]:
-    """`coherence` is the multiple coherence of each input with all others."""
-    if len(names) < 2:
-        return ()
-    remarks = []
-    for i, name in enumerate(names):
+    """On inputs that are alike, on leakage, and on few windows."""
+    remarks, names = [], record.input_names
+    coherence = 1 - np.nan_to_num(averaged.alone)  # of each input with all others
+    for i, name in enumerate(names if len(names) > 1 else ()):
         lost = coherence[:, i] > _LOST
         if np.any(lost):
             text = (
@@ -302,22 +239,15 @@ def _remarks_on_inputs(
                 f"responses are larger. Excite the inputs independently"
             )
             remarks.append(Remark(text, kind="correlated inputs"))
-    return tuple(remarks)
-
-
-def _remarks_on_leakage(
-    omega: Grid,
-    leakage: Float[np.ndarray, "2 frequencies outputs inputs"],
-    error: Pairs,
-    names: tuple[Sequence[str], Sequence[str]],
-) -> tuple[Remark, ...]:
-    """Remarks on pairs whose response leakage biases, clearly and beyond the random error."""
+    # Pairs whose response leakage biases, clearly and beyond the random error.
     kernel = np.exp(-0.5 * (np.log(omega[:, None] / omega) / _AVERAGED) ** 2)
-    bias, remarks = leakage[0], []
-    least = np.maximum(leakage[1], error)
+    bias, doubt = averaged.leakage()
+    least = np.maximum(doubt, averaged.random_error)
     with np.errstate(invalid="ignore"):
         ratio = np.where(np.isfinite(least) & np.isfinite(bias), bias / least, 0.0)
-    for (o, output), (i, source) in itertools.product(*map(enumerate, names)):
+    for (o, output), (i, source) in itertools.product(
+        enumerate(record.output_names), enumerate(names)
+    ):
         leaked = kernel @ ratio[:, o, i] ** 2 > _LEAKED**2 * np.sum(kernel, axis=1)
         if np.any(leaked):
             text = (
@@ -327,6 +257,8 @@ def _remarks_on_leakage(
                 "window, or «integrators=» where the plant integrates"
             )
             remarks.append(Remark(text, omega[leaked], (output, source), "leakage"))
+    if independent < 3:
+        remarks.append(Remark(_FEW.format(count=independent), kind="few windows"))
     return tuple(remarks)
 
 
@@ -396,4 +328,99 @@ def spectral_density(
     energy = length * (level**2 + cosine**2 / 2)
     scale = 2 * records[0].dt / (energy * transforms.shape[1])
     put = jax.device_put
-    return SpectralDensity(put(omega), put(cross_products(transforms) * scale), records[0].names)
+    return SpectralDensity(
+        put(omega), put(adjoint(transforms) @ transforms * scale), records[0].names
+    )
+
+
+_SECONDS = 0.5  # of a window: motors change their speed little meanwhile
+_SHORTEST, _LONGEST = 64, 4096  # samples of a window
+_MOST = 200  # windows that are looked at
+_STANDS = 13.0  # dB above the floor: noise alone gets there once in a million
+_ALSO = 8.0  # dB, of a harmonic, in the median of all windows
+_OFTEN = 0.5  # share of the windows
+
+
+class SpectralLine(NamedTuple):
+    """The strongest narrow line of a channel, as `find_line` returns it.
+
+    **Attributes:**
+
+    - `omega`: rad/s, median of the windows in which it stands out.
+    - `low`, `high`: rad/s, between which it lies in 90 % of these windows.
+    - `height`: dB above its surroundings, median.
+    - `share`: of the windows in which it stands out.
+    - `harmonics`: which multiples of it stand out, too.
+    - `follows`: rank correlation with another channel, -1 to 1; nan without one.
+    """
+
+    omega: float
+    low: float
+    high: float
+    height: float
+    share: float
+    harmonics: tuple[int, ...]
+    follows: float
+
+
+def find_line(
+    record: Record, channel: str, *, above: float = 0.0, over: str | None = None
+) -> SpectralLine | None:
+    """Find the strongest narrow line in the spectrum of a channel.
+
+    In each window of half a second the line is the frequency that is highest above the running
+    median of its surroundings. Motors and propellers make lines with harmonics that follow the
+    throttle; a resonance of the frame stays where it is.
+
+    **Arguments:**
+
+    - `record`: what was flown.
+    - `channel`: whose spectrum.
+    - `above`: rad/s, below which no line is looked for, such as the top of the identified band.
+    - `over`: a channel that the line may follow, such as the throttle.
+
+    **Returns:** a `SpectralLine`; None where none stands 13 dB out of half of the windows.
+    """
+    size = int(2 ** np.round(np.log2(np.clip(_SECONDS / record.dt, _SHORTEST, _LONGEST))))
+    if size > record.samples:
+        return None
+    starts = np.arange(0, record.samples - size + 1, size // 2)
+    places = starts[:: -(-starts.size // _MOST), None] + np.arange(size)
+    omega = 2 * np.pi * np.fft.rfftfreq(size, record.dt)
+    parts = record.channel(channel)[places]
+    spectra = np.fft.rfft((parts - parts.mean(axis=1, keepdims=True)) * np.hanning(size), axis=1)
+    level = 10 * np.log10(np.maximum(np.abs(spectra) ** 2, 1e-300))
+    reach = max(8, size // 32)
+    padded = np.pad(level, ((0, 0), (reach, reach)), mode="reflect")
+    around = np.lib.stride_tricks.sliding_window_view(padded, 2 * reach + 1, axis=1)
+    excess = level - np.median(around, axis=2)
+    excess[:, :4] = -np.inf  # the mean, and what a taper makes of a trend
+    searched = np.where(omega > above, excess, -np.inf)
+    bins = np.argmax(searched, axis=1)
+    heights = np.max(searched, axis=1)
+    stands = heights > _STANDS
+    if np.mean(stands) < _OFTEN:
+        return None
+    lines = omega[bins[stands]]
+    low, middle, high = np.percentile(lines, [5, 50, 95])
+    follows = np.nan
+    if over is not None:
+        levels = record.channel(over)[places].mean(axis=1)[stands]
+        follows = 0.0
+        if np.ptp(lines) and np.ptp(levels):  # Spearman's, without a correction for ties
+            ranks = [
+                np.argsort(np.argsort(x, kind="stable"), kind="stable") for x in (lines, levels)
+            ]
+            follows = float(np.asarray(np.corrcoef(ranks)).flat[1])
+    harmonics, excess, bins = [], excess[stands], bins[stands]
+    for multiple in (2, 3, 4):
+        near = multiple * bins[:, None] + np.arange(-multiple, multiple + 1)
+        if np.median(near[:, -1]) >= excess.shape[1]:
+            break
+        near = np.minimum(near, excess.shape[1] - 1)
+        level = excess[np.arange(len(bins))[:, None], near].max(axis=1)
+        harmonics += [multiple] if np.median(level) > _ALSO else []
+    return SpectralLine(
+        float(middle), float(low), float(high), float(np.median(heights[stands])),
+        float(np.mean(stands)), tuple(harmonics), float(follows),
+    )  # fmt: skip

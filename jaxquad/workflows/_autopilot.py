@@ -220,7 +220,8 @@ def _tune_adrc(
         throttle = {"throttle": dict(proposal.setup.throttle)}
         records = list(read_records(path, record, further_inputs=throttle))
     announce("the gain over the throttle")
-    band = None if settings.band is None else tuple(2 * np.pi * x for x in settings.band)
+    low, high = settings.band or (0.0, 0.0)
+    band = None if settings.band is None else (2 * np.pi * low, 2 * np.pi * high)
     unsure = lambda error: dataclasses.replace(
         result, verdict=Message(f"this log cannot tell: {marked_text(error)}")
     )

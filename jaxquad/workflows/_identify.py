@@ -7,38 +7,15 @@ from typing import TypeVar
 
 import numpy as np
 
+import jaxquad.identify as fitting
+import jaxquad.spectra as spectra
 from jaxquad._core import announce, as_messages
-from jaxquad.identify import (
-    behind_filters,
-    CoherenceWeighted,
-    Fit,
-    fit,
-    fit_damped,
-    fit_transfer_function,
-    guess_lagged_integrator,
-    KnownFilter,
-    MaximumLikelihood,
-    MISFIT,
-    usable,
-    Verification,
-    verify,
-    WIDER_BAND,
-    without_filters,
-)
+from jaxquad.identify import Fit, fit, KnownFilter
 from jaxquad.models import LaggedIntegrator, parameter_units, TransferFunction
 from jaxquad.records import Proposal, Record
 from jaxquad.records.firmware import axis_of_rate
 from jaxquad.report import reason_of
-from jaxquad.spectra import (
-    Composite,
-    DOMINATED,
-    EARLY,
-    frequency_response,
-    FrequencyResponse,
-    JointInputOutput,
-    LocalPolynomial,
-    Welch,
-)
+from jaxquad.spectra import FrequencyResponse
 
 from ._identification import EXPLAINED, HALVES, Identification
 from ._log import mix_of, open_again, open_logs, OpenedLogs, read_records
@@ -47,7 +24,7 @@ from ._settings import IdentifySettings, in_options
 
 
 T = TypeVar("T")
-_COSTS = {"ml": MaximumLikelihood(), "coherence": CoherenceWeighted()}
+_COSTS = {"ml": fitting.MaximumLikelihood(), "coherence": fitting.CoherenceWeighted()}
 _POINTS = 100  # frequencies, log-spaced over the band
 _LONGEST = 0.02  # of the record: a longer delay is no delay of the vehicle
 _NEAR = 1.5  # samples: a delay that is taken out as precisely as that need not be better
@@ -131,7 +108,8 @@ def identify_opened(opened: OpenedLogs) -> Identification:
             settings, start=settings.verify_start, stop=settings.verify_stop, segments=(),
             reference=None,
         )  # fmt: skip
-        check = verify(fit, behind_filters(_longest(Path(settings.verify), other), filters))
+        record = _longest(Path(settings.verify), other)
+        check = fitting.verify(fit, fitting.behind_filters(record, filters))
 
     def attempt(title: str, compute: Callable[[], T]) -> T | None:
         try:
@@ -146,7 +124,7 @@ def identify_opened(opened: OpenedLogs) -> Identification:
     bands = explanation = None
     if fit.verdict.fitted and fit.verdict.kind != "no minimum":
         bands = attempt(HALVES, fit.bands)
-        if settings.explain and fit.chi_squared > MISFIT**2:
+        if settings.explain and fit.chi_squared > fitting.MISFIT**2:
             explanation = attempt(EXPLAINED, fit.explain)
     if settings.reference:
         announce("fit to the direct response")
@@ -203,7 +181,7 @@ def _estimate(
         frf = _respond(opened, method, filters, delay)
         fit = _fit_response(frf, settings)
     if vehicle and isinstance(fit.model, LaggedIntegrator) and settings.integrators:
-        fit = fit_damped(fit)
+        fit = fitting.fit_damped(fit)
     announce("fits to parts of the band")
     span, parts, changes = _fit_parts(fit, frf, settings)
     fit = finish_fit(fit, settings, records[0], changes, remedies)
@@ -221,19 +199,19 @@ def _respond(
     settings = opened.settings
     shape = {"integrators": settings.integrators, "delay": delay}
     if settings.window is not None or settings.estimator == "welch":
-        estimator = Welch(settings.window, **shape)
+        estimator = spectra.Welch(settings.window, **shape)
     elif settings.estimator == "composite":
-        estimator = Composite(**shape)
+        estimator = spectra.Composite(**shape)
     else:
-        estimator = LocalPolynomial(**shape, **({"global_order": 0} if quick else {}))
+        estimator = spectra.LocalPolynomial(**shape, global_order=0 if quick else 12)
     if method == "joint":
-        estimator = JointInputOutput(estimator)
+        estimator = spectra.JointInputOutput(estimator)
     band = settings.band_rad
     if settings.band is not None:
         band = 2 * np.pi * settings.band[0], 2 * np.pi * settings.band[1]
     omega = None if band is None else np.geomspace(*band, _POINTS)
-    frf = frequency_response(list(opened.records), omega, estimator=estimator)
-    return without_filters(frf, filters)
+    frf = spectra.frequency_response(list(opened.records), omega, estimator=estimator)
+    return fitting.without_filters(frf, filters)
 
 
 def _delay_of(fit: Fit, records: tuple[Record, ...]) -> float:
@@ -250,14 +228,14 @@ def _fit_response(frf: FrequencyResponse, settings: IdentifySettings) -> Fit:
     """The model of the settings, or K e^(-delay s) / (s^n (lag s + 1)), fitted to a response."""
     cost, n = _COSTS[settings.cost], settings.integrators
     if settings.poles is not None:
-        return fit_transfer_function(
+        return fitting.fit_transfer_function(
             frf, zeros=settings.zeros, poles=settings.poles + n, integrators=n,
             delay="free" if settings.delay else 0.0, cost=cost,
         )  # fmt: skip
     free = ["gain", *(["lag"] if settings.lag else []), *(["delay"] if settings.delay else [])]
     if not np.any(np.isfinite(frf.response)):  # the fit says so
         return fit(LaggedIntegrator(1.0, 0.1, 0.1, n), frf, free=free, cost=cost)
-    guess = guess_lagged_integrator(frf, n)
+    guess = fitting.guess_lagged_integrator(frf, n)
     total = np.asarray(guess.lag) + np.asarray(guess.delay)  # what is fixed at 0 adds to the other
     lag = 0.0 if not settings.lag else guess.lag if settings.delay else total
     delay = 0.0 if not settings.delay else guess.delay if settings.lag else total
@@ -273,11 +251,11 @@ def _fit_parts(
     and for a response that feedback dominates or whose phase rises: no part of it would be better.
     """
     small = not full.chi_squared >= _MISFIT**2 or not isinstance(full.model, LaggedIntegrator)
-    no_plant = any(remark.kind in (DOMINATED, EARLY) for remark in frf.remarks)
+    no_plant = any(remark.kind in (spectra.DOMINATED, spectra.EARLY) for remark in frf.remarks)
     if not full.verdict.fitted or small or no_plant:
         return "", {}, []
     hertz = lambda omega: f"{omega / (2 * np.pi):.3g} Hz"
-    used = np.asarray(frf.omega)[usable(frf, None, 0.6)[:, 0, 0]]
+    used = np.asarray(frf.omega)[fitting.usable(frf, None, 0.6)[:, 0, 0]]
     low, first, second, high = np.geomspace(used[0], used[-1], 4).tolist()
     span = f"{low:.3g} .. {high:.3g} rad/s ({low / (2 * np.pi):.3g} .. {hertz(high)})"
     bands = {
@@ -334,15 +312,15 @@ def finish_fit(
 def _options_for(fit: Fit, settings: IdentifySettings) -> list[str]:
     """What may determine the parameters of a fit that are open, as options."""
     kind, remarked = fit.verdict.kind, {remark.kind for remark in fit.remarks}
-    wider = [remedy for remedy in fit.verdict.remedies if remedy.kind == WIDER_BAND]
+    wider = [remedy for remedy in fit.verdict.remedies if remedy.kind == fitting.WIDER_BAND]
     excite = in_options(wider[0]) if wider else _EXCITE
     if kind == "too few points":
         return [excite, "use longer windows (--estimator welch --window S)"]
-    if kind == "no model" and DOMINATED in remarked:
+    if kind == "no model" and spectra.DOMINATED in remarked:
         name = [] if settings.reference else ["name the external reference (--reference)"]
         record = "excite the axis (jaxquad design sweep), and record what excites it as the "
         return [*name, f"{record}reference"]
-    if kind == "no model" and EARLY in remarked:
+    if kind == "no model" and spectra.EARLY in remarked:
         return ["exchange --input and --output if they are swapped, or correct time stamps"]
     if kind == "no model":
         return [
@@ -365,7 +343,7 @@ def verify_result(
     result: str | Path | StoredResult,
     path: str | Path,
     changes: Mapping[str, object] | None = None,
-) -> Verification:
+) -> fitting.Verification:
     """Simulate an identified model on another record, and compare.
 
     **Arguments:**
@@ -389,4 +367,4 @@ def verify_result(
     if settings.band is not None:
         band = 2 * np.pi * settings.band[0], 2 * np.pi * settings.band[1]
     record = _longest(Path(path), settings)
-    return verify(model, behind_filters(record, stored.filters), band=band)
+    return fitting.verify(model, fitting.behind_filters(record, stored.filters), band=band)

@@ -74,10 +74,10 @@ class Settings:
             texts[key] = flag, " ".join(text.split()), group
         options = {}
         for one in dataclasses.fields(cls):  # pyright: ignore[reportArgumentType]
-            if hasattr(one.type, "__metadata__"):
+            for kind in getattr(one.type, "__metadata__", ()):
                 flag, text, group = texts.get(one.name, ("", "", ""))
                 flag = flag or f"--{one.name.replace('_', '-')}"
-                options[one.name] = Option(one.type.__metadata__[0], text, group, flag)
+                options[one.name] = Option(kind, text, group, flag)
         return options
 
     @classmethod
@@ -92,16 +92,12 @@ class Settings:
         Raises SettingsError for an unknown key, with the most similar known one, for a required
         key that is missing, and for values that cannot be.
         """
+        fields = dataclasses.fields(cls)  # pyright: ignore[reportArgumentType]
+        required = [x.name for x in fields if x.default is x.default_factory is _REQUIRED]
         try:
             check_keys(content, cls.options())
-            missing = [
-                field.name
-                for field in dataclasses.fields(cls)  # pyright: ignore[reportArgumentType]
-                if field.default is field.default_factory is _REQUIRED and field.name not in content
-            ]
-            if missing:
-                keys = " and ".join(f"`{key}`" for key in missing)
-                raise SettingsError(f"{keys} must be given")
+            if missing := [f"`{key}`" for key in required if key not in content]:
+                raise SettingsError(f"{' and '.join(missing)} must be given")
             return cls(**content)
         except SettingsError as error:
             raise within_file(where, error) from error
@@ -216,8 +212,9 @@ def _one_of(*choices: str) -> Kind:
 
 
 def _is_number(value: object) -> TypeGuard[float | int]:
-    is_real = isinstance(value, int | float) and not isinstance(value, bool)
-    return is_real and math.isfinite(value)
+    if not isinstance(value, int | float) or isinstance(value, bool):
+        return False
+    return math.isfinite(value)
 
 
 def _is_list(value: object) -> TypeGuard[Sequence[Any]]:
@@ -280,12 +277,11 @@ def _band(value: object) -> Pair:
 def _segments(value: object) -> tuple[Pair, ...]:
     if not _is_list(value):
         raise ValueError("give a list of [start, stop], in s")
-    spans = []
-    for part in value:
-        if (span := _span(part)) is None:
+    spans = [_span(part) for part in value]
+    for part, span in zip(value, spans, strict=True):
+        if span is None:
             raise ValueError(f"{part!r} is no START:STOP in s: write 22:30.5, the start first")
-        spans.append(span)
-    return tuple(spans)
+    return tuple(filter(None, spans))
 
 
 def _by_name(value: object, advice: str) -> list[tuple[object, Any, Any]]:

@@ -6,6 +6,7 @@ from pathlib import Path
 import jax
 import numpy as np
 
+import jaxquad.tuning as tuning
 from jaxquad._core import announce, plain_content
 from jaxquad.control import certainty_equivalence, LADRC, ScheduledLADRC
 from jaxquad.ensembles import Ensemble, LogUniform, Normal, Posterior
@@ -14,17 +15,7 @@ from jaxquad.identify import UndeterminedError
 from jaxquad.loops import Loop
 from jaxquad.report import provenance, write_json
 from jaxquad.simulation import Pulse, Saturation, Scenario, scenario, Step
-from jaxquad.tuning import (
-    describe_controller,
-    KNOWN_INERTIA,
-    Limit,
-    Objective,
-    peers,
-    Penalty,
-    tune as tune_controller,
-    Tuned,
-    worst_flights,
-)
+from jaxquad.tuning import Tuned
 
 from ._identification import Identification
 from ._identify import identify_fit
@@ -66,7 +57,7 @@ class Tuning:
             "holds": tuned.holds,
             "verdicts": [verdict._asdict() for verdict in tuned.verdicts],
             "values": tuned.values,
-            "controller": describe_controller(tuned.controller) | {"dt": self.loop.dt},
+            "controller": tuning.describe_controller(tuned.controller) | {"dt": self.loop.dt},
             "cost": tuned.cost,
             "converged": tuned.converged,
             "bounds": [bound._asdict() for bound in tuned.bounds],
@@ -89,7 +80,7 @@ class Tuning:
         origin = provenance(*axis.paths, settings=settings)
         write_json(folder / "tuned.json", self.content() | {"provenance": origin.content()})
         write_c_header(folder / f"{name}.h", tuned.controller, name=name, axes=1)
-        flights = worst_flights(tuned, self.loop, self.ensemble, self.flight)
+        flights = tuning.worst_flights(tuned, self.loop, self.ensemble, self.flight)
         from jaxquad.plot import certificate_figure, convergence_figure, flight, headless
         from jaxquad.report import write_report  # here: with them comes matplotlib
 
@@ -185,17 +176,17 @@ def tune(
     )  # fmt: skip
     # That of docs/tuning.md, whose knee of 20 V^2/s belongs to a limit of 10 V.
     penalties = (
-        Penalty("activity_rate", knee=_ACTIVITY * settings.limit**2, weight=2.0),
-        Penalty("sensitivity_peak", knee=2.0, weight=3.0),
-        Penalty("abscissa", knee=-0.5, weight=5.0),
+        tuning.Penalty("activity_rate", knee=_ACTIVITY * settings.limit**2, weight=2.0),
+        tuning.Penalty("sensitivity_peak", knee=2.0, weight=3.0),
+        tuning.Penalty("abscissa", knee=-0.5, weight=5.0),
     )
-    objective = Objective(penalties=penalties, events=(0.0, pulse, back), load_start=pulse)
-    tuned = tune_controller(
+    objective = tuning.Objective(penalties=penalties, events=(0.0, pulse, back), load_start=pulse)
+    tuned = tuning.tune(
         loop, ensemble, flight, objective=objective,
-        limits=(Limit("sensitivity_peak", at_most=settings.sensitivity),),
+        limits=(tuning.Limit("sensitivity_peak", at_most=settings.sensitivity),),
         free=None if settings.wo is None else ["ladrc.wc", "map.values"],
         members=settings.members, fresh=settings.fresh,
-        peers={KNOWN_INERTIA: peers(plant, dt=dt)[KNOWN_INERTIA]},
+        peers={tuning.KNOWN_INERTIA: tuning.peers(plant, dt=dt)[tuning.KNOWN_INERTIA]},
         key=jax.random.key(settings.seed), progress=progress,
     )  # fmt: skip
     return Tuning(axis, settings, tuned, loop, ensemble, flight)

@@ -79,6 +79,7 @@ def test_the_cache_is_switched_off_or_the_users_own(tmp_path):
     assert json.loads(answer(own))[:3] == [str(tmp_path / "own")] * 3
 
 
+@pytest.mark.slow
 def test_the_command_line_keeps_what_it_compiles(tmp_path):
     rows = "".join(f"{k / 100},{k % 7},{k % 5}\n" for k in range(16))
     (tmp_path / "log.csv").write_text(f"time,u,y\n{rows}")

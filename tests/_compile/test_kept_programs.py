@@ -152,6 +152,7 @@ def test_without_a_folder_no_program_is_kept(tmp_path, monkeypatch):
     assert KeptPrograms(lambda _, x: x, dict)(*ARGUMENTS)[2] == 2.0
 
 
+@pytest.mark.slow
 def test_a_second_process_traces_neither_flight_nor_fit_and_finds_the_same(tmp_path):
     inherited = {k: v for k, v in os.environ.items() if not k.startswith("JAX_")}
     environment = inherited | {

@@ -125,6 +125,7 @@ def test_wide_arrays_make_smaller_chunks_which_are_kernels():
     assert TAG in run.lower(sums).as_text()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [1, 128, 131, 1009])
 def test_blocks_of_any_number_of_samples_are_one_scan(count):
     step = lambda x, u: (0.9 * x + jnp.sin(u * x), u * x)
@@ -192,6 +193,7 @@ class Weighted(eqx.Module):
         return total + self.weight * now.angle, None
 
 
+@pytest.mark.slow
 def test_an_accumulator_may_have_numbers_of_each_member():
     weight = jnp.arange(float(MEMBERS))[None]
     loop = Loop(rig(INERTIA), LADRC([10.0], [30.0], [0.8478]), drive=Saturation(20.0))

@@ -30,6 +30,7 @@ def passes(*words):
     return ran.stdout
 
 
+@pytest.mark.slow
 def test_flights_their_gradients_and_fits_need_no_compilers():
     assert " passed" in passes(*FEW)
 

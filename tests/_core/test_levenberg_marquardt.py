@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from scipy.optimize import least_squares
 
 from jaxquad._core import (
@@ -31,6 +32,7 @@ def evaluate(z):
     return Normal(*normal)
 
 
+@pytest.mark.slow
 def test_every_member_of_a_batch_reaches_the_minimum_of_scipy():
     found = jax.jit(lambda z: minimise(evaluate, z, 50))(STARTS.T)
     expected = least_squares(lambda z: np.asarray(residual(z, DATA)), STARTS[0], xtol=1e-14)

@@ -27,6 +27,7 @@ def test_a_delayed_loop_is_the_same_as_a_kernel_and_plain(name):
     compare(*CASES[name])
 
 
+@pytest.mark.slow
 def test_a_longer_delay_makes_no_larger_program():
     size = lambda delay: len(
         jax.jit(jax.grad(cost_of(delay, 2, False), argnums=0))

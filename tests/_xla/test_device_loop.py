@@ -88,6 +88,7 @@ def have_memory(monkeypatch):
     monkeypatch.setattr(_loop, "_memory", lambda: (10**9, 228 * 1024))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("memory", ["little", "much", "much, few registers", "few registers"])
 def test_values_and_gradients_are_those_of_the_plain_scan(memory, monkeypatch):
     """With respect to what members share and what they do not, at the start and in every sample."""
@@ -160,6 +161,7 @@ def steady(scan, tuning, x):
     return jnp.sum(scan(step, x, jnp.linspace(0.0, 1.0, SAMPLES))[0] ** 2)
 
 
+@pytest.mark.slow
 def test_what_is_the_same_in_every_sample_is_computed_before_the_loop():
     args = spread(2, MEMBERS), spread(1, MEMBERS, seed=1)
     forward, reverse = written(jax.grad(ft.partial(steady, kernel)), *args)
@@ -169,6 +171,7 @@ def test_what_is_the_same_in_every_sample_is_computed_before_the_loop():
     np.testing.assert_allclose(found, expected, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_what_would_take_many_arrays_before_the_loop_stays_in_it():
     """The differences of a map's values, as many as they are."""
     knots, x = spread(40, MEMBERS), spread(1, MEMBERS, seed=1)
@@ -194,6 +197,7 @@ def limited(scan, low, high, x):
     return jnp.sum(scan(step, x, jnp.array([0.0, 0.2, 0.0]))[0] ** 2)
 
 
+@pytest.mark.slow
 def test_slopes_of_limits_are_one_choice_and_no_quotient():
     x = jnp.array([[0.1, 0.3, 0.2, 0.4, 0.05] * (MEMBERS // 5)])
     args = jnp.full((1, MEMBERS), 0.1), jnp.full((1, MEMBERS), 0.3), x
@@ -375,6 +379,7 @@ def trial():
         return _switch.why_no_trust_in_gpu.__wrapped__()
 
 
+@pytest.mark.slow
 def test_kernels_are_compared_with_a_plain_loop_before_they_are_trusted(monkeypatch):
     said = []
     jax.jit(lambda x: said.append(trial()))(1.0)  # while another program is traced

@@ -135,6 +135,7 @@ def untested(silence, monkeypatch, tmp_path):
     _switch.why_not_trusted.cache_clear()
 
 
+@pytest.mark.slow
 def test_kernels_pass_their_trial_with_this_jaxlib(untested):
     assert engine().one_kernel
     (answer,) = untested.glob("jaxquad/kernel-*.json")

@@ -29,6 +29,7 @@ def count(operation, program):
     return (program.as_text() or "").count(f" {operation}(")
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(jax.default_backend() != "cpu", reason="other devices fuse well enough")
 def test_slopes_of_few_frequencies_compute_an_exponential_once():
     once = lambda values: evaluate_once(lambda v: with_slopes(v, OMEGA), least=FEW)(values)

@@ -182,6 +182,7 @@ def in_a_process(program):
     return ran.stdout.split()[-1]
 
 
+@pytest.mark.slow
 def test_constants_and_arguments_whose_use_is_simplified_away_do_not_end_the_process():
     """They do, in XLA as of jaxlib 0.10, unless a barrier hides those and a sum uses these."""
     assert in_a_process(ABORTING) == "survived"
@@ -210,6 +211,7 @@ print("split")
 """
 
 
+@pytest.mark.slow
 def test_what_xla_splits_among_devices_is_left_plain():
     """A kernel cannot be split; within `jax.shard_map` each device has its own."""
     assert in_a_process(SHARDED) == "split"
@@ -237,6 +239,7 @@ WITHOUT = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("what", WITHOUT)
 def test_without_the_compilers_interfaces_a_loop_is_plain(what):
     assert in_a_process(MISSING.format(how=WITHOUT[what])) == "plain"

@@ -81,7 +81,7 @@ def test_the_angle_loop_is_stable_up_to_the_gain_at_which_a_simulated_one_is():
         *GAINS, gyro=FilterChain((), 1 / DT), target_hz=0.0, error_hz=0.0, derivative_hz=0.0, dt=DT
     )
     angle = firmware_named("ardupilot").angle_loop({"ATC_ANG_RLL_P": "4.5"}, 0, DT, levelled=False)
-    assert angle is not None and angle.closed and angle.gain(angle.value) == 4.5
+    assert angle is not None and angle.closed and angle.unit * angle.value == 4.5
     back, ahead = law_paths(law, 0, OMEGA)
     plants = hold_plants(column(GAIN), column(LAG), column(0.0), OMEGA, DT)
     ones = np.ones(OMEGA.size, complex)
@@ -103,6 +103,6 @@ def test_the_angle_loop_is_stable_up_to_the_gain_at_which_a_simulated_one_is():
 def test_betaflights_angle_loop_is_open_in_acro_and_has_no_yaw():
     values = {"levelPID": "50,75,75"}
     acro = firmware_named("betaflight").angle_loop(values, 0, 1 / 4000, levelled=False)
-    assert acro is not None and not acro.closed and acro.gain(acro.value) == pytest.approx(5.0)
+    assert acro is not None and not acro.closed and acro.unit * acro.value == pytest.approx(5.0)
     assert firmware_named("betaflight").angle_loop(values, 2, 1 / 4000, levelled=True) is None
     assert firmware_named("betaflight").angle_loop({}, 0, 1 / 4000, levelled=True) is None

@@ -30,6 +30,7 @@ def relative(residual, signal):
     return np.sqrt(np.mean(residual**2) / np.mean(signal**2))
 
 
+@pytest.mark.slow
 def test_the_file_is_read_without_a_remark(log, columns):
     loaded = load_log(log)
     table = loaded.tables[""]

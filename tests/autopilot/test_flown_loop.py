@@ -69,6 +69,7 @@ def test_the_loop_that_flew_is_reproduced_within_the_errors(log, fit):
     assert content["kind"] == "flown"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("factor", [0.8, 1.25])
 def test_other_gains_are_refused_with_the_factor_between_them(closed, fit, factor):
     law = dataclasses.replace(LAW, p=factor * P, i=factor * I, d=factor * D)
@@ -77,6 +78,7 @@ def test_other_gains_are_refused_with_the_factor_between_them(closed, fit, facto
     assert found.scale == pytest.approx(1 / factor, rel=0.1)  # of first order in the factor
 
 
+@pytest.mark.slow
 def test_a_plant_that_is_not_explained_does_not_say_that_other_gains_flew(closed, fit):
     law = dataclasses.replace(LAW, p=1.25 * P, i=1.25 * I, d=1.25 * D)
     doubtful = dataclasses.replace(fit, chi_squared=4.8)
@@ -85,6 +87,7 @@ def test_a_plant_that_is_not_explained_does_not_say_that_other_gains_flew(closed
     assert "fly a chirp" in found.verdict and "is not the one" not in found.verdict
 
 
+@pytest.mark.slow
 def test_another_filter_of_the_derivative_is_refused(closed, fit):
     law = dataclasses.replace(LAW, dterm=(PT1(CUTOFF / 3),))
     assert jq.autopilot.reproduce_flight(fit, law, closed, unit="deg/s").kind == "not flown"

@@ -137,6 +137,7 @@ def flight(tmp_path):
     return path
 
 
+@pytest.mark.slow
 def test_its_log_is_understood_and_its_gains_are_tuned_into_its_own_file(kestrel, flight, tmp_path):
     assert {"rate_roll", "u_yaw"} <= {channel.name for channel in jq.records.channels(flight)}
     proposal = jq.propose(flight)

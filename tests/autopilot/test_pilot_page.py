@@ -40,6 +40,7 @@ def page(name: str) -> PilotPage:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["flight.bbl", *HOSTILE])
 def test_any_name_leaves_the_page_whole_and_without_strangers(tmp_path, name):
     text = write_pilot_page(tmp_path / "page.html", page(name)).read_text(encoding="utf-8")

@@ -60,6 +60,7 @@ def test_a_fleet_gives_a_table_a_summary_and_reports(fleet, tmp_path, capfd, mon
     assert printed.err.splitlines()[-1] == "3/3 sweep.npz: identified"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("text", "complaint"),
     [("estimater = 1", "did you mean 'estimator'"), ("rate =", "not TOML"), ("logs='*.x'", "*.x")],

@@ -272,6 +272,7 @@ PLANT = ["--inertia", "0.01", "--limit", "0.2"]
 SMALL = ["--noise", "0.05", "--members", "8", "--fresh", "32", "--duration", "1.6"]
 
 
+@pytest.mark.slow
 def test_a_report_is_drawn_again_to_the_byte(demo, capsys, tmp_path):
     assert main(["report", str(demo), "--out", str(tmp_path), "--quiet"]) == 0
     assert "report.html" in capsys.readouterr().out

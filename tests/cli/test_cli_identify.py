@@ -47,6 +47,7 @@ def test_bad_input_is_one_line_on_stderr(flight, capsys):
     assert "no such file" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_noise_is_not_identifiable(tmp_path, capsys):
     log, out = write_noise(tmp_path / "hover.npz"), tmp_path / "out"
     assert identify(log, "--out", str(out), channels=("M", "q")) == 3
@@ -58,6 +59,7 @@ def test_noise_is_not_identifiable(tmp_path, capsys):
     assert (out / "bode.png").stat().st_size > 10_000
 
 
+@pytest.mark.slow
 def test_json_is_all_that_stdout_holds_and_knows_no_nan(flight, tmp_path, capsys):
     """Far below 1 / lag the lag and the delay trade off, which is said of both."""
     code = identify(flight, "--out", str(tmp_path), "--band-rad", "1", "1.5", "--json")
@@ -70,6 +72,7 @@ def test_json_is_all_that_stdout_holds_and_knows_no_nan(flight, tmp_path, capsys
     assert "(--no-lag)" in printed.err and "std. error" in printed.err
 
 
+@pytest.mark.slow
 def test_a_model_without_a_lag_has_the_whole_of_it_as_delay(flight, tmp_path, capsys):
     band = ["--band-rad", "3", "12"]
     assert identify(flight, "--out", str(tmp_path), *band, "--no-lag", "--cost", "coherence") == 0
@@ -89,6 +92,7 @@ def test_poles_and_zeros_of_given_orders_are_fitted(flight, tmp_path, capsys):
     assert rows[0]["value"] == pytest.approx(GAIN / 0.02, rel=0.1)
 
 
+@pytest.mark.slow
 def test_options_take_precedence_over_a_file(flight, tmp_path, capsys):
     config = tmp_path / "identify.toml"
     config.write_text('input = "M=right-left"\noutput = "q"\nband_rad = [1, 1.5]\nlag = false\n')

@@ -52,12 +52,14 @@ def stepped():
     }
 
 
+@pytest.mark.slow
 def test_b0_is_the_ladrcs_until_the_inertia_is_known_then_follows_it(stepped):
     b0 = np.asarray(stepped[1.6].signals["b0"])[:, 0]
     np.testing.assert_array_equal(b0[: round(4.99 / DT)], 1.6)
     np.testing.assert_allclose(b0[-1], GAIN / (INERTIA * SPREAD), rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_a_step_after_that_is_the_same_for_all_inertias_and_hardly_overshoots(stepped):
     """The probe is still on; with b0 = 3 the paper's 34 % at the nominal inertia."""
     after = slice(round(12.0 / DT), round(14.0 / DT))
@@ -91,6 +93,7 @@ def test_the_probe_stays_within_the_controllers_limit():
     assert np.abs(run.command).max() == pytest.approx(0.2, rel=1e-12)
 
 
+@pytest.mark.slow
 def test_the_estimator_hears_what_the_drive_really_gave():
     """A drive that the controller does not know of saturates; the estimate stays exact."""
     step = np.where((TIME >= 6.0) & (TIME < 9.0), np.radians(4.0), 0.0)

@@ -79,6 +79,7 @@ def test_the_slope_of_a_saturated_loop_agrees_with_central_differences(name):
     assert felt >= 5  # the limit too, but not a feedforward of no acceleration
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["current", "clamped"])
 def test_an_ensemble_of_gains_is_a_controller_per_member(name):
     single = CONTROLLERS[name]

@@ -47,6 +47,7 @@ def test_least_squares_are_far_off_under_the_papers_sine_and_not_trusted():
         assert np.all(np.abs(inertia - 1) > 0.5) and not np.any(trusted)
 
 
+@pytest.mark.slow
 def test_a_payload_is_locked_in_within_five_seconds():
     """Twice the inertia from 15 s on, which the window from there to 20 s is first to see whole."""
     heavy = lambda time: INERTIA * (1 if time < 15.0 else 2)

@@ -8,21 +8,52 @@ from ladrc_loop import loop
 from scipy.integrate import solve_ivp
 
 import jaxquad as jq
-from jaxquad.control.inertia import (
-    disturbance_slope,
-    disturbed_axis,
-    estimate_disturbance,
-    expected_disturbance,
-    filter_signals,
-    observe_disturbance,
-    paper_inertia,
-)
+from jaxquad.control import paper_inertia
 
 
 J, DRAG, LOAD = 0.0552, 0.004, 0.03  # kg m^2, N m s/rad, N m
 NOMINAL, POLE = 0.04, 20.0  # J_n and lambda
 CHANGE = J - NOMINAL
 LOADS = {"dJ": CHANGE, "K_afx": DRAG, "M_g": LOAD, "lam": POLE}
+
+
+# J_x and J_n are the true and the nominal inertia in kg m^2, phi the roll angle in rad, u = tau_x
+# the torque in N m, lam the observer's pole in rad/s, M_c the estimate of the disturbance in N m.
+
+
+def disturbed_axis(J_x):
+    """Eq. (15), (16): A, B and C of J_x phi'' = u + tau_M, with x = [phi', tau_M] and y = phi'."""
+    A = jnp.array([[0.0, 1.0], [0.0, 0.0]]) / J_x
+    B = jnp.array([1.0, 0.0]) / J_x
+    C = jnp.array([1.0, 0.0])
+    return A, B, C
+
+
+def observe_disturbance(z, phi_dot, u, *, J_n, lam):
+    """Eq. (17): z' and M_c of the observer of least order."""
+    z_dot = -lam * z + lam * J_n * phi_dot + u
+    M_c = -lam * z + lam * J_n * phi_dot
+    return z_dot, M_c
+
+
+def estimate_disturbance(q0_dot, q1, *, J_n):
+    """Eq. (18) with (19) in it: M_c = J_n q0' - q1; the printed (18) lacks a filter."""
+    return J_n * q0_dot - q1
+
+
+def filter_signals(q0, q1, phi_dot, u, *, lam):
+    """Eq. (19): q0' and q1' of the filters of rate and torque."""
+    return -lam * q0 + lam * phi_dot, -lam * q1 + lam * u
+
+
+def disturbance_slope(M_c, phi_dot, phi_ddot, *, dJ, K_afx, M_g, lam):
+    """Eq. (20): M_c' under dJ = J_x - J_n, drag and a constant load; printed with phi' and J_x."""
+    return -lam * M_c - lam * (dJ * phi_ddot + K_afx * phi_dot + M_g)
+
+
+def expected_disturbance(q0, q0_dot, t, *, dJ, K_afx, M_g, lam):
+    """Eq. (21): M_c from rest at t = 0; printed with q0 for its derivative and q1 for the rise."""
+    return -dJ * q0_dot - K_afx * q0 - M_g * (1 - jnp.exp(-lam * t))
 
 
 def torque(time):

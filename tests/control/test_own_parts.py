@@ -199,6 +199,7 @@ def test_an_observer_of_the_same_matrices_flies_and_is_linearised_as_the_library
         np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_an_estimator_without_a_test_signal_or_a_sample_interval_adapts_b0():
     chart = jq.control.certainty_equivalence(KT, J)
     law = jq.AdaptiveLADRC(LADRC(10.0, 30.0, 1.6), RatioEstimator(), chart, settling=0.05)

@@ -175,6 +175,7 @@ def test_a_rate_limit_moves_power_to_lower_lines_and_costs_information():
     assert (slow.power * slow.omega**2).sum() < (free.power * free.omega**2).sum()
 
 
+@pytest.mark.slow
 def test_lines_sets_how_many_share_the_power():
     found = design_of(PLANT, lines=10)
     assert found.omega.size >= 10
@@ -237,6 +238,7 @@ def test_information_is_that_of_white_noise_in_the_time_domain():
     )
 
 
+@pytest.mark.slow
 def test_cramer_rao_is_what_a_maximum_likelihood_fit_prints():
     omega = jq.excitation.harmonics(*BAND, period=PERIOD, lines=8)
     signal = jq.multisine(omega, period=PERIOD, periods=2, sample_rate=RATE, amplitude=1.0)
@@ -311,6 +313,7 @@ def test_simulated_flights_scatter_as_predicted():
     np.testing.assert_allclose(scatter / found.standard_errors, 1.08, atol=0.35)
 
 
+@pytest.mark.slow
 def test_the_signal_repeats_and_starts_near_zero(sharp):
     wave = sharp.excitation.signal.reshape(4, -1)
     np.testing.assert_array_equal(wave[0], wave[3])

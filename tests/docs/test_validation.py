@@ -50,6 +50,7 @@ def test_the_efficient_estimate_scatters_as_the_bound_says(name):
     assert np.all(np.abs(np.mean(errors, axis=0)) < 0.3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [20, 34, 784, 1661])
 def test_a_global_model_does_not_miss_the_lag_of_a_short_record(seed):
     """Of these records linear estimates lead to growing poles: 1.2 to 2.5 bounds were lost."""

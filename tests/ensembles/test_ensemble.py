@@ -205,6 +205,7 @@ def test_members_are_drawn_outside_jit():
         jax.jit(lambda key: study().draw(COUNT, key).delay)(KEY)
 
 
+@pytest.mark.slow
 def test_both_precisions_draw_the_same_members_and_noise():
     double = study(gust=0.01).draw(COUNT, KEY)
     with jax.enable_x64(False):
@@ -218,6 +219,7 @@ def test_both_precisions_draw_the_same_members_and_noise():
     np.testing.assert_allclose(noise, double.flight(SCENARIO).noise, rtol=1e-5, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_each_member_keeps_its_own_noise_gust_and_payload_when_others_are_left_out():
     payload = Payload(Uniform(0.2, 1.0), at=Uniform(0.1, 0.2), width=Uniform(0.05, 0.1))
     members = study(gust=Uniform(0.01, 0.03), payload=payload).draw(COUNT, KEY)
@@ -271,6 +273,7 @@ def flown(members, happens):
     return np.asarray(jq.simulate(members.loop(LADRC), happens).angle)
 
 
+@pytest.mark.slow
 def test_a_member_flies_as_the_plant_that_it_stands_for():
     members, k = study().draw(COUNT, KEY), 5
     happens, plant = members.flight(SCENARIO), members.plant
@@ -285,6 +288,7 @@ def test_a_member_flies_as_the_plant_that_it_stands_for():
     np.testing.assert_allclose(flown(members, happens)[..., k], alone, rtol=1e-9, atol=1e-15)
 
 
+@pytest.mark.slow
 def test_a_payload_from_the_start_is_more_inertia():
     heavy = study(payload=Payload(0.5, at=0.0), inertia=Uniform(0.5, 1.0)).draw(COUNT, KEY)
     inertia = heavy.plant.inertia + 0.5 * 0.0552

@@ -110,6 +110,7 @@ def test_no_devices_are_refused():
         simulate(Loop(PLANT, PD([40.0], [8.0])), HAPPENS, devices=[])
 
 
+@pytest.mark.slow
 def test_one_device_is_asked_for_in_any_way():
     numbers = [
         evaluate(Loop(PLANT, PD([40.0], [8.0])), HAPPENS, devices=devices).itae
@@ -194,6 +195,7 @@ def test_slices_join_to_the_whole(at_once):
     assert lengths == {min(at_once, 7)}
 
 
+@pytest.mark.slow
 def test_metrics_join_to_those_of_all_members():
     inertia = np.linspace(0.05, 0.08, 4)
     fly = lambda k: evaluate(

@@ -81,6 +81,7 @@ def recorded():
     return np.stack([reference, rate, acceleration, measurement, inertia], 1).astype(np.float32)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ahead", [True, False])
 @pytest.mark.parametrize("at", [0, 7, 60])
 def test_a_sample_that_is_not_finite_is_as_if_it_had_not_been_taken(run, at, ahead):
@@ -94,6 +95,7 @@ def test_a_sample_that_is_not_finite_is_as_if_it_had_not_been_taken(run, at, ahe
         assert found[at, AXIS] == (clean[at - 1, AXIS] if at else 0)
 
 
+@pytest.mark.slow
 def test_an_axis_is_not_touched_by_the_bad_samples_of_another(run):
     spoilt = recorded()
     spoilt[30:90, 3, AXIS] = np.nan

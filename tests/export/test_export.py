@@ -44,6 +44,7 @@ def agree(found, expected, precision):
     assert np.max(np.abs(found - expected) / scale) < within
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name, precision",
     [(name, "double") for name in [*LADRCS, *PIDS]]

@@ -31,6 +31,7 @@ def fit(frfs, condition):
     return jq.fit(START, frfs, free=FREE, conditions=(None, condition))
 
 
+@pytest.mark.slow
 def test_a_changed_parameter_is_fitted_as_the_function_that_changes_it(frfs):
     named, function = fit(frfs, CHANGED), fit(frfs, loaded)
     assert named.identifiable
@@ -50,6 +51,7 @@ def test_it_changes_models_of_numpys_arrays_too():
     assert isinstance(changed.J_x, np.ndarray) and float(changed.J_x) == 0.0552 + ADDED
 
 
+@pytest.mark.slow
 def test_its_numbers_are_no_part_of_a_program():
     lowered = []
 

@@ -28,6 +28,7 @@ def record():
     return jq.Record(time, u, y, output_names="q", output_units="rad/s", hold="dt")
 
 
+@pytest.mark.slow
 def test_the_band_of_a_gain_alone_is_the_interval_of_the_gain():
     only = jq.fit(START, response_of(TRUTH, error=0.05, seed=0), free=("gain",))
     low, high = only.interval("gain")
@@ -39,6 +40,7 @@ def test_the_band_of_a_gain_alone_is_the_interval_of_the_gain():
     np.testing.assert_allclose(step.reach, half * step.value, rtol=1e-6, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_the_band_of_a_step_response_is_that_of_models_drawn_from_the_fit(fit):
     """2000 draws know a standard deviation to 1.6 %; the band is first order in 10 % of the lag."""
     drawn = fit.ensemble(2000, jax.random.key(0))
@@ -52,6 +54,7 @@ def test_the_band_of_a_step_response_is_that_of_models_drawn_from_the_fit(fit):
     assert np.mean((found.low[:, 0, 0] <= truth) & (truth <= found.high[:, 0, 0])) > 0.9
 
 
+@pytest.mark.slow
 def test_a_step_response_needs_equal_steps_from_0(fit):
     for time in ([0.0, 0.1, 0.3], [0.1, 0.2], [0.0]):
         with pytest.raises(ValueError, match=r"equally spaced from 0.*linspace"):
@@ -80,12 +83,14 @@ def test_a_fit_as_a_mapping_is_json_and_what_a_result_stores(fit, tmp_path):
     assert fit.to_dict()["parameters"][0]["value"] == fit["gain"]
 
 
+@pytest.mark.slow
 def test_a_fit_called_with_a_record_verifies_it(fit, record):
     check, same = fit(record), jq.verify(fit.model, record, band=fit.used_band)
     assert check.fit_percent == same.fit_percent == jq.verify(fit, record).fit_percent > 95
     assert fit(record, band=(1.0, 10.0)).band == (1.0, 10.0)
 
 
+@pytest.mark.slow
 def test_the_true_model_compares_best(fit, record):
     models = {"truth": TRUTH, "fit": fit, "half": jq.LaggedIntegrator(140.0, 0.016, 0.011)}
     found = jq.compare(models, record)

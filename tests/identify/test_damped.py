@@ -101,6 +101,7 @@ def test_a_flown_chirp_shows_a_damping_where_there_is_one(damping):
         assert abs(fit[name] - truth[name]) < 3 * fit.standard_errors[fit.names.index(name)]
 
 
+@pytest.mark.slow
 def test_one_more_fit_which_starts_from_the_phase_at_the_lowest_frequencies_is_enough(monkeypatch):
     plain, starts = jq.fit(START, flown(1.0, seed=0)), []
     assert plain.origin is not None
@@ -117,6 +118,7 @@ def test_one_more_fit_which_starts_from_the_phase_at_the_lowest_frequencies_is_e
     assert 0.4 < start < 1.5
 
 
+@pytest.mark.slow
 def test_the_errors_count_what_a_damping_of_three_degrees_moves():
     """It moves the parameters as leaving out the one that was found does, to first order."""
     plain = jq.fit(START, flown(2.1, seed=3))
@@ -134,6 +136,7 @@ def test_the_errors_count_what_a_damping_of_three_degrees_moves():
         fit_damped(plain, unmodelled=-1.0)
 
 
+@pytest.mark.slow
 def test_the_fit_keeps_what_was_free_and_in_which_band():
     frf = flown(2.1, seed=0)
     plain = jq.fit(START, frf, free=["gain", "lag"], band=(4.0, 100.0))
@@ -144,6 +147,7 @@ def test_the_fit_keeps_what_was_free_and_in_which_band():
     assert fit_damped(fit) is fit
 
 
+@pytest.mark.slow
 def test_other_models_are_refused_and_nothing_fitted_stays_so():
     frf = response_of(jq.LaggedIntegrator(8.0, 0.05, 0.03, integrators=0))
     flat = jq.fit(jq.LaggedIntegrator(8.0, 0.05, 0.03, integrators=0), frf)

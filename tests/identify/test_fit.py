@@ -26,6 +26,7 @@ def cost_14(values, frf, sign=1.0, power=2):
     return 20 / OMEGA.size * np.sum(weight * (decibels**2 + sign * 0.01745 * degrees**2))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("cost", COSTS, ids=["eq14", "ml"])
 @pytest.mark.parametrize("solver", [None, optx.GaussNewton(rtol=1e-8, atol=1e-8)], ids=["lm", "gn"])
 def test_a_noise_free_response_gives_the_parameters_back(cost, solver):
@@ -148,6 +149,7 @@ class TiedAxes(eqx.Module):
         return jnp.stack([1 / (inertia * s), 1 / (inertia * s * s)], axis=1)[:, :, None]
 
 
+@pytest.mark.slow
 def test_a_users_own_module_with_two_outputs_fits():
     frf = response_of(TiedAxes(jnp.asarray(0.0552)))
     fit = jq.fit(TiedAxes(jnp.asarray(0.2)), frf)
@@ -163,6 +165,7 @@ def test_a_model_that_cannot_explain_the_response_says_so_and_widens_its_errors(
     assert lacking.standard_errors[0] > 3 * proper.standard_errors[0]
 
 
+@pytest.mark.slow
 def test_a_solver_that_stops_early_is_no_minimum():
     fit = jq.fit(START, response_of(TRUTH, seed=0), max_steps=1)
     assert any("stopped early" in remark for remark in fit.remarks)
@@ -199,6 +202,7 @@ def test_a_local_minimum_is_called_one():
     assert any("local minimum" in remark for remark in fit.remarks)
 
 
+@pytest.mark.slow
 def test_exact_data_end_a_fit_without_a_remark():
     """Where rounding is all that is left, no step lowers the cost: that is the minimum."""
     truth = jq.LaggedIntegrator(25000.0, 0.03, 0.001, damping=0.5)

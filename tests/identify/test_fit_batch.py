@@ -70,6 +70,7 @@ def test_every_member_is_at_the_minimum_that_optimistix_finds():
         assert found.costs[k] == pytest.approx(cost, rel=1e-12)
 
 
+@pytest.mark.slow
 def test_points_that_share_noise_count_together_as_in_one_fit():
     time, command, rate = swept(1)
     omega = np.geomspace(0.8, 30.0, 24)
@@ -117,6 +118,7 @@ def test_state_spaces_are_fitted_as_single_ones_are():
         assert batch.costs[k] == pytest.approx(one.cost, rel=1e-10)
 
 
+@pytest.mark.slow
 def test_other_numbers_of_members_and_frequencies_compile_nothing():
     _, responses = measured()
     compiled, responses = [], np.asarray(responses)
@@ -139,11 +141,13 @@ def test_other_numbers_of_members_and_frequencies_compile_nothing():
     assert not compiled
 
 
+@pytest.mark.slow
 def test_without_noise_the_truth_comes_back():
     truth, responses = measured(noise=0.0)
     np.testing.assert_allclose(solved(responses).values, truth, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_points_of_no_weight_may_hold_anything():
     _, responses = measured()
     coherence = np.where(np.arange(OMEGA.size) < 20, 0.95, 0.0)[:, None, None]

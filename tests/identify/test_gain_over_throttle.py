@@ -64,6 +64,7 @@ def test_stretches_are_where_each_level_was_flown(found):
     np.testing.assert_allclose(starts, SECONDS * np.arange(3), atol=0.05)
 
 
+@pytest.mark.slow
 def test_gains_lag_delay_and_curve_are_recovered_within_their_errors(found):
     np.testing.assert_allclose(found.throttle, LEVELS, atol=0.005)
     assert np.all(np.abs(found.gain - gain(found.throttle)) < 3.5 * found.gain_errors)
@@ -74,6 +75,7 @@ def test_gains_lag_delay_and_curve_are_recovered_within_their_errors(found):
     assert abs(found.curve.value - CURVE) < 3.5 * found.curve.standard_error < 0.1
 
 
+@pytest.mark.slow
 def test_the_gain_between_the_levels_follows_the_curve_with_its_band(found):
     grid = np.linspace(0.25, 0.6, 8)
     band = found.over(grid)
@@ -83,6 +85,7 @@ def test_the_gain_between_the_levels_follows_the_curve_with_its_band(found):
     assert middle.value[0] == pytest.approx(found.b0(1).value, rel=0.02)
 
 
+@pytest.mark.slow
 def test_drawn_plants_scatter_as_the_band_says_and_follow_a_curve(found):
     grid = np.array([0.3, 0.45, 0.6])
     plants, band = found.draw(grid, 4000, seed=3), found.over(grid)

@@ -50,6 +50,7 @@ def test_several_starts_find_the_truth(many):
     assert many.chi_squared < 2
 
 
+@pytest.mark.slow
 def test_all_stops_are_listed_by_cost_and_say_what_they_are(many):
     costs = [point.cost for point in many.minima]
     assert costs == sorted(costs) and len(costs) > 1
@@ -68,6 +69,7 @@ class Even(eqx.Module):
         return ((1 + self.root.astype(s.dtype) ** 2) / (0.1 * s + 1))[:, None, None]
 
 
+@pytest.mark.slow
 def test_a_stationary_point_that_is_no_minimum_says_so():
     frf = response_of(Even(jnp.asarray(1.0)), seed=0)
     stuck = jq.fit(Even(jnp.asarray(0.0)), frf, free=[jq.identify.Real("root", 1.0)], cost=ML)
@@ -76,6 +78,7 @@ def test_a_stationary_point_that_is_no_minimum_says_so():
     assert not any("no minimum" in remark for remark in free.remarks)
 
 
+@pytest.mark.slow
 def test_two_minima_of_the_same_cost_are_called_rivals():
     frf = response_of(Even(jnp.asarray(1.0)), seed=0)
     start = Even(jnp.asarray(0.3))

@@ -49,6 +49,7 @@ def test_a_held_input_is_fitted_exactly_with_the_plants_own_delay(response):
     assert not any("keeps each value" in remark for remark in fit.remarks)
 
 
+@pytest.mark.slow
 def test_where_the_hold_is_unknown_the_fit_says_what_to_give(response):
     unsaid = dataclasses.replace(response, hold=None)
     fit = jq.fit(START, unsaid, free=FREE)
@@ -57,6 +58,7 @@ def test_where_the_hold_is_unknown_the_fit_says_what_to_give(response):
     assert sum("give hold=" in remark for remark in fit.remarks) == 1
 
 
+@pytest.mark.slow
 def test_a_measured_input_has_no_hold(response):
     fit = jq.fit(START, dataclasses.replace(response, hold=0.0), free=FREE)
     assert fit.values[3] == pytest.approx(0.031 + DT / 2, rel=0.01)

@@ -77,6 +77,7 @@ def add_inertia(model):
     return model.with_added_inertia(ADDED)
 
 
+@pytest.mark.slow
 def test_a_second_record_under_known_added_inertia_tells_them_apart():
     frfs = response_of(RIG, seed=2), response_of(add_inertia(RIG), seed=3)
     both = jq.fit(
@@ -126,6 +127,7 @@ def controller_at(share):
     return dataclasses.replace(frf, remarks=(remark,))
 
 
+@pytest.mark.slow
 def test_a_response_that_is_mostly_the_controllers_has_no_model():
     """However well one fits: no other structure is advised."""
     start = jq.LaggedIntegrator(8.0, 0.05, 0.03)
@@ -214,6 +216,7 @@ def test_a_parameter_without_effect_is_named():
     assert np.isfinite(fit.values[:2]).all()
 
 
+@pytest.mark.slow
 def test_a_well_posed_fit_says_nothing_of_the_kind():
     fit = jq.fit(start(), response_of(RIG, seed=0), free=("K_t", "lag"), cost=ML)
     assert fit.identifiable and not fit.verdict.null_directions and "NOT" not in str(fit)
@@ -246,6 +249,7 @@ def summed(values, product=False):
     return Sum(a, b, c, product)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("values", [(2, 2, 2), (1, 3, 5), (0.5, 0.5, 9)])
 def test_a_sum_is_never_taken_for_a_product(values):
     """At equal values the two are alike to first order: only a finite move tells."""
@@ -273,6 +277,7 @@ def test_a_fit_from_the_wrong_sign_is_doubted_aloud():
     assert any("minimum" in remark and "starting values" in remark for remark in fit.remarks)
 
 
+@pytest.mark.slow
 def test_where_there_is_no_minimum_no_number_is_given():
     frf = response_of(jq.LaggedIntegrator(8.0, 0.1, 0.02), seed=0)
     fit = jq.fit(jq.LaggedIntegrator(2.0, 0.4, 0.1), frf, cost=ML, max_steps=1)
@@ -295,6 +300,7 @@ def test_a_fit_that_still_moves_by_a_quarter_of_an_error_has_no_numbers(steps):
     assert steps != 3 or 0.25 < off < 1.0  # one of them is near enough to look like a minimum
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(6))
 def test_no_number_has_an_error_of_more_than_half_its_size(seed):
     frf = response_of(jq.LaggedIntegrator(8.0, 0.02, 0.0), error=0.3, seed=seed)
@@ -352,6 +358,7 @@ def test_a_value_that_the_record_does_not_determine_is_not_given_by_its_name():
 NARROW = np.geomspace(1.0, 6.0, 30)
 
 
+@pytest.mark.slow
 def test_what_ran_to_zero_and_is_mixed_up_with_another_is_refused_with_it():
     frf = response_of(jq.LaggedIntegrator(280.0, 0.016, 0.011), error=0.04, seed=0, omega=NARROW)
     fit = jq.fit(jq.LaggedIntegrator(280.0, 0.02, 0.02), frf, free=("lag", "delay"), cost=ML)
@@ -364,6 +371,7 @@ def test_what_ran_to_zero_and_is_mixed_up_with_another_is_refused_with_it():
 STARTS_OF_A_LAG = [(70.0, 0.03), (90.0, 20.0), (70.0, 1e-4), (80.0, 1e-9)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 2])
 def test_a_lag_that_may_be_zero_has_one_verdict_from_every_start(seed):
     """Of seed 0 the best lag is zero, of seed 2 a third of its standard error."""

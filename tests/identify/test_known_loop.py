@@ -70,6 +70,7 @@ def test_the_series_of_a_loop_is_its_sensitivity():
     np.testing.assert_allclose(found, lfilter(whole, closed, x, axis=0), rtol=0, atol=1e-10)
 
 
+@pytest.mark.slow
 def test_a_series_times_its_inverse_is_one():
     a = np.array([1.0, *(0.3 * np.random.default_rng(1).standard_normal(299) / np.arange(1, 300))])
     product = np.convolve(a, np.asarray(invert_series(jnp.asarray(a))))[:300]

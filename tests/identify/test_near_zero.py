@@ -45,6 +45,7 @@ def test_a_value_of_less_than_two_standard_errors_ends_at_its_one_sided_limit():
         assert f"delay: {fit.values[2]:.3g}, below {bound.limit:.3g}" in fit.verdict.summary
 
 
+@pytest.mark.slow
 def test_models_drawn_around_it_keep_its_sign_and_its_order():
     for seed in range(6):
         fit = fit_flown(50e-6, seed)
@@ -99,6 +100,7 @@ def test_a_lag_at_zero_is_in_the_interval_of_the_delay(weak):
     assert wrong <= 2
 
 
+@pytest.mark.slow
 def test_the_sum_of_a_lag_at_zero_and_the_delay_is_named_with_its_error(weak):
     """Its scatter is as large as it says, and it is within 3.3 standard errors of the truth."""
     assert sum(fit.values[1] < 1e-3 for fit in weak) > 8
@@ -110,6 +112,7 @@ def test_the_sum_of_a_lag_at_zero_and_the_delay_is_named_with_its_error(weak):
     assert 0.7 < np.sqrt(np.mean(np.square(off))) < 1.3
 
 
+@pytest.mark.slow
 def test_draws_of_a_lag_near_zero_spread_as_the_sum_says(weak):
     fit = next(fit for fit in weak if 0 < fit.values[1] < 1e-3 and not fit.identifiable)
     drawn = fit.ensemble(4000, jax.random.key(0), hold_undetermined=True)

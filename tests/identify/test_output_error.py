@@ -60,6 +60,7 @@ def lagged_angle(u, gain=8.0, lag=0.1, late=3):
     return y + 0.02 * np.std(y) * noise(4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("start", [(-8.0, 0.1, 0.05), (-4.0, 0.2, 0.02)])
 def test_from_the_wrong_sign_nothing_is_called_determined(start):
     fit = refine(jq.LaggedIntegrator(*start), jq.Record(TIME, U, lagged_angle(U)))

@@ -51,17 +51,20 @@ def test_what_is_not_there_is_left_out(reduced):
     assert reduced.fit.model.spring == 0 and reduced.fit.model.lag == 0
 
 
+@pytest.mark.slow
 def test_what_is_left_holds_the_truth(reduced):
     error = np.abs(reduced.fit.values - [6.0, 3.0]) / reduced.fit.standard_errors
     assert np.all(error < 3)
 
 
+@pytest.mark.slow
 def test_the_most_insensitive_goes_first(reduced):
     first = int(np.argmax(reduced.first.insensitivity))
     assert reduced.steps[0].parameter == reduced.first.names[first]
     assert reduced.steps[0].reason.startswith("I ")
 
 
+@pytest.mark.slow
 def test_the_protocol_is_printed(reduced):
     text = str(reduced)
     assert text.startswith("start: 4 parameters, J_ave")

@@ -53,6 +53,7 @@ def test_a_derived_quantity_moves_with_what_is_tied():
     assert apart.standard_error == pytest.approx(2 * fit.standard_errors[0], rel=1e-9)
 
 
+@pytest.mark.slow
 def test_what_is_tied_is_shown_with_its_value_and_error():
     fit = jq.fit(START, response_of(TRUTH, seed=0), free=FREE, tied=TIED, cost=ML)
     [tied] = fit.tied
@@ -91,6 +92,7 @@ def test_the_gain_of_a_transfer_function_moves_with_what_is_tied():
     assert jq.identify.factors(fit).gain.standard_error == pytest.approx(fit.standard_errors[1])
 
 
+@pytest.mark.slow
 def test_without_free_all_but_the_tied_numbers_are_free():
     fit = jq.fit(START, response_of(TRUTH), tied=TIED, cost=ML)
     assert fit.names == FREE

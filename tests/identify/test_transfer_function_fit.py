@@ -106,6 +106,7 @@ def test_a_plant_is_recovered_from_its_response_alone(name):
     assert float(guess.delay) == pytest.approx(float(truth.delay), abs=1e-8)
 
 
+@pytest.mark.slow
 def test_six_decades_of_frequency_and_of_magnitude_are_no_obstacle():
     truth = model_of([-0.1, -30.0], [-0.004, *pair_of(0.3, 3.0), -800.0], 5e4)
     frf = response_of(truth, omega=np.geomspace(1e-3, 1e3, 120))

@@ -35,6 +35,7 @@ def test_a_true_model_fits_entirely():
     assert check.tic < 1e-8 and check.rms < 1e-8
 
 
+@pytest.mark.slow
 def test_input_bias_and_reference_shift_are_estimated():
     """A bias of the input drifts through the integrator; the output starts anywhere."""
     u, y = flight()

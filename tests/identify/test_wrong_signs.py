@@ -50,6 +50,7 @@ def test_intervals_beside_a_zero_of_the_wrong_sign_hold_the_truth(seed):
     assert len(said) == 1 and "jq.identify.Real('zero')" in said[0]
 
 
+@pytest.mark.slow
 def test_the_advice_finds_the_truth():
     free = ["gain", jq.identify.Real("zero", 1.0), "zeta", "wn"]
     fit = fitted(0, Zero(6.0, 0.5, 0.7, 5.0), free=free)
@@ -92,6 +93,7 @@ def test_a_gain_of_the_wrong_sign_is_told():
     assert any("start with the other sign of the gain" in remark for remark in fit.remarks)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method, said", [("direct", True), ("joint", False)])
 def test_a_model_that_grows_needs_a_reference(method, said):
     grows = jq.TransferFunction([20.0], [1.0, -3.0])
@@ -101,6 +103,7 @@ def test_a_model_that_grows_needs_a_reference(method, said):
     assert any("a pole at +3" in remark for remark in remarks) == said
 
 
+@pytest.mark.slow
 def test_an_interval_keeps_the_sign_of_its_parameter():
     """Also where a negative one came out as 0, and where it is too loose for a limit."""
     fit = fitted(0, Zero(6.0, 0.5, 0.7, 5.0))
@@ -113,6 +116,7 @@ def test_an_interval_keeps_the_sign_of_its_parameter():
     assert moved.interval("zeta", level=0.99)[0] == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("model_error", [True, False])
 @pytest.mark.parametrize("freedom", [9.0, np.inf])
 def test_an_interval_of_another_level_reaches_as_far_as_students_t(freedom, model_error):
@@ -127,6 +131,7 @@ def test_an_interval_of_another_level_reaches_as_far_as_students_t(freedom, mode
     assert derived.interval_at(0.99) == pytest.approx(wanted, rel=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("level", [0, 1, 95, -0.5, np.nan, True])
 def test_a_level_that_is_no_share_is_refused(level):
     fit = fitted(0, Zero(6.0, 0.5, 0.7, 5.0))

@@ -31,11 +31,13 @@ def test_stability_and_margins_of_10_30_are_those_of_the_record(at_gains):
     assert 1 / at_gains.gain_reduction[0] == pytest.approx(4.633, rel=1e-3)
 
 
+@pytest.mark.slow
 def test_noise_to_command_is_the_gain_of_rms_from_one_sample_to_the_next(at_gains):
     full, half_k, half_l, both = np.asarray(at_gains.noise_gain[7:11])  # for b0 = 1
     assert (round(full), round(half_k), round(half_l), round(both)) == (310, 206, 224, 153)
 
 
+@pytest.mark.slow
 def test_half_gains_move_the_slowest_pole_as_told(at_gains):
     # With half of K the poles of the regulator are at -5 in continuous time, -4.95 at 2 ms.
     np.testing.assert_allclose(at_gains.abscissa[7:11], [-10, -5, -10, -5], rtol=0.011)

@@ -87,12 +87,14 @@ def test_the_closed_loop_poles_are_those_of_python_control(loops):
     np.testing.assert_allclose(nonzero(z), nonzero(closed.poles()), rtol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("k", range(len(MEMBERS)))
 def test_a_delay_of_any_part_of_a_sample_is_exact(loops, k):
     poles = discrete(loops.member(k))
     np.testing.assert_allclose(nonzero(poles), nonzero(propagated(k)), rtol=1e-8)
 
 
+@pytest.mark.slow
 def test_the_abscissa_is_that_of_the_slowest_pole(loops):
     exact = np.max(loops.poles.real, axis=-1)
     np.testing.assert_allclose(loops.abscissa, exact, atol=1e-8)
@@ -100,6 +102,7 @@ def test_the_abscissa_is_that_of_the_slowest_pole(loops):
     assert sorted(np.flatnonzero(loops.stable[:6])) == STABLE
 
 
+@pytest.mark.slow
 def test_an_unstable_loop_is_flagged_and_has_no_margins(loops):
     wild = loops.member(4)
     assert np.isinf(wild.sensitivity_peak) and np.isinf(wild.noise_gain)

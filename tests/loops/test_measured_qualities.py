@@ -113,6 +113,7 @@ def test_measured_rms_is_free_of_what_noise_adds():
     assert scatter < 0.03 * truth**2  # the noise adds 12 %
 
 
+@pytest.mark.slow
 def test_bad_input_is_refused_by_name():
     model = delayed_integrator(1.0, 0.1)
     with pytest.raises(ValueError, match="quantity is 'angle'"):

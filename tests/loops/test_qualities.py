@@ -24,6 +24,7 @@ LOOPS = {
 }
 
 
+@pytest.mark.slow
 def test_bandwidth_of_a_delayed_integrator_is_the_closed_form():
     found = attitude_bandwidth(delayed_integrator(3.0, 0.2))
     w180 = np.pi / 2 / 0.2
@@ -37,6 +38,7 @@ def test_bandwidth_of_a_delayed_integrator_is_the_closed_form():
     assert found.remarks == ()
 
 
+@pytest.mark.slow
 def test_a_rate_response_gives_the_bandwidth_of_its_attitude():
     rate = ratio([2.0], [0.05, 1.0], 0.15)
     attitude = ratio([2.0], [0.05, 1.0, 0.0], 0.15)
@@ -54,6 +56,7 @@ def test_phase_delay_fit_is_the_least_squares_line():
     assert found.phase_delay_fit == pytest.approx(-np.polyfit(omega, phase, 1)[0] / 2, rel=1e-10)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", LOOPS)
 def test_margins_are_those_of_python_control(name):
     b, a = LOOPS[name]
@@ -213,6 +216,7 @@ def test_reverse_gradients_do_not_suffer_from_what_does_not_exist():
     assert np.isfinite(jax.grad(lag)(jnp.asarray(0.0)))
 
 
+@pytest.mark.slow
 def test_second_derivatives_of_a_crossing_are_right():
     cubic = ratio([1.0], [1.0, 0.0, 0.0, 0.0])
 
@@ -223,6 +227,7 @@ def test_second_derivatives_of_a_crossing_are_right():
     assert jax.jit(jax.hessian(place))(5.0) == pytest.approx(exact, rel=1e-12)
 
 
+@pytest.mark.slow
 def test_what_is_not_in_the_band_is_nan_with_a_reason():
     found = attitude_bandwidth(ratio([1.0], [1.0, 0.0]))
     assert np.isnan(found.bandwidth) and np.isnan(found.phase_delay)

@@ -124,6 +124,7 @@ def test_a_motor_step_solves_its_differential_equation():
     np.testing.assert_array_equal(motor.step(start, command, 0.0), start)
 
 
+@pytest.mark.slow
 def test_the_hover_answers_with_the_gains_of_its_data_sheet():
     plant = quanser_hover(lag=None)
     still = jnp.zeros(3)

@@ -112,6 +112,7 @@ def test_the_quaternion_derivative_turns_the_rotation_matrix_at_the_body_rate():
     np.testing.assert_allclose(change.transpose(2, 0, 1), expected, atol=1e-14)
 
 
+@pytest.mark.slow
 def test_euler_angles_survive_the_quaternion_and_have_a_gradient_everywhere():
     back = euler_from_quaternion(quaternion_from_euler(ANGLES))
     np.testing.assert_allclose(back, ANGLES, atol=1e-14)
@@ -122,6 +123,7 @@ def test_euler_angles_survive_the_quaternion_and_have_a_gradient_everywhere():
     np.testing.assert_allclose(slope[..., 0], 2 * np.eye(3, 4, k=1), atol=1e-15)
 
 
+@pytest.mark.slow
 def test_euler_angles_and_their_slopes_are_those_of_the_arctangent():
     def written(q):
         w, x, y, z = q

@@ -59,6 +59,7 @@ def test_a_round_trip_returns_the_same_response(name, to):
         assert_equal_responses(back.frequency_response(OMEGA), wanted, 1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SYSTEMS)
 def test_a_system_of_python_control_keeps_its_response_there_and_back(name):
     system = SYSTEMS[name]
@@ -68,6 +69,7 @@ def test_a_system_of_python_control_keeps_its_response_there_and_back(name):
     assert_equal_responses(response(model.to_control()), response(system), 1e-12)
 
 
+@pytest.mark.slow
 def test_a_model_with_mass_accelerations_and_scipy_in_between():
     model = jq.StateSpace(
         A, B[:, :1], C[:1], H1=C[1:], M=np.eye(3) + 0.1 * RANDOM.normal(size=(3, 3))

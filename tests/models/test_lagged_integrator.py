@@ -45,6 +45,7 @@ def test_damping_needs_an_integrator_and_a_sign():
     assert parameter_units(TRUTH, ["damping"]) == ("1/s",)
 
 
+@pytest.mark.slow
 def test_a_fit_names_damping_and_leaves_one_of_zero_alone():
     frf = response_of(TRUTH, error=0.01, seed=0, omega=np.asarray(OMEGA))
     start = jq.LaggedIntegrator(200.0, 0.05, 0.01, damping=1.0)
@@ -56,6 +57,7 @@ def test_a_fit_names_damping_and_leaves_one_of_zero_alone():
     assert jq.fit(jq.LaggedIntegrator(200.0, 0.05, 0.01), frf).names == ("gain", "lag", "delay")
 
 
+@pytest.mark.slow
 def test_what_a_held_input_shows_of_it_is_the_exact_sampled_plant():
     """By its partial fractions, one held; 16 aliases leave 4e-6 at 100 rad/s."""
     dt = 0.01
@@ -71,6 +73,7 @@ def test_what_a_held_input_shows_of_it_is_the_exact_sampled_plant():
     )
 
 
+@pytest.mark.slow
 def test_plants_drawn_from_a_fit_are_damped():
     frf = response_of(TRUTH, error=0.01, seed=0, omega=np.asarray(OMEGA))
     fit = jq.fit(TRUTH, frf, free=["gain", "damping", "lag", "delay"])
@@ -81,6 +84,7 @@ def test_plants_drawn_from_a_fit_are_damped():
     assert spread == pytest.approx(fit.standard_errors[1], rel=0.15)
 
 
+@pytest.mark.slow
 def test_the_formula_of_a_page_has_it():
     settings = jq.workflows.IdentifySettings(input="M", output="q")
     frf, formulas = response_of(TRUTH, error=0.01, seed=0, omega=np.asarray(OMEGA)), []

@@ -215,6 +215,7 @@ def test_an_unknown_hold_is_refused_with_those_that_exist():
         simulate_linear(model("double integrator"), NOISE, DT, hold="second")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("hold", ["zero", "first"])
 @pytest.mark.parametrize("delay", [0.0, 0.033, 0.04])
 @pytest.mark.parametrize("name", ["lightly damped mode", "feedthrough and an integrator"])

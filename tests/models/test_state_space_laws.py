@@ -49,6 +49,7 @@ def test_a_series_has_the_product_of_the_responses(seed):
     assert np.all(np.abs(found - parts[0] @ parts[1]) < 1e-9 * scale)
 
 
+@pytest.mark.slow
 @CHECK
 @hypothesis.given(seed=st.integers(0, 1000), logs=arrays(float, (4,), elements=st.floats(-3, 3)))
 def test_other_coordinates_and_other_equations_change_nothing(seed, logs):

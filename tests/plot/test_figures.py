@@ -113,6 +113,7 @@ def of_many_texts(check, frf):
     }
 
 
+@pytest.mark.slow
 def test_nothing_is_cut_off_and_no_legend_lies_on_an_axis(check, frf):
     """The layout is fixed: it counts lines instead of measuring texts."""
     for name, panels in of_many_texts(check, frf).items():

@@ -58,6 +58,7 @@ def test_a_fit_shows_its_points_its_model_and_what_it_did_not_use(fit):
     np.testing.assert_allclose(reach, fit.response_band(np.array([omega])).decibels[0, 0, 0])
 
 
+@pytest.mark.slow
 def test_two_inputs_and_two_outputs_are_a_grid_of_all_pairs():
     panels = jq.plot.bode(TWO)
     names = [panel.get_ylabel() for panel in panels]
@@ -98,6 +99,7 @@ def test_the_step_response_of_a_first_order_lag_is_exponential():
     assert panel.get_xlabel() == "time, s" and panel.get_ylabel() == "answer to a unit step"
 
 
+@pytest.mark.slow
 def test_a_loop_is_drawn_open_closed_and_by_its_poles():
     loop = case_loop(ladrc(8.0, 25.0))
     [panel] = jq.plot.step(loop, duration=2.0)

@@ -87,6 +87,7 @@ def test_a_table_without_rows_is_refused(tmp_path):
         load(written(tmp_path, []))
 
 
+@pytest.mark.slow
 @FUZZ
 @given(st.binary(max_size=60), st.integers(0, 700), st.integers(0, 100))
 def test_damage_raises_nothing_but_read_errors(folder, new, at, gone):

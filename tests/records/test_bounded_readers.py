@@ -32,6 +32,7 @@ def mat_of_zeros(path, variables, size):
     return len(content)
 
 
+@pytest.mark.slow
 def test_mat_is_bounded_over_all_variables_and_after_widening(tmp_path):
     path = tmp_path / "log.mat"
     stored = mat_of_zeros(path, 44, 8_000_000)  # 2.8 GB of doubles

@@ -88,6 +88,7 @@ def test_a_damaged_head_is_refused_with_its_place(data, offset, reason):
     assert caught.value.offset == offset
 
 
+@pytest.mark.slow
 @FUZZ
 @given(
     st.sampled_from([PLAIN, MIXED]),

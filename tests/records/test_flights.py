@@ -252,6 +252,7 @@ def of_phase_alone(log, folder):
     return written(folder / "log.csv", table.time, columns)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "axes"), [("A_chirp_roll", 1), ("B_chirp_three_axes", 3)])
 def test_a_chirp_whose_phase_alone_is_logged_is_the_same_chirp(data, tmp_path, name, axes):
     whole = data / FIRMWARE / f"{name}.BFL"
@@ -273,6 +274,7 @@ def test_a_chirp_whose_phase_alone_is_logged_is_the_same_chirp(data, tmp_path, n
         np.testing.assert_allclose(ours.band, theirs.band, rtol=0.2)
 
 
+@pytest.mark.slow
 def test_a_response_with_the_sine_of_the_phase_is_that_with_the_excitation(data, tmp_path):
     """To three standard errors, at all frequencies that both see."""
     log = load_log(data / FIRMWARE / "A_chirp_roll.BFL")
@@ -292,6 +294,7 @@ def test_a_response_with_the_sine_of_the_phase_is_that_with_the_excitation(data,
     np.testing.assert_array_less(np.abs(a / b - 1), 3 * np.asarray(error).ravel())
 
 
+@pytest.mark.slow
 def test_a_gap_that_is_allowed_is_allowed_for_the_spectrum_over_the_throttle(tmp_path):
     time = np.arange(20_000) / 1000
     wave = 50 * np.sin(20 * time)

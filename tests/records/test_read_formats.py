@@ -153,6 +153,7 @@ def test_a_chunk_that_unfolds_to_gigabytes_is_stopped(tmp_path):
         channels(tmp_path / name)
 
 
+@pytest.mark.slow
 def test_parquet_gives_numbers_stamps_in_seconds_and_nan_for_what_is_missing(tmp_path):
     arrow = pytest.importorskip("pyarrow")
     parquet = pytest.importorskip("pyarrow.parquet")

@@ -42,6 +42,7 @@ def test_the_flight_that_is_asked_for_makes_a_loose_parameter_known():
     assert after < before / 4
 
 
+@pytest.mark.slow
 def test_the_flight_names_channel_amplitude_and_seconds():
     frf = response_of(TRUTH, error=0.02, seed=3, omega=BELOW)
     flown = record()
@@ -51,6 +52,7 @@ def test_the_flight_names_channel_amplitude_and_seconds():
     assert seconds >= 5 * 2 * np.pi / band_of(flight)[0] and seconds <= 2 * flown.duration + 10
 
 
+@pytest.mark.slow
 def test_a_known_model_is_to_be_verified_and_then_needs_nothing():
     frf = response_of(TRUTH, error=0.005, seed=0)
     fit, flown = fitted(frf), record()

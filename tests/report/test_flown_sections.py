@@ -99,6 +99,7 @@ def test_a_step_that_the_log_does_not_show_is_computed_by_the_law(frf):
     assert bare is not None and bare["computed"] is None
 
 
+@pytest.mark.slow
 def test_a_motor_is_called_one_where_it_follows_the_throttle(frf, tmp_path):
     fit = jq.fit(jq.LaggedIntegrator(10.0, 0.01, 0.0), frf, free=("gain", "lag"))
     record = flown()

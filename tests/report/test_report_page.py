@@ -128,6 +128,7 @@ def test_errors_of_the_package_speak_for_themselves():
     assert reason_of(KeyError("rate")) == "KeyError: 'rate'"
 
 
+@pytest.mark.slow
 def test_a_figure_that_cannot_be_drawn_leaves_its_section(tmp_path, frf, fit, record, monkeypatch):
     monkeypatch.setattr(jq.plot, "record_figure", lambda *_: 1 / 0)
     page = read_page(write_report(tmp_path / "report.html", fit=fit, frf=frf, record=record))
@@ -219,6 +220,7 @@ def test_equal_results_give_equal_bytes(tmp_path, frf, fit, log):
     assert pages[0].read_bytes() == pages[1].read_bytes()
 
 
+@pytest.mark.slow
 def test_names_from_a_log_are_shown_and_not_obeyed(tmp_path, frf, fit, whole):
     """Every name, unit, remark, file name and command is hostile, each in another way."""
     u, y, r, unit, source, words = HOSTILE
@@ -258,6 +260,7 @@ def test_not_identifiable_comes_first_and_marks_its_numbers(tmp_path, frf):
     assert "Null directions" in text and "direction 1" in text and "jq.identify.Prior" in text
 
 
+@pytest.mark.slow
 def test_what_could_not_be_fitted_has_a_page_too(tmp_path, frf, record):
     weak = eqx.tree_at(lambda f: f.coherence, frf, frf.coherence * 0.1)
     blind = eqx.tree_at(
@@ -303,6 +306,7 @@ def test_a_fit_without_a_minimum_is_no_result(tmp_path, frf, fit):
     assert header.split()[:3] == ["\u2717", "NO", "MINIMUM"]
 
 
+@pytest.mark.slow
 def test_several_responses_have_a_part_each(tmp_path, frf, fit):
     both = {"empty": frf, "loaded": frf}
     models = {"loaded": jq.LaggedIntegrator(140.0, 0.016, 0.011)}

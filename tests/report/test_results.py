@@ -53,6 +53,7 @@ def test_a_result_file_holds_the_numbers_of_the_fit(tmp_path, fit, frf, check):
     assert [file.name for file in path.parent.iterdir()] == ["result.json"]
 
 
+@pytest.mark.slow
 def test_what_is_not_determined_keeps_its_number_and_is_marked(tmp_path):
     rig = jq.models.AttitudeAxis(0.197, 0.1188, 0.0552, 0.02)
     fit = jq.fit(rig, response_of(rig, seed=0), free=("J_x", "K_t"))
@@ -104,6 +105,7 @@ def test_a_value_has_the_digits_that_its_error_supports(fit, value, error, text)
     assert f" {text} " in compare_fits({"fit": other}).splitlines()[1]
 
 
+@pytest.mark.slow
 def test_a_tied_parameter_is_a_row_of_the_page(frf, tmp_path):
     tied = {"delay": lambda model: 0.7 * model.lag}
     fit = jq.fit(TRUTH, frf, free=("gain", "lag"), tied=tied)

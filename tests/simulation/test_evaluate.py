@@ -80,6 +80,7 @@ def stored(ensemble):
     return simulate(*ensemble)
 
 
+@pytest.mark.slow
 def test_a_loop_is_judged_alike_while_it_runs_and_from_its_record(running, stored):
     recorded = metrics(stored, start=1.0, load_start=5.0)
     for name in NUMBERS:
@@ -87,6 +88,7 @@ def test_a_loop_is_judged_alike_while_it_runs_and_from_its_record(running, store
         np.testing.assert_allclose(found, expected, rtol=1e-12, err_msg=name)
 
 
+@pytest.mark.slow
 def test_a_diverged_member_is_finite_flagged_and_counted(running):
     assert running.diverged.tolist() == [False, False, False, True]
     assert np.isfinite(running.itae).all() and np.isfinite(running.activity).all()
@@ -98,6 +100,7 @@ def test_a_diverged_member_is_finite_flagged_and_counted(running):
     assert "1 of 4 members (25.0%) diverged" in str(running)
 
 
+@pytest.mark.slow
 def test_saturation_is_counted_from_the_record(running, stored):
     limits = np.array(LIMITS) * (1 - 1e-5)
     share = np.mean(np.abs(np.asarray(stored.command)[500:]) >= limits, axis=0)
@@ -121,6 +124,7 @@ def paper():
     return evaluate(Loop(PLANT, ladrc([3.0, 1.6, GAIN / INERTIA])), three(Step(1.0)))
 
 
+@pytest.mark.slow
 def test_steps_have_the_numbers_of_an_independent_simulation(paper):
     """Figures of an independent prototype, known to three digits."""
     np.testing.assert_allclose(paper.itae[0], [1.380, 0.051, 0.030], rtol=5e-3)
@@ -166,6 +170,7 @@ def test_the_gradient_is_that_of_central_differences(ensemble):
     assert float(exact) == pytest.approx(float(numeric), rel=1e-6)
 
 
+@pytest.mark.slow
 def test_evaluate_runs_under_jit_and_vmap(paper):
     happens = scenario(duration=10.0, axes=1, reference={0: Step(1.0)})
 
@@ -210,6 +215,7 @@ def test_what_happens_at_some_samples_only_stays_so_under_vmap():
     assert "cond[" in str(jax.make_jaxpr(jax.grad(mean))(jnp.asarray(10.0)))
 
 
+@pytest.mark.slow
 def test_float32_loops_are_judged_in_float32(paper):
     single = lambda tree: jax.tree.map(
         lambda x: x.astype(jnp.float32) if eqx.is_array(x) else x, tree
@@ -252,6 +258,7 @@ def test_the_authority_of_axes_is_that_of_the_nearest_limit():
         authority(Silent())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("torque", "share"), [(0.2, 0.5), (0.3, 0.5), (0.09, 0.0)])
 def test_a_disturbance_beyond_the_authority_is_reported(torque, share):
     happens = three(Step(0.0), Pulse(torque, period=5.0, share=0.5))
@@ -267,6 +274,7 @@ def test_a_disturbance_beyond_the_authority_is_reported(torque, share):
         assert "exceed the torque of the drive: samples 50.0% on roll" in str(found)
 
 
+@pytest.mark.slow
 def test_the_warning_counts_the_members_of_a_plant():
     happens = scenario(duration=10.0, axes=1, disturbance={0: Step(0.2)})
     plant = DecoupledAxes([[0.0468, 0.0936, 0.14]], [INERTIA])
@@ -275,6 +283,7 @@ def test_the_warning_counts_the_members_of_a_plant():
         evaluate(loop, happens)
 
 
+@pytest.mark.slow
 def test_parts_of_one_loop_may_be_narrower_than_its_ensemble(ensemble, running):
     loop, happens = ensemble
     wide = jax.tree.map(

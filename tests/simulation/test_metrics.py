@@ -175,6 +175,7 @@ def test_what_a_load_does_is_not_taken_for_the_answer_to_the_step(steps):
     np.testing.assert_allclose(found.rms[0], np.sqrt(np.mean(error**2, axis=0)), rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_summary_is_that_of_numpy_and_counts_every_member():
     scale = np.random.default_rng(5).lognormal(size=64)
     error = scale * np.exp(-3.0 * TIME[:, None])[:, None]

@@ -77,6 +77,7 @@ def same(one, other):
         np.testing.assert_array_equal(x, y, err_msg=str(path))
 
 
+@pytest.mark.slow
 def test_members_fly_as_on_one_core(cores, calls):
     found = []
     for count in (1, 2, 16):
@@ -89,6 +90,7 @@ def test_members_fly_as_on_one_core(cores, calls):
     assert len({thread for thread, _ in calls}) > 1
 
 
+@pytest.mark.slow
 def test_sizes_share_a_program(cores, calls):
     cores(2)
     for members in (90, MEMBERS, 170):
@@ -96,6 +98,7 @@ def test_sizes_share_a_program(cores, calls):
     assert {width for _, width in calls} == {PART}
 
 
+@pytest.mark.slow
 def test_metrics_are_those_of_one_core(cores):
     found = []
     for count in (1, 3):
@@ -111,6 +114,7 @@ def test_what_all_members_share_is_there_once(cores):
     assert found.authority is not None and found.authority.torque.shape == (1,)
 
 
+@pytest.mark.slow
 def test_an_ensemble_of_two_axes_is_parted_by_its_last(cores):
     spread = 0.0552 * np.geomspace(0.5, 2.0, MEMBERS)
     inertia, found = spread * np.array([[[1.0], [1.1]]]), []
@@ -153,6 +157,7 @@ def test_a_short_flight_is_not_worth_a_thread(monkeypatch, calls):
     assert len(calls) == 1
 
 
+@pytest.mark.slow
 def test_within_another_program_nothing_is_parted(cores):
     cores(2)
 

@@ -60,6 +60,7 @@ def independent(plant, inputs, disturbance):
     return jax.vmap(lambda x: plant.measure(unravel(x)))(np.stack(states))
 
 
+@pytest.mark.slow
 def test_between_samples_the_loop_agrees_with_scipy_under_the_same_held_inputs():
     plant, case = rig(), scenario()
     found = simulate(Loop(plant, PILOT, dt=DT, drive=DRIVE), case)
@@ -69,6 +70,7 @@ def test_between_samples_the_loop_agrees_with_scipy_under_the_same_held_inputs()
     np.testing.assert_allclose(found.angle, expected, rtol=0, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_the_error_falls_as_the_fourth_power_of_the_step():
     def final(steps):
         held = quiet(steps + 1, injection=(3.0, -2.0, 4.0), disturbance=(0.05, 0.02, -0.02))
@@ -96,6 +98,7 @@ def fleet():
     return simulate(Loop(rig(INERTIAS), PILOT, dt=DT, drive=DRIVE, encoder=ENCODER), case)
 
 
+@pytest.mark.slow
 def test_an_ensemble_is_as_many_single_runs():
     together, case = fleet(), scenario(1, (3,))
     assert together.angle.shape == (SAMPLES, 3, 3)
@@ -111,6 +114,7 @@ def test_an_ensemble_is_as_many_single_runs():
             )
 
 
+@pytest.mark.slow
 def test_one_scenario_serves_an_ensemble_of_plants():
     one, wide = scenario(2), jax.tree.map(lambda x: jnp.stack([x] * 3, axis=-1), scenario(2))
     found, expected = (
@@ -150,6 +154,7 @@ def test_forward_reverse_and_finite_derivatives_agree():
     assert reverse @ np.array(SHEET.inertia) == pytest.approx(float(finite), rel=1e-6)
 
 
+@pytest.mark.slow
 def test_single_precision_stays_single():
     with jax.enable_x64(False):
         narrow = Scenario(*(jnp.zeros((5, 3), jnp.float32) for _ in range(4)))

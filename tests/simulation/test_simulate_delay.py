@@ -82,6 +82,7 @@ def test_a_traced_delay_gives_the_same_and_its_gradient_is_that_of_differences()
         assert float(slope(delay)) == pytest.approx(float(difference), rel=1e-6)
 
 
+@pytest.mark.slow
 def test_the_loop_is_smooth_where_the_delay_passes_a_whole_sample():
     slope = jax.jit(jax.grad(final))
     below, at, above = (float(slope(0.004 + h)) for h in (-1e-9, 0.0, 1e-9))

@@ -161,6 +161,7 @@ def test_no_runaway_makes_values_or_gradients_infinite(name):
     assert all(np.all(np.isfinite(x)) for x in gradients(plant, law, step(), **options))
 
 
+@pytest.mark.slow
 def test_under_vmap_and_jit_nothing_is_raised():
     run = lambda b0: simulate(
         Loop(axes(INERTIA[:, 0]), eqx.tree_at(lambda c: c.b0, LAW, b0)), step()

@@ -86,6 +86,7 @@ def test_the_disturbance_estimate_is_recorded_in_units_of_the_command():
     np.testing.assert_allclose(found.signals["disturbance"][-1] * KT, 0.004, rtol=1e-3)
 
 
+@pytest.mark.slow
 def test_ensembles_of_plants_laws_scenarios_and_delays_meet():
     b0 = KT / J * np.array([[0.8, 1.0, 1.5]] * 2)
     inertia = J * np.array([[1.0, 1.2, 0.9]] * 2)

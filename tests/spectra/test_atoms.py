@@ -86,6 +86,7 @@ def test_all_forms_of_the_covariance_are_the_plain_one(errors, plain):
     )
 
 
+@pytest.mark.slow
 def test_projections_and_pairs_do_not_depend_on_the_form(plain):
     columns = draw(np.random.default_rng(1), *SHAPE, 5)
     expected = WHOLE.project(columns)
@@ -94,6 +95,7 @@ def test_projections_and_pairs_do_not_depend_on_the_form(plain):
     np.testing.assert_allclose(one.between((0, 0), (0, 0)), 4 * plain[:, 1, 2, :, 1, 2], rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_the_projection_is_the_variance_of_a_weighted_sum(plain):
     """The two columns are the real and the imaginary part of one sum."""
     columns = np.zeros((*SHAPE, 2), complex)

@@ -44,6 +44,7 @@ def error_of_correlation(size: float, turn: float, seed: int) -> float:
     return float(np.sqrt(np.mean(np.abs(found - exact(OMEGA)) ** 2)))
 
 
+@pytest.mark.slow
 def test_outputs_are_correlated_as_in_a_wide_band_unless_that_changes_along_frequency():
     """A wide band knows a steady correlation three times better, and would miss all of a turn."""
     steady, turning = (

@@ -124,6 +124,7 @@ def test_the_random_error_of_both_inputs_is_their_scatter(draws):
     assert 0.8 < ratio.min() and ratio.max() < 1.25
 
 
+@pytest.mark.slow
 def test_the_errors_of_both_inputs_are_correlated_as_they_scatter(draws):
     found, truth, errors = draws
     sample = np.mean(errors[:, :, 0] * errors[:, :, 1].conj(), axis=0)

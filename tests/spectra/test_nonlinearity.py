@@ -6,7 +6,7 @@ from scipy import signal
 
 from jaxquad.records import Record
 from jaxquad.spectra import frequency_response, JointInputOutput, Welch
-from jaxquad.spectra._harmonics import interpolated, phase_of_sweep
+from jaxquad.spectra._linearity import interpolated, phase_of_sweep
 
 
 DT, SAMPLES = 0.02, 3000

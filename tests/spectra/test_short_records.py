@@ -43,6 +43,7 @@ def test_a_second_of_a_closed_loop_is_called_too_short(seconds, seed):
     assert "Record at least" in said
 
 
+@pytest.mark.slow
 def test_a_record_without_any_response_says_why():
     """The references move the input too little, at all frequencies."""
     u, y, r = np.random.default_rng(0).standard_normal((3, 600))

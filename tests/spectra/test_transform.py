@@ -3,9 +3,15 @@ import pytest
 
 from jaxquad.records import Record
 from jaxquad.spectra import Composite, Welch
-from jaxquad.spectra._fourier_sums import _block_functions, fourier_sums, Taper
+from jaxquad.spectra._fourier_sums import (
+    _block_functions,
+    fourier_sums,
+    lattice_windows,
+    segment_starts,
+    Taper,
+    window,
+)
 from jaxquad.spectra._welch import transform_records
-from jaxquad.spectra._windows import lattice_windows, segment_starts, window
 
 
 # Lengths of whole blocks and odd ones, short and very short; starts on and off blocks.

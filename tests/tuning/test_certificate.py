@@ -58,6 +58,7 @@ def test_members_are_unstable_where_the_eigenvalues_of_an_independent_loop_leave
     assert 0 < certificate.designs["paper b0 = 3"].unstable_count < MEMBERS
 
 
+@pytest.mark.slow
 def test_itae_starts_its_clock_at_every_event_and_activity_does_not(certificate):
     members = OPEN.fresh(LOOP, MEMBERS, jax.random.key(3))
     flown = jq.simulate(
@@ -80,12 +81,14 @@ def test_itae_starts_its_clock_at_every_event_and_activity_does_not(certificate)
     np.testing.assert_allclose(found.of("overshoot"), 100 * np.maximum(*past), rtol=1e-6, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_all_designs_meet_the_same_members_and_noise(certificate):
     own, twin = certificate.design, certificate.designs["twin"]
     for name, values in own.by_axis.items():
         np.testing.assert_array_equal(twin.by_axis[name], values)
 
 
+@pytest.mark.slow
 def test_the_members_are_fresh_and_those_of_the_key(certificate):
     trained = OPEN.draw(LOOP, MEMBERS, jax.random.key(3))
     seen = np.asarray(trained.assumed_inertia)[0]
@@ -97,6 +100,7 @@ def test_the_members_are_fresh_and_those_of_the_key(certificate):
     assert certificate.provenance["key"] == jax.random.key_data(jax.random.key(3)).tolist()
 
 
+@pytest.mark.slow
 def test_a_design_within_its_limits_holds_and_says_what_that_proves():
     limits = (Limit("sensitivity_peak", at_most=10.0), Limit("phase_margin", at_least=0.1))
     slow = jq.LADRC(4.0, 20.0, 1.0)

@@ -118,6 +118,7 @@ def test_a_limit_is_kept_and_is_said_to_hold_the_optimum_back():
     assert found.active == (one.limit,) and "on the members tuned on, active" in str(found)
 
 
+@pytest.mark.slow
 def test_the_first_line_is_the_verdict():
     found = tuned("slow")
     first, *verdicts = str(found).splitlines()[:4]
@@ -156,6 +157,7 @@ def test_names_that_mean_nothing_are_refused():
             run(controller, free=free)
 
 
+@pytest.mark.slow
 def test_members_that_no_gains_stabilise_are_reported_with_lag_times_wc():
     slow = ensemble(lag=Uniform(0.4, 0.41)).draw(loop(), MEMBERS, KEY)
     found = run(equivalent(30.0, 90.0), slow, method=LBFGS(evaluations=3))

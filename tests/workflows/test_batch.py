@@ -87,6 +87,7 @@ def alive(process: int) -> bool:
         return False
 
 
+@pytest.mark.slow
 def test_one_failing_log_is_a_row_and_stops_no_other(tmp_path):
     names = ["a.csv", "b.csv", "defect.csv", "killed.csv", "unusable.csv", "z.csv"]
     folder, out = logs(tmp_path / "logs", names), tmp_path / "out"

@@ -71,6 +71,7 @@ def test_a_reference_that_moves_nothing_leaves_no_response_and_is_named(poles, t
     assert remark in str(found)
 
 
+@pytest.mark.slow
 def test_an_identification_can_be_pickled(log, found):
     sent = lambda x: pickle.loads(pickle.dumps(x))
     opened = sent(open_logs(log, found.settings))
@@ -79,6 +80,7 @@ def test_an_identification_can_be_pickled(log, found):
     assert str(sent(found)) == str(found)
 
 
+@pytest.mark.slow
 def test_numbers_and_figures_are_at_hand_without_a_folder(found):
     assert found.fit.verdict.identifiable
     assert found.fit.values[0] == pytest.approx(GAIN, rel=0.03)
@@ -119,6 +121,7 @@ def test_a_result_is_made_again_from_its_settings(found, folder, log, tmp_path):
         identify_again(folder, log=moved)
 
 
+@pytest.mark.slow
 def test_the_sum_of_lag_and_delay_has_its_unit_in_the_report(folder):
     page = (folder / "report.html").read_text()
     row = re.search(r"<bdi>lag \+ delay</bdi></th>(.*?)</tr>", page, re.S)
@@ -153,6 +156,7 @@ def test_a_narrow_band_is_named_in_options():
     assert remedies[0].startswith(advice)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("terms", "unit"),
     [(("lag", "delay"), "s"), (("gain", "lag"), ""), (("lag",), ""), ((), ""), (("x", "lag"), "")],
@@ -181,6 +185,7 @@ def test_what_is_not_identifiable_is_a_value_with_advice(tmp_path):
         verify_result(stored, noise)
 
 
+@pytest.mark.slow
 def test_what_stands_beside_the_fit_may_fail(log, tmp_path, monkeypatch, capsys):
     """Halves of the band and a figure: the code stays 0, page and text say what is missing."""
     monkeypatch.setattr(jq.identify.Fit, "bands", lambda _: 1 / 0)
@@ -224,6 +229,7 @@ def test_a_hover_without_a_reference_is_no_plant(more, tmp_path, capsys):
     assert "Nothing about this vehicle." in (tmp_path / "report.html").read_text()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("gain", "said"), [(-8.0, ["the gain is negative: when u0 rises, y0 falls."]), (8.0, [])]
 )

@@ -61,6 +61,7 @@ def test_a_result_has_the_model_the_numbers_and_the_settings(found, folder):
     assert stored.tuned is None and "gain = " in str(stored) and len(str(stored)) < 500
 
 
+@pytest.mark.slow
 def test_the_stored_response_is_that_which_was_fitted(found, folder):
     frf = jq.load_result(folder / "result.json").frf
     np.testing.assert_allclose(frf.response, found.frf.response, rtol=1e-9)

@@ -123,8 +123,7 @@ class ArduPilotAttitude(AngleLoop):
 
     The rate's target is `p` times the error of the angle, beyond a_max/p^2 the root of it that a
     deceleration a_max needs, plus the rate of a `Setpoint` (what input shaping gives); it is used
-    one loop later. The rate that the inner loop sees is the difference of the measured angles over
-    a sample. Source: docs/autopilots.md.
+    one loop later. Source: docs/autopilots.md.
 
     **Arguments:** (each number is a scalar, one value per axis, or `[axes, *ensemble]`)
 
@@ -133,9 +132,7 @@ class ArduPilotAttitude(AngleLoop):
     - `acceleration_limit`: half of ATC_ACCEL_x_MAX in rad/s^2; the default is 550 deg/s^2.
     - `rate_limit`: ATC_RATE_x_MAX in rad/s; inf is none.
 
-    **Raises:**
-
-    - `ValueError`: `p` or a limit is not above 0.
+    **Raises:** `ValueError`: `p` or a limit is not above 0.
     """
 
     rate: ArduPilotRate
@@ -195,9 +192,7 @@ class HarmonicNotch(eqx.Module):
     - `harmonics`: multiples of the centre that have notches.
     - `notches`: 1, 2, 3 or 5 at each harmonic.
 
-    **Raises:**
-
-    - `ValueError`: centre or quality is not above 0, or a multiple is below 1.
+    **Raises:** `ValueError`: centre or quality is not above 0, or a multiple is below 1.
     """
 
     centre_hz: Float[Array, "..."] = per_member(rank=1, converter=as_float)
@@ -279,47 +274,6 @@ _FOLLOWED = {
 }  # fmt: skip
 
 
-def _gyro_notches(
-    number: Callable[[str, float], float], tracked_hz: Mapping[int, Sequence[float]]
-) -> tuple[list[HarmonicNotch], list[Tracking], list[Message]]:
-    """Notches of INS_HNTCH_* and INS_HNTC2_*, which follow the throttle, and what is left out."""
-    filters: list[HarmonicNotch] = []
-    tracking: list[Tracking] = []
-    unmodelled: list[Message] = []
-    for name in ("INS_HNTCH", "INS_HNTC2"):
-        read = lambda end, default, name=name: number(f"{name}_{end}", default)
-        mask = round(read("HMNCS", 3.0))
-        if read("ENABLE", 0.0) <= 0 or mask == 0:
-            continue
-        frequency, reference = read("FREQ", 80.0), read("REF", 0.0)
-        mode = round(read("MODE", 1.0)) if reference > 0 else 0
-        options = round(read("OPTS", 0.0))  # the double notch goes before the triple one
-        notch = ardupilot_harmonic_notch(
-            frequency, read("BW", 40.0), read("ATT", 40.0),
-            harmonics=[k + 1 for k in range(16) if mask >> k & 1],
-            notches=2 if options & 1 else 3 if options & 16 else 5 if options & 64 else 1,
-        )  # fmt: skip
-        if mode == 1:
-            tracking.append(Tracking(len(filters), frequency, reference, read("FM_RAT", 1.0)))
-        if mode not in _FOLLOWED:
-            filters.append(notch)
-        elif sources := tracked_hz.get(mode):
-            centres = list(sources)  # a notch for each, or one for their mean
-            if not options & 2 or mode in (2, 5):
-                centres = [(1.0 if mode == 4 else reference) * float(np.mean(sources))]
-            lowest = notch.centre_hz
-            filters += [
-                dataclasses.replace(notch, centre_hz=jnp.maximum(lowest, x)) for x in centres
-            ]
-        else:
-            text = (
-                f"{name}_MODE {mode}: the harmonic notch follows {_FOLLOWED[mode]}, from "
-                f"{frequency:g} Hz on; give what it followed in Hz (`tracked_hz={{{mode}: [...]}}`)"
-            )
-            unmodelled.append(Message(text, "notch"))
-    return filters, tracking, unmodelled
-
-
 class FlownArduPilot(FlownLoop[ArduPilotRate]):
     """ArduPilot's rate loop of a log, with the notches that follow the throttle.
 
@@ -360,26 +314,13 @@ def ardupilot_loop(
     - `tracked_hz`: what harmonic notches follow that go by an RPM sensor (2, 5), ESC telemetry (3)
         or the gyro's spectrum (4), in Hz: by INS_HNTCH_MODE, with a number for each source.
 
-    **Raises:**
-
-    - `ValueError`: a gain is missing.
+    **Raises:** `ValueError`: a gain is missing.
     """
-    read = Numbers(values)
-    rate = read.number("SCHED_LOOP_RATE", 400.0)
-    gyro_rate = 1000.0 * 2 ** read.number("INS_GYRO_RATE", 0.0)
+    number = Numbers(values).number
+    rate = number("SCHED_LOOP_RATE", 400.0)
+    gyro_rate = 1000.0 * 2 ** number("INS_GYRO_RATE", 0.0)
     gyro_rate = rate * max(1, math.ceil(gyro_rate / rate - 1e-9))
-    per_axis = lambda end, default=None: [read.number(name, default) for name in _of(end)]
-    limit = np.array(per_axis("PDMX", 0.0))
-    cutoff = read.number("INS_GYRO_FILTER", 20.0)
-    notches, tracking, left_out = _gyro_notches(read.number, tracked_hz or {})
-    low_pass = (Butterworth(cutoff),) if cutoff > 0 else ()
-    law = ArduPilotRate(
-        p=per_axis("P"), i=per_axis("I"), d=per_axis("D"), ff=per_axis("FF", 0.0),
-        d_ff=per_axis("D_FF", 0.0), gyro=FilterChain((*notches, *low_pass), gyro_rate),
-        target_hz=per_axis("FLTT", 20.0), error_hz=per_axis("FLTE", 0.0),
-        derivative_hz=per_axis("FLTD", 20.0), integral_limit=per_axis("IMAX", 0.5),
-        pd_limit=np.where(limit > 0, limit, np.inf), dt=1 / rate,
-    )  # fmt: skip
+    per_axis = lambda end, default=None: [number(name, default) for name in _of(end)]
     switched = {
         **dict.fromkeys(_of("SMAX"), "the slew limiter lowers P and D"),
         **{f"ATC_RAT_{x}_{n}": Message("a notch", "notch") for x in _SHORT for n in ("NTF", "NEF")},
@@ -387,9 +328,52 @@ def ardupilot_loop(
     }
     unmodelled = [
         Message(f"{name}: {what}", Message(what).kind)
-        for name, what in switched.items() if read.number(name, 0.0) > 0
+        for name, what in switched.items() if number(name, 0.0) > 0
     ]  # fmt: skip
-    flown = FlownArduPilot(law, (*unmodelled, *left_out), tuple(tracking))
+    filters: list[HarmonicNotch] = []
+    tracking: list[Tracking] = []
+    for name in ("INS_HNTCH", "INS_HNTC2"):
+        read = lambda end, default, name=name: number(f"{name}_{end}", default)
+        mask = round(read("HMNCS", 3.0))
+        if read("ENABLE", 0.0) <= 0 or mask == 0:
+            continue
+        frequency, reference = read("FREQ", 80.0), read("REF", 0.0)
+        mode = round(read("MODE", 1.0)) if reference > 0 else 0
+        options = round(read("OPTS", 0.0))  # the double notch goes before the triple one
+        notch = ardupilot_harmonic_notch(
+            frequency, read("BW", 40.0), read("ATT", 40.0),
+            harmonics=[k + 1 for k in range(16) if mask >> k & 1],
+            notches=2 if options & 1 else 3 if options & 16 else 5 if options & 64 else 1,
+        )  # fmt: skip
+        if mode == 1:
+            tracking.append(Tracking(len(filters), frequency, reference, read("FM_RAT", 1.0)))
+        if mode not in _FOLLOWED:
+            filters.append(notch)
+        elif sources := (tracked_hz or {}).get(mode):
+            centres = list(sources)  # a notch for each, or one for their mean
+            if not options & 2 or mode in (2, 5):
+                centres = [(1.0 if mode == 4 else reference) * float(np.mean(sources))]
+            lowest = notch.centre_hz
+            filters += [
+                dataclasses.replace(notch, centre_hz=jnp.maximum(lowest, x)) for x in centres
+            ]
+        else:
+            text = (
+                f"{name}_MODE {mode}: the harmonic notch follows {_FOLLOWED[mode]}, from "
+                f"{frequency:g} Hz on; give what it followed in Hz (`tracked_hz={{{mode}: [...]}}`)"
+            )
+            unmodelled.append(Message(text, "notch"))
+    limit = np.array(per_axis("PDMX", 0.0))
+    cutoff = number("INS_GYRO_FILTER", 20.0)
+    low_pass = (Butterworth(cutoff),) if cutoff > 0 else ()
+    law = ArduPilotRate(
+        p=per_axis("P"), i=per_axis("I"), d=per_axis("D"), ff=per_axis("FF", 0.0),
+        d_ff=per_axis("D_FF", 0.0), gyro=FilterChain((*filters, *low_pass), gyro_rate),
+        target_hz=per_axis("FLTT", 20.0), error_hz=per_axis("FLTE", 0.0),
+        derivative_hz=per_axis("FLTD", 20.0), integral_limit=per_axis("IMAX", 0.5),
+        pd_limit=np.where(limit > 0, limit, np.inf), dt=1 / rate,
+    )  # fmt: skip
+    flown = FlownArduPilot(law, tuple(unmodelled), tuple(tracking))
     return dataclasses.replace(flown, law=flown.at(throttle))
 
 

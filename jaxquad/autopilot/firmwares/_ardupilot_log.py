@@ -24,7 +24,6 @@ from jaxquad.records.firmware import (
     Point,
     Selection,
     Setup,
-    Signals,
     values_of,
     with_injections,
 )
@@ -76,7 +75,23 @@ def ardupilot_setup(log: Log, wanted: Selection) -> Setup:
     if chosen := choose_chirps(chirps, wanted):
         setup = _chirped(log, chosen)
     else:
-        setup = _without_chirp(signals, wanted.axis or most_active_axis(signals, rates), rates)
+        axis = wanted.axis or most_active_axis(signals, rates)
+        letter = _LETTERS[axis]
+        command = f"RATE.{letter}Out"
+        if not rates[axis] or values_of(signals, command).size == 0:
+            raise RecordError(f"the log has no {command} or no RATE.{letter}.")
+        remarks = [
+            f"RATE.{letter}Des is computed by the attitude loop: it contains feedback and cannot "
+            f"be the external reference",
+            f"for an external reference, {_FLY}",
+        ]
+        stick = f"RCIN.C{AXES.index(axis) + 1 if axis != 'yaw' else 4}"
+        if {"RCIN.C1", stick} <= signals.arrays.keys():
+            remarks.append(
+                f"the stick ({stick}, {channel_rate(signals, stick):.3g} Hz) is not affected by "
+                f"feedback: use --reference {stick} if it moved enough"
+            )
+        setup = Setup(axis, {command: 1.0}, rates[axis], remarks=tuple(remarks))
     # What the flight mode computes acts in the next loop, behind the rate controller, unless that
     # has a thread of its own (FSTRATE_ENABLE).
     late, loop_hz = {}, number_of(log, "SCHED_LOOP_RATE")
@@ -159,26 +174,6 @@ def _chirped(log: Log, chirps: list[NumberedChirp]) -> Setup:
     command, remarks = {f"{rate}Out": 1.0}, tuple(remarks)
     setup = Setup(axis, command, rate, "SIDD.Targ", remarks=remarks, injected_at=point)
     return with_injections(setup, logged, f"SystemID chirp into {place}")
-
-
-def _without_chirp(signals: Signals, axis: str, rates: dict[str, str]) -> Setup:
-    letter = _LETTERS[axis]
-    command = f"RATE.{letter}Out"
-    if not rates[axis] or values_of(signals, command).size == 0:
-        raise RecordError(f"the log has no {command} or no RATE.{letter}.")
-    remarks = [
-        f"RATE.{letter}Des is computed by the attitude loop: it contains feedback and cannot be "
-        f"the external reference",
-        f"for an external reference, {_FLY}",
-    ]
-    if "RCIN.C1" in signals.arrays:
-        stick = f"RCIN.C{AXES.index(axis) + 1 if axis != 'yaw' else 4}"
-        if stick in signals.arrays:
-            remarks.append(
-                f"the stick ({stick}, {channel_rate(signals, stick):.3g} Hz) is not affected by "
-                f"feedback: use --reference {stick} if it moved enough"
-            )
-    return Setup(axis, {command: 1.0}, rates[axis], remarks=tuple(remarks))
 
 
 LOG = FirmwareLog(

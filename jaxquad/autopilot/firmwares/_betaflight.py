@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from jaxquad._core import Message, Number
+from jaxquad._core import Message
 from jaxquad.identify import CurveFirmware
 from jaxquad.records import AXES
 
@@ -41,6 +41,9 @@ from ._betaflight_log import LOG
 
 
 Ends = tuple[float, float, float]  # of a dynamic cutoff: lowest and highest in Hz, expo
+Ratio = Float[ArrayLike, "..."]
+Samples = Float[np.ndarray, " samples"]
+Speeds = Float[np.ndarray, "samples axes"]
 
 
 class FlownBetaflight(FlownLoop[BetaflightPID]):
@@ -72,11 +75,7 @@ class FlownBetaflight(FlownLoop[BetaflightPID]):
         return flown
 
     def at(
-        self,
-        throttle: Float[ArrayLike, "..."],
-        *,
-        surge: Float[ArrayLike, "..."] = 0.0,
-        integral_share: Float[ArrayLike, "..."] = 1.0,
+        self, throttle: Ratio, *, surge: Ratio = 0.0, integral_share: Ratio = 1.0
     ) -> BetaflightPID:
         """The law at a throttle of 0 to 1: its dynamic cutoffs and TPA, and anti-gravity's part."""
         law, factor = self.law, tpa_factor(throttle, *self.tpa)
@@ -98,7 +97,7 @@ class FlownBetaflight(FlownLoop[BetaflightPID]):
     def at_sample(self, throttle: Array, surge: Array, integral_share: Array) -> BetaflightPID:
         return self.at(throttle, surge=surge, integral_share=integral_share)
 
-    def surge(self, throttle: Float[np.ndarray, " samples"]) -> Float[np.ndarray, " samples"]:
+    def surge(self, throttle: Samples) -> Samples:
         from scipy.signal import lfilter
 
         if self.anti_gravity is None:
@@ -112,16 +111,12 @@ class FlownBetaflight(FlownLoop[BetaflightPID]):
             moved = lfilter([float(np.asarray(section.b0))], pole, moved)
         return gain * np.asarray(moved)
 
-    def integral_share(
-        self, mixer_range: Float[np.ndarray, " samples"]
-    ) -> Float[np.ndarray, " samples"]:
+    def integral_share(self, mixer_range: Samples) -> Samples:
         if self.windup >= 1:
             return np.ones_like(mixer_range)
         return np.clip((1 - mixer_range) / (1 - self.windup), 0.0, 1.0)
 
-    def setpoint_speed(
-        self, slope: Float[np.ndarray, "samples axes"], fed: Float[np.ndarray, "samples axes"]
-    ) -> Float[np.ndarray, "samples axes"]:
+    def setpoint_speed(self, slope: Speeds, fed: Speeds) -> Speeds:
         """By the logged F where that has a gain: it is of the sticks, between their samples."""
         weight = np.broadcast_to(F_SCALE * DEGREES * np.asarray(self.law.f), slope.shape[1:])
         weighted = weight > 0
@@ -132,9 +127,7 @@ class FlownBetaflight(FlownLoop[BetaflightPID]):
 _SURGED_I, _SURGED_P = 0.34, 0.0034  # what anti-gravity's measure adds to Ki, and to P per percent
 
 
-def _retuned(
-    filters: tuple[Filter, ...], ends: Ends | None, throttle: Float[ArrayLike, "..."]
-) -> tuple[Filter, ...]:
+def _retuned(filters: tuple[Filter, ...], ends: Ends | None, throttle: Ratio) -> tuple[Filter, ...]:
     """The filters with the first one's cutoff at a throttle; None leaves it."""
     if ends is None or not isinstance(filters[0], PT1 | PT2 | PT3 | Butterworth):
         return filters
@@ -207,51 +200,22 @@ class _Header:
         by_gain = 1.0 if self.version >= (2025,) else gain / 100
         return DMax(ceiling, 8e-5 * gain / 35, 8e-5 * advance * by_gain / 35)
 
-    def relax(self) -> ItermRelax | None:
-        if (mode := int(self.number("iterm_relax", 0.0))) == 0:
-            return None
-        kind = "setpoint" if self.number("iterm_relax_type", 1.0) == 1 else "gyro"
-        share = [1.0, 1.0, 1.0 if mode in (2, 4) else 0.0]
-        cutoff = self.number("iterm_relax_cutoff", 15.0)
-        return ItermRelax(cutoff, 40.0, share, kind, mode in (3, 4))
-
-    def windup(self, default: float) -> float:
-        """Of 1; 0 in the header is off."""
-        return (self.number("iterm_windup", default) or 100.0) / 100
-
-    def anti_gravity(self) -> tuple[float, float, float] | None:
-        """Gain, cutoff and gain of P; versions before 4.4 have another law."""
-        on = int(self.number("features", float(1 << 28))) & 1 << 28
-        gain, cutoff, of_p = (
-            self.number(f"anti_gravity_{name}", default)
-            for name, default in (("gain", 0.0), ("cutoff_hz", 5.0), ("p_gain", 100.0))
-        )
-        return None if self.version < (4, 4) or not on or gain == 0 else (gain, cutoff, of_p)
-
     def unmodelled(self) -> tuple[Message, ...]:
         harmonics = self.number("rpm_filter_harmonics", 0.0)
         transition = self.number("feedforward_transition", 0.0)
-        said = (
-            (
-                self.version < (4, 4), "anti-gravity",
-                "anti-gravity: the integral grows faster while the throttle moves",
-            ),
-            (
-                harmonics > 0, "notch",
-                f"{harmonics:g} RPM notches per motor on the gyro: they follow the motors",
-            ),
-            (
-                self.number("dyn_notch_count", 0.0) > 0, "notch",
-                "dynamic notches on the gyro: they follow its spectrum",
-            ),
-            (
-                transition > 0, "feedforward",
-                f"feedforward_transition {transition:g}: F grows with the sticks' deflection; the "
-                "law is that of centred sticks, without F",
-            ),
-            *((self.number(x, 0.0) > 0, "", f"{x}: {what}") for x, what in _UNUSUAL.items()),
-        )  # fmt: skip
-        return tuple(Message(text, kind) for is_on, kind, text in said if is_on)
+        said = {
+            "anti-gravity: the integral grows faster while the throttle moves":
+                (self.version < (4, 4), "anti-gravity"),
+            f"{harmonics:g} RPM notches per motor on the gyro: they follow the motors":
+                (harmonics > 0, "notch"),
+            "dynamic notches on the gyro: they follow its spectrum":
+                (self.number("dyn_notch_count", 0.0) > 0, "notch"),
+            f"feedforward_transition {transition:g}: F grows with the sticks' deflection; the law "
+            "is that of centred sticks, without F":
+                (transition > 0, "feedforward"),
+            **{f"{x}: {what}": (self.number(x, 0.0) > 0, "") for x, what in _UNUSUAL.items()},
+        }  # fmt: skip
+        return tuple(Message(text, kind) for text, (is_on, kind) in said.items() if is_on)
 
 
 def betaflight_loop(
@@ -267,9 +231,7 @@ def betaflight_loop(
     - `version`: of the firmware, (4, 2, 0).
     - `throttle`: 0 to 1, at which the cutoffs of `law` are.
 
-    **Raises:**
-
-    - `ValueError`: the header lacks a gain or the loop's rate.
+    **Raises:** `ValueError`: the header lacks a gain or the loop's rate.
     """
     read = _Header(values, version)
     number, numbers, new = read.number, read.numbers, read.version >= (2025,)
@@ -281,31 +243,41 @@ def betaflight_loop(
     dterm, dterm_dynamic = read.low_pass("dterm_lpf1")
     limit = number("pidsum_limit", 500.0)
     limits = np.array([limit, limit, number("pidsum_limit_yaw", 400.0)])
+    mode, relax = int(number("iterm_relax", 0.0)), None
+    if mode:
+        kind = "setpoint" if number("iterm_relax_type", 1.0) == 1 else "gyro"
+        share = [1.0, 1.0, 1.0 if mode in (2, 4) else 0.0]
+        relax = ItermRelax(number("iterm_relax_cutoff", 15.0), 40.0, share, kind, mode in (3, 4))
+    windup = (number("iterm_windup", 80.0 if new else 85.0) or 100.0) / 100  # 0 is off
+    gravity = (
+        number("anti_gravity_gain", 0.0), number("anti_gravity_cutoff_hz", 5.0),
+        number("anti_gravity_p_gain", 100.0),
+    )  # fmt: skip
+    on = int(number("features", float(1 << 28))) & 1 << 28 and gravity[0] != 0
     law = BetaflightPID(
         p=p, i=i, d=base, f=numbers("feedforward_weight", (0.0, 0.0, 0.0)),
         gyro=FilterChain(read.low_pass("gyro_lpf2")[0], 1e6 / looptime),
         filters=(*gyro, *read.notches("gyro_notch")),
         dterm=(*dterm, *read.low_pass("dterm_lpf2")[0], *read.notches("dterm_notch")),
         integral_factor=[1.0, 1.0, 2.5], p_lowpass_hz=[0.0, 0.0, number("yaw_lowpass_hz", 0.0)],
-        f_share=1.0 if number("feedforward_transition", 0.0) == 0 else 0.0, relax=read.relax(),
+        f_share=1.0 if number("feedforward_transition", 0.0) == 0 else 0.0, relax=relax,
         d_max=read.d_max(base, np.maximum(d, bound) if new else d), limit=limits,
-        integral_limit=read.windup(80.0) * limits if new else 400.0,
+        integral_limit=windup * limits if new else 400.0,
         dt=1e-6 * looptime * denominator,
     )  # fmt: skip
     tpa = number("tpa_rate", 0.0), (number("tpa_breakpoint", 1350.0) - 1000) / 1000
     flown = FlownBetaflight(
         law, read.unmodelled(), gyro_dynamic, dterm_dynamic, tpa, number("tpa_mode", 1.0) == 0,
-        read.anti_gravity(), 1.0 if new else read.windup(85.0),
+        gravity if on and read.version >= (4, 4) else None,  # until 4.3 it is another law
+        1.0 if new else windup,
     )  # fmt: skip
     return dataclasses.replace(flown, law=flown.at(throttle))
 
 
 def flies_adrc(values: Mapping[str, str]) -> bool:
-    """Whether a Betaflight header is of a flight with the proposed ADRC: pid_type is 1.
+    """Whether a Betaflight header, as for `betaflight_loop`, is of a flight with the proposed ADRC.
 
-    **Arguments:**
-
-    - `values`: the header's lines by name, `jq.records.read_settings(path).values`.
+    Its pid_type is 1.
     """
     return values.get("pid_type", "0").strip().upper() in ("1", "ADRC")
 
@@ -384,9 +356,7 @@ class Betaflight(Firmware):
         low, high = (float(x) for x in values.get("motorOutput", "48,2047").split(",")[:2])
         return low, high
 
-    def stick_throttle(
-        self, command: Float[np.ndarray, " samples"], values: Mapping[str, str]
-    ) -> Float[np.ndarray, " samples"] | None:
+    def stick_throttle(self, command: Samples, values: Mapping[str, str]) -> Samples | None:
         """The throttle before its boost; a limit of the throttle is another one."""
         if float(values.get("throttle_limit_type", 0)):
             return None
@@ -409,12 +379,8 @@ class Betaflight(Firmware):
         return {**values, "looptime": f"{looptime:.6g}"}
 
     def levelled(self, loop: FlownLoop) -> FlownLoop:
-        """The integral is held from a fifth of the set-point's speed on there."""
-        relax = loop.law.relax if isinstance(loop.law, BetaflightPID) else None
-        if relax is None:
-            return loop
-        relax = dataclasses.replace(relax, threshold=0.2 * relax.threshold)
-        return dataclasses.replace(loop, law=dataclasses.replace(loop.law, relax=relax))
+        law = loop.law.levelled() if isinstance(loop.law, BetaflightPID) else loop.law
+        return dataclasses.replace(loop, law=law)
 
     def angle_loop(self, values, axis, dt, *, levelled):
         level = values.get("levelPID", "").split(",")[0]
@@ -454,9 +420,7 @@ class Betaflight(Firmware):
     def notch_rate_hz(self, loop: FlownLoop) -> float:
         return 1 / loop.law.dt
 
-    def change_filters(
-        self, values: Mapping[str, str], parameters: Mapping[str, Number]
-    ) -> dict[str, str]:
+    def change_filters(self, values, parameters):
         changed = dict(values)
         for name, value in parameters.items():
             _, line, place = _FILTERS.get(name, (0, "", 0))
@@ -486,46 +450,40 @@ class Betaflight(Firmware):
         return "its proposed ADRC (pull request 15400) is of the rate, not of the angle"
 
     def parameter_file(self, values, title, *, version, profile, raised, words):
-        names = _names_of([row.name for row, *_ in values], version, raised)
+        adrc = [row.name for row, *_ in values if row.name.startswith("adrc_")]
+        if adrc and version < (2026,):
+            raise ValueError(
+                f"{', '.join(adrc)} exist only in builds of pull request 15400: give their version."
+            )
+        older: dict[str, str] = {}  # names of this version
+        if version < (2025,):
+            older |= {f"d_{axis}": f"d_min_{axis}" for axis in raised}
+            older |= {f"d_max_{axis}": f"d_{axis}" for axis in raised}
+        if version < (4, 5):
+            older["angle_p_gain"] = "p_level"
+        for part in ("gyro", "dterm") if version < (4, 3) else ():
+            older[f"{part}_lpf1_dyn_min_hz"] = f"dyn_lpf_{part}_min_hz"
+            older[f"{part}_lpf1_dyn_max_hz"] = f"dyn_lpf_{part}_max_hz"
+            for name in (f"{part}_lpf1_static_hz", f"{part}_lpf2_static_hz"):
+                older[name] = _OLDER[name]
         rows = [f"# {line}" for line in title.splitlines()]
         if profile is None:
             rows.append("# select the PID profile that flew first: the log does not name it")
         else:
             rows.append(f"profile {profile}")
-        if version >= (4, 3) and not all(name.startswith("adrc_") for name in names):
+        if version >= (4, 3) and len(adrc) < len(values):
             # Sliders that stay on would rewrite what is set here.
             rows.append("set simplified_pids_mode = OFF")
             for part in ("gyro", "dterm"):
                 if any(row.name.startswith(f"{part}_lpf") for row, *_ in values):
                     rows.append(f"set simplified_{part}_filter = OFF")
-        for name, (row, value, other) in zip(names, values, strict=True):
+        for row, value, other in values:
+            name = older.get(row.name, row.name)
             rows += [f"# {name} was {number_text(other, row.integer)}"]
             rows += [f"set {name} = {number_text(value, row.integer)}"]
         for name, word, other in words:
             rows += [f"# {name} was {other}", f"set {name} = {word}"]
         return joined_lines([*rows, "save"])
-
-
-def _names_of(names: Sequence[str], version: tuple[int, ...], raised: Sequence[str]) -> list[str]:
-    """The parameters as this version calls them."""
-    adrc = [name for name in names if name.startswith("adrc_")]
-    if adrc and version < (2026,):
-        raise ValueError(
-            f"{', '.join(adrc)} exist only in builds of pull request 15400: give their version."
-        )
-    if version >= (2025,):
-        return list(names)
-    older = {f"d_{axis}": f"d_min_{axis}" for axis in raised}
-    older |= {f"d_max_{axis}": f"d_{axis}" for axis in raised}
-    if version < (4, 5):
-        older["angle_p_gain"] = "p_level"
-    if version < (4, 3):
-        for part in ("gyro", "dterm"):
-            older[f"{part}_lpf1_dyn_min_hz"] = f"dyn_lpf_{part}_min_hz"
-            older[f"{part}_lpf1_dyn_max_hz"] = f"dyn_lpf_{part}_max_hz"
-            older[f"{part}_lpf1_static_hz"] = f"{part}_lowpass_hz"
-            older[f"{part}_lpf2_static_hz"] = f"{part}_lowpass2_hz"
-    return [older.get(name, name) for name in names]
 
 
 FIRMWARE = Betaflight()

@@ -13,13 +13,7 @@ import numpy as np
 from jaxtyping import Complex, Float
 
 from jaxquad._core import as_messages
-from jaxquad.identify import (
-    B0Law,
-    B0Schedule,
-    draw_models,
-    filter_response,
-    GainOverThrottle,
-)
+from jaxquad.identify import B0Law, B0Schedule, draw_models, filter_response, GainOverThrottle
 from jaxquad.records import AXES
 
 from .._filters import FilterChain, PT2
@@ -91,25 +85,21 @@ class FlownADRC(FlownLoop[BetaflightADRC]):
 
 
 Flown = FlownBetaflight | FlownADRC
-_OF_AXES = {"adrc_wc": "adrcWC", "adrc_wo": "adrcWO", "adrc_b0": "adrcB0"}
-_OF_ALL = ("adrc_gyro_lpf_hz", "adrc_td_hz", "adrc_hover_throttle", "adrc_sigma_decay")
 
 
 def adrc_parameters(values: Mapping[str, str]) -> dict[str, float]:
     """The parameters of the proposed ADRC that a Betaflight header holds, flown or not.
 
-    **Arguments:**
-
-    - `values`: the header's lines by name, `jq.records.read_settings(path).values`.
-
-    **Returns:** values by the names of `PARAMETERS`; empty for a firmware without the ADRC.
+    `values` are as for `betaflight_loop`. Empty for a firmware without the ADRC.
     """
+    lines = {"adrc_wc": "adrcWC", "adrc_wo": "adrcWO", "adrc_b0": "adrcB0"}
     parameters = {
         f"{name}_{axis}": value
-        for name, line in _OF_AXES.items() if line in values
+        for name, line in lines.items() if line in values
         for axis, value in zip(AXES, _three(values, line), strict=True)
     }  # fmt: skip
-    return parameters | {name: float(values[name]) for name in _OF_ALL if name in values}
+    of_all = ("adrc_gyro_lpf_hz", "adrc_td_hz", "adrc_hover_throttle", "adrc_sigma_decay")
+    return parameters | {name: float(values[name]) for name in of_all if name in values}
 
 
 def betaflight_adrc_loop(
@@ -117,18 +107,10 @@ def betaflight_adrc_loop(
 ) -> FlownADRC:
     """The rate loop of a Betaflight header that was flown with the proposed ADRC.
 
-    A header without adrc_b0_law is of a build in which b0 follows the square of the throttle.
-    Source: docs/autopilots.md.
+    Arguments are as for `betaflight_loop`. A header without adrc_b0_law is of a build in which b0
+    follows the square of the throttle. Source: docs/autopilots.md.
 
-    **Arguments:**
-
-    - `values`: the header's lines by name, `jq.records.read_settings(path).values`.
-    - `version`: of the firmware, (2026, 6, 0).
-    - `throttle`: 0 to 1, at which the cutoffs and b0 of `law` are.
-
-    **Raises:**
-
-    - `ValueError`: the PID flew, or the header lacks a number.
+    **Raises:** `ValueError`: the PID flew, or the header lacks a number.
     """
     if not flies_adrc(values):
         raise ValueError(
@@ -153,9 +135,8 @@ def betaflight_adrc_loop(
     left_out: list[str] = [x for x in pid.unmodelled if x.kind in ("notch", "feedforward")]
     left_out.append("the gate before liftoff, and wc on the ground")
     if number("adrc_sat_z3_inhibit", 0.0) > 0:
-        left_out.append(
-            "adrc_sat_z3_inhibit: the observer's integrator rests at the mixer's limits"
-        )
+        text = "adrc_sat_z3_inhibit: the observer's integrator rests at the mixer's limits"
+        left_out.append(text)
     if any(float(x) != 100 for k in values if "adrc_zeta" in k for x in values[k].split(",")):
         left_out.append("adrc_zeta: the damping ratio is taken as 1")
     flown = FlownADRC(law, as_messages(left_out), pid=pid, schedule=schedule)
@@ -163,15 +144,9 @@ def betaflight_adrc_loop(
 
 
 def b0_law(values: Mapping[str, str]) -> B0Law | None:
-    """adrc_b0_law of a Betaflight header; None where it has none.
+    """adrc_b0_law of a Betaflight header, as for `betaflight_loop`; None where it has none.
 
-    **Arguments:**
-
-    - `values`: the header's lines by name, `jq.records.read_settings(path).values`.
-
-    **Raises:**
-
-    - `ValueError`: the header's number stands for no law.
+    **Raises:** `ValueError`: the header's number stands for no law.
     """
     if "adrc_b0_law" not in values:
         return None
@@ -229,7 +204,7 @@ class ADRCLoops(RateLoops):
         updates = dt * np.stack([3 * wo, 3 * wo**2, wo**3])
         leak, one = 1 - q * (1 - frame.forgetting * dt), 1 - q
 
-        def weighed(inputs: Sequence[np.ndarray | float]) -> np.ndarray:
+        def weighed(inputs: Sequence[np.ndarray | float] | np.ndarray) -> np.ndarray:
             """z for what enters each of its rows: z2 and z3 by z1 from the last up, then z1."""
             third = inputs[2] / leak, -q * updates[2] / leak
             second = (

@@ -4,7 +4,6 @@ A design is a search over wc, wo and b0 on responses, as that of a PID is one ov
 """
 
 import dataclasses
-import itertools
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
@@ -12,16 +11,11 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxquad._core import announce, plain_content
-from jaxquad.identify import (
-    B0Law,
-    B0Schedule,
-    GainOverThrottle,
-    ScaledB0,
-    UndeterminedError,
-)
+from jaxquad.identify import B0Law, B0Schedule, GainOverThrottle, ScaledB0, UndeterminedError
 from jaxquad.records import AXES
 
 from .._parameters import find_parameter, store_parameters
+from .._rate_design import best_on_grid, stored_near
 from .._rate_loops import LoopQualities, together
 from .._stages import beyond_limits, Kind
 from ._betaflight_adrc import (
@@ -91,6 +85,13 @@ class ADRCStage(NamedTuple):
     rejection: float
     noise: float
 
+    def cells(self) -> list[str]:
+        """The numbers as both tables print them, the crossover in Hz."""
+        tuned = ["-" if np.isnan(x) else f"{x:.0f}" for x in self[:3]]
+        peaks, ends = ([f"{x:.2f}" for x in part] for part in (self[4:6], self[7:]))
+        hertz = self.crossover / (2 * np.pi)
+        return [*tuned, f"{100 * self.stable:.1f}", *peaks, f"{hertz:.1f}", *ends]
+
 
 @dataclasses.dataclass(frozen=True)
 class ADRCProposal:
@@ -136,19 +137,13 @@ class ADRCProposal:
     def content(self) -> dict[str, object]:
         """All of it, for JSON."""
         return plain_content({
-            "kind": self.kind,
-            "verdict": self.verdict,
-            "parameters": dict(self.parameters),
+            "kind": self.kind, "verdict": self.verdict, "parameters": dict(self.parameters),
             "schedule": self.schedule._asdict(),
             "throttle": self.throttle,
             "stages": {name: stage._asdict() for name, stage in self.stages.items()},
-            "b0_of_the_log": None if self.scaled is None else {
-                "hover": self.scaled.hover,
-                "b0": self.scaled.b0.value,
-                "interval_95": self.scaled.b0.interval,
-                "law": self.scaled.law,
-                "deviations": dict(self.scaled.deviations),
-                "extrapolated": self.scaled.extrapolated,
+            "b0_of_the_log": None if (x := self.scaled) is None else {
+                "hover": x.hover, "b0": x.b0.value, "interval_95": x.b0.interval, "law": x.law,
+                "deviations": dict(x.deviations), "extrapolated": x.extrapolated,
             },
         })  # fmt: skip
 
@@ -158,13 +153,8 @@ class ADRCProposal:
             f"{'on fresh plants':<18} {'wc':>4} {'wo':>4} {'b0':>6}   stable   worst Ms   resonance"
             "   crossover   torque   noise"
         ]
-        for name, x in self.stages.items():
-            numbers = f"{x.wc:4.0f} {x.wo:4.0f} {x.b0:6.0f}"
-            rows.append(
-                f"{name:<18} {numbers.replace('nan', '  -')} {100 * x.stable:6.1f} % "
-                f"{x.peak:10.2f} {x.resonance:11.2f} {x.crossover / (2 * np.pi):8.1f} Hz "
-                f"{x.rejection:8.2f} {x.noise:7.2f}"
-            )
+        form = "{:<18} {:>4} {:>4} {:>6} {:>6} % {:>10} {:>11} {:>8} Hz {:>8} {:>7}"
+        rows += [form.format(name, *stage.cells()) for name, stage in self.stages.items()]
         return "\n".join(rows)
 
     def __str__(self) -> str:
@@ -202,17 +192,13 @@ def propose_adrc(
     **Arguments:**
 
     - `plant`: of `jq.identify.gain_over_throttle`, with the filters of the gyro divided out.
-    - `flown`: the loop of the log's header, `betaflight_loop` or `betaflight_adrc_loop`: its
-        filters stay, and it is what noise and torque are compared with.
+    - `flown`: of `betaflight_loop` or `betaflight_adrc_loop`: its filters stay, and it is what
+        noise and torque are compared with.
     - `axis`: "roll", "pitch" or "yaw".
     - `hover`: adrc_hover_throttle, 0 to 1; by default that of the ADRC that flew, else the lowest
         level of throttle, because b0 is scaled up from there alone.
-    - `targets`: an `ADRCTargets`.
     - `bins`: throttles, evenly from the lowest to the highest flown.
     - `members`, `fresh`: plants to tune on, and to certify on at each throttle.
-    - `seed`: of the draws.
-
-    **Returns:** an `ADRCProposal`.
 
     **Raises:**
 
@@ -257,7 +243,15 @@ def propose_adrc(
     loops = draw(max(1, members // len(grid)), seed)
     for attempt in range(1, _CERTIFICATES + 1):
         announce(f"searching wc, wo and b0 at {len(grid)} throttles")
-        best = _search(loops, (low, high), targets, edge, before)
+        score = _Score(loops, targets, edge, before)
+        first = [dataclasses.replace(loop, plants=loop.plants[:1]) for loop in loops]
+        rough, ends = _Score(first, targets, edge, before), (np.log(low), np.log(high))
+        middle, half = np.log(low * high) / 2, np.log(high / low) / 2
+        for level in range(_LEVELS):
+            used = rough if level < _ROUGH else score
+            middle, half = best_on_grid(used, middle, half, ends, _POINTS), _NARROWED * half
+        near = stored_near(np.exp(middle), rows, (low, high))
+        best = near[np.argmin(score(near))]  # where none keep the targets: the nearest
         announce(f"certifying the whole numbers on {fresh} new plants")
         certified = draw(fresh, seed + attempt)
         stages = _stages(certified, before, best, usual)
@@ -265,8 +259,11 @@ def propose_adrc(
         beyond = beyond_limits(stages["what flew"], third, stages["proposed"], targets, edge)
         if not beyond:
             break
-        worst = (x.worst(best[None], _WORST) for x in certified)
-        loops = [old.joined(new) for old, new in zip(loops, worst, strict=True)]
+        worst = [x.worst(best[None], _WORST).plants for x in certified]
+        loops = [
+            dataclasses.replace(x, plants=np.concatenate([x.plants, more]))
+            for x, more in zip(loops, worst, strict=True)
+        ]
     kind, verdict = _judge(stages, beyond, targets, fresh, grid)
     values = {row.name: float(x) for row, x in zip(rows, best, strict=True)} | frame.parameters()
     stored = store_parameters("betaflight", values if kind == "proposed" else {})
@@ -312,8 +309,9 @@ def _stages(
     rms = lambda ratio: float(np.sqrt(np.mean(ratio**2)))
 
     def stage(design: Design, x: LoopQualities) -> ADRCStage:
+        wc, wo, b0 = map(float, design)
         return ADRCStage(
-            *map(float, design), float(np.mean(x.stable)), float(np.max(x.peak)),
+            wc, wo, b0, float(np.mean(x.stable)), float(np.max(x.peak)),
             float(np.max(x.resonance)), float(np.median(x.crossover)),
             rms(x.rejection / flown.rejection), rms(x.noise / flown.noise),
         )  # fmt: skip
@@ -348,30 +346,6 @@ def _judge(
         f"proposed: stable on all {fresh} fresh plants {where} throttle, worst Ms {best.peak:.2f} "
         f"of at most {targets.sensitivity:g}, {better}"
     )
-
-
-def _search(
-    loops: Sequence[ADRCLoops], bounds: tuple[Design, Design], targets: ADRCTargets, edge: float,
-    before: Design | None,
-) -> Design:  # fmt: skip
-    """The whole numbers with the least effect of torque; where none keep the targets: nearest."""
-    low, high = bounds
-    score = _Score(loops, targets, edge, before)
-    first = [dataclasses.replace(loop, plants=loop.plants[:1]) for loop in loops]
-    rough = _Score(first, targets, edge, before)
-    middle, half = np.log(low * high) / 2, np.log(high / low) / 2
-    for level in range(_LEVELS):
-        axes = [
-            np.clip(np.linspace(m - h, m + h, _POINTS), np.log(a), np.log(b))
-            for m, h, a, b in zip(middle, half, low, high, strict=True)
-        ]
-        points = np.stack([x.ravel() for x in np.meshgrid(*axes, indexing="ij")], axis=1)
-        used = rough if level < _ROUGH else score
-        middle, half = points[np.argmin(used(np.exp(points)))], _NARROWED * half
-    edges = zip(np.exp(middle), np.ceil(low), np.floor(high), strict=True)
-    near = [np.unique(np.clip([np.floor(x), np.ceil(x)], a, b)) for x, a, b in edges]
-    stored = np.array(list(itertools.product(*near)))
-    return stored[np.argmin(score(stored))]
 
 
 class _Score:

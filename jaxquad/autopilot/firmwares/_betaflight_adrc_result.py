@@ -1,17 +1,16 @@
 """What a Betaflight log says for its proposed ADRC: the report, and the files to load."""
 
 import dataclasses
-import shlex
 from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 
-from jaxquad._core import announce, plain_content, write_file
+from jaxquad._core import plain_content, write_file
 from jaxquad.identify import GainBand, GainOverThrottle
 from jaxquad.plot import StepBand, ThrottleCurve
 from jaxquad.records import AXES
-from jaxquad.report import Headline, Provenance, provenance, Table, write_json
+from jaxquad.report import Headline, Provenance, Table
 
 from .._files import change_table, parameter_file, ParameterChange, propose_changes, WordChange
 from .._filters import FilterChain, PT2
@@ -25,9 +24,9 @@ from .._page import (
     motor_rows,
     PilotPage,
     VERDICTS,
-    write_pilot_page,
 )
 from .._parameters import find_parameter
+from .._proposal import write_result
 from .._rate_loops import StepGrid
 from .._reproduce_flight import Reproduction
 from .._stages import DesignSettings, Kind
@@ -124,28 +123,20 @@ class ADRCAutopilot:
 
     def content(self) -> dict[str, object]:
         """All of it, for JSON."""
+        proposal, plant = self.proposal, self.plant
         content = {
-            "kind": self.kind,
-            "verdict": self.verdict,
-            "firmware": "betaflight",
-            "version": self.version,
-            "axis": self.axis,
-            "law": "adrc",
-            "flown_law": "adrc" if self.flew_adrc else "pid",
-            "flown": self.flown.parameters(),
-            "unmodelled": self.flown.unmodelled,
-            "old": self.old,
-            "new": self.new,
+            "kind": self.kind, "verdict": self.verdict, "firmware": "betaflight",
+            "version": self.version, "axis": self.axis, "law": "adrc",
+            "flown_law": "adrc" if self.flew_adrc else "pid", "flown": self.flown.parameters(),
+            "unmodelled": self.flown.unmodelled, "old": self.old, "new": self.new,
             "words": [x._asdict() for x in self.words],
-            "proposal": None if self.proposal is None else self.proposal.content(),
+            "proposal": None if proposal is None else proposal.content(),
             "reproduction": [
-                {"throttle": throttle} | loop.to_dict()
-                for throttle, loop in self.reproductions.items()
+                {"throttle": x} | loop.to_dict() for x, loop in self.reproductions.items()
             ],
-            "plant": None if self.plant is None else self.plant.to_dict(),
-            "remarks": self.remarks,
-            "settings": self.settings.content(),
-        }
+            "plant": None if plant is None else plant.to_dict(),
+            "remarks": self.remarks, "settings": self.settings.content(),
+        }  # fmt: skip
         return {key: plain_content(value) for key, value in content.items()}
 
     @property
@@ -179,8 +170,33 @@ class ADRCAutopilot:
                 f"thrust_linear {linear:g} flew and stays: the gain over the throttle is that with "
                 "it, taken as a straight line"
             )
-        if self.proposal is not None and self.plant is not None:
-            remarks += _remarks_on_b0(self.plant, self.proposal, self.flew_adrc)
+        proposal, plant = self.proposal, self.plant
+        if proposal is None or plant is None:
+            return tuple(remarks)
+        schedule, scaled, throttle = proposal.schedule, proposal.scaled, proposal.throttle
+        most = float(schedule.scale(throttle[-1]))
+        if scaled is None:
+            remarks.append(
+                f"b0 over the throttle is not known, and adrc_b0_law {schedule.law} is "
+                f"{'what flew' if self.flew_adrc else 'the default'}: the certificate is of "
+                f"{throttle[0]:.2f} throttle alone; {plant.what_to_fly()}"
+            )
+            return tuple(remarks)
+        if most >= schedule.high > 1:
+            remarks.append(
+                f"at {throttle[-1]:.2f} throttle b0 is at adrc_b0_scale_max, {schedule.high:g}"
+            )
+        if self.flew_adrc and scaled.law != schedule.law:
+            off = {law: f"{100 * share:.0f} %" for law, share in scaled.deviations.items()}
+            remarks.append(
+                f"adrc_b0_law {schedule.law} stays as it flew: it is off by up to "
+                f"{off[schedule.law]}, and {scaled.law} by {off[scaled.law]}"
+            )
+        if scaled.extrapolated:
+            remarks.append(
+                f"the hover throttle of {scaled.hover:.2f} lies outside of what was flown, "
+                f"{float(plant.low.min()):.2f} to {float(plant.high.max()):.2f}"
+            )
         return tuple(remarks)
 
     def write(self, folder: str | Path) -> list[Path]:
@@ -188,16 +204,10 @@ class ADRCAutopilot:
 
         **Returns:** their paths.
         """
-        announce("parameter files")
-        folder = Path(folder)
-        stated = {k: v for k, v in self.settings.content().items() if v is not None}
-        words = ["jaxquad", "autopilot", str(self.path), *self.settings.words()]
-        origin = provenance(self.path, command=shlex.join(words), settings=stated)
-        content = self.content() | {"provenance": origin.content()}
-        stored = write_json(folder / "autopilot.json", content)
-        announce("the page")
-        page = write_pilot_page(folder / "autopilot.html", adrc_page(self, origin))
-        return [page, stored, *(write_file(folder / k, text) for k, text in self._texts().items())]
+        path = Path(folder)
+        files = lambda: [write_file(path / name, text) for name, text in self._texts().items()]
+        pages = lambda origin: [adrc_page(self, origin)]
+        return write_result(path, self.path, self.settings, self.content(), files, pages)
 
     def _texts(self) -> dict[str, str]:
         """The parameter files, and the table of what changes; without a proposal what flew."""
@@ -236,26 +246,25 @@ class ADRCAutopilot:
 
     def __str__(self) -> str:
         version, law = ".".join(map(str, self.version)), "ADRC" if self.flew_adrc else "PID"
-        lines = [
-            f"betaflight {version}, rate loop of {self.axis}: the {law} flew".replace(" ,", ",")
-        ]
-        of_axis = {k: x for k, x in self.flown.parameters().items() if k.endswith(f"_{self.axis}")}
-        lines += [f"  {name} = {value:.6g}" for name, value in of_axis.items()]
+        head = f"betaflight {version}, rate loop of {self.axis}: the {law} flew"
+        values = self.flown.parameters().items()
+        lines = [head.replace(" ,", ",")]
+        lines += [f"  {name} = {x:.6g}" for name, x in values if name.endswith(f"_{self.axis}")]
         if isinstance(self.flown, FlownADRC):
             schedule = self.flown.schedule
             lines.append(f"  adrc_b0_law = {schedule.law}, hover {100 * schedule.hover:.0f} %")
         lines += [f"  not modelled: {x}" for x in self.flown.unmodelled]
-        lines += ["", str(self.plant)] if self.plant is not None else []
         again = [
-            f"flown loop at {throttle:.2f} throttle: {loop.verdict}"
-            for throttle, loop in self.shown_again.items()
+            f"flown loop at {x:.2f} throttle: {y.verdict}" for x, y in self.shown_again.items()
         ]
-        lines += ["", *again] if again else []
-        if self.proposal is not None:
-            lines += ["", self.proposal.table()]
-        if self.new:
-            lines += ["", change_table(self.changes, self.words).rstrip()]
-        lines += ["", *(f"! {x}" for x in self.remarks)] if self.remarks else []
+        parts = (
+            [] if self.plant is None else [str(self.plant)], again,
+            [] if self.proposal is None else [self.proposal.table()],
+            [change_table(self.changes, self.words).rstrip()] if self.new else [],
+            [f"! {x}" for x in self.remarks],
+        )  # fmt: skip
+        for part in parts:
+            lines += ["", *part] if part else []
         return "\n".join([*lines, "", self.verdict])
 
 
@@ -266,40 +275,13 @@ def doubted_throttle(again: Mapping[float, Reproduction]) -> float | None:
     return next(iter(off or (again if blind else ())), None)
 
 
-def _remarks_on_b0(plant: GainOverThrottle, proposal: ADRCProposal, flew: bool) -> list[str]:
-    schedule, scaled = proposal.schedule, proposal.scaled
-    if scaled is None:
-        return [
-            f"b0 over the throttle is not known, and adrc_b0_law {schedule.law} is "
-            f"{'what flew' if flew else 'the default'}: the certificate is of "
-            f"{proposal.throttle[0]:.2f} throttle alone; {plant.what_to_fly()}"
-        ]
-    remarks, most = [], float(schedule.scale(proposal.throttle[-1]))
-    if most >= schedule.high > 1:
-        remarks.append(
-            f"at {proposal.throttle[-1]:.2f} throttle b0 is at adrc_b0_scale_max, {schedule.high:g}"
-        )
-    if flew and scaled.law != schedule.law:
-        off = scaled.deviations
-        remarks.append(
-            f"adrc_b0_law {schedule.law} stays as it flew: it is off by up to "
-            f"{100 * off[schedule.law]:.0f} %, and {scaled.law} by {100 * off[scaled.law]:.0f} %"
-        )
-    if scaled.extrapolated:
-        remarks.append(
-            f"the hover throttle of {scaled.hover:.2f} lies outside of what was flown, "
-            f"{float(plant.low.min()):.2f} to {float(plant.high.max()):.2f}"
-        )
-    return remarks
-
-
 _PLANTS, _SEED = 100, 77  # of the steps' bands
 _POINTS = 60  # of a curve over the throttle
 
 
 def adrc_page(result: ADRCAutopilot, origin: Provenance) -> PilotPage:
     """All that the page shows."""
-    version, proposal, plant = ".".join(map(str, result.version)), result.proposal, result.plant
+    version, proposal = ".".join(map(str, result.version)), result.proposal
     flown, flight, axis = result.flown, result.flight, AXES.index(result.axis)
     headlines = [Headline(*VERDICTS[result.kind], result.verdict)]
     for throttle, again in result.shown_again.items():
@@ -307,45 +289,36 @@ def adrc_page(result: ADRCAutopilot, origin: Provenance) -> PilotPage:
         word = "THE FLOWN LOOP AGAIN" if flew else "THE FLOWN LOOP IS NOT REPRODUCED"
         level = "good" if flew else "warn" if again.kind == "unknown" else "bad"
         headlines.append(Headline(level, word, f"at {throttle:.2f} throttle: {again.verdict}"))
-    pid = flown.pid.law if isinstance(flown, FlownADRC) else flown.law
-    chains = chains_of(pid, axis)
-
-    def with_observer(cutoff: float) -> Chains:
-        observer = (FilterChain((PT2(cutoff),), 1 / pid.dt),) if cutoff > 0 else ()
-        return {"gyro": chains["gyro"], "observer": observer}
-
-    filters: dict[str, Chains] = {"flown": chains}
+    pid, cutoff = flown, result.new.get("adrc_gyro_lpf_hz", 0.0)
     if isinstance(flown, FlownADRC):
-        filters = {"flown": with_observer(flown.frame.lowpass_hz)}
-    elif result.new:
-        filters["proposed"] = with_observer(result.new["adrc_gyro_lpf_hz"])
-    steps, b0, stages = {}, None, None
-    if proposal is not None and plant is not None:
-        steps, b0 = _steps_and_b0(result, proposal, plant)
-        stages = stage_table(proposal, result.settings.fresh)
+        pid, cutoff = flown.pid, flown.frame.lowpass_hz
+    chains = chains_of(pid.law, axis)
+    observer = (FilterChain((PT2(cutoff),), 1 / pid.law.dt),) if cutoff > 0 else ()
+    filters: dict[str, Chains] = {"flown": chains}
+    if result.flew_adrc or result.new:
+        design = "flown" if result.flew_adrc else "proposed"
+        filters[design] = {"gyro": chains["gyro"], "observer": observer}
+    steps, b0 = ({}, None) if proposal is None else _steps_and_b0(result, proposal)
     return PilotPage(
         title=f"betaflight {version}, ADRC for {result.axis}".replace(" ,", ","),
         headlines=headlines,
         remarks=[*result.remarks, *(f"not modelled: {text}" for text in flown.unmodelled)],
-        filters=filters,
-        steps=steps,
-        b0=b0,
+        filters=filters, steps=steps, b0=b0, terms_are="as logged", unit="pidsum",
         terms={} if flight is None or not flight.terms else logged_terms(flight),
-        terms_are="as logged",
         motors=[] if flight is None else motor_rows(flight),
-        stages=stages,
+        stages=None if proposal is None else stage_table(proposal, result.settings.fresh),
         changes=change_rows(result.changes, result.words) if result.new else None,
-        text=str(result),
-        unit="pidsum",
-        provenance=origin,
-    )
+        text=str(result), provenance=origin,
+    )  # fmt: skip
 
 
 def _steps_and_b0(
-    result: ADRCAutopilot, proposal: ADRCProposal, plant: GainOverThrottle
-) -> tuple[dict[str, StepBand], B0Section]:
+    result: ADRCAutopilot, proposal: ADRCProposal
+) -> tuple[dict[str, StepBand], B0Section | None]:
     """Steps at the middle one of the throttles that were certified, and b0 over all of them."""
-    flown, schedule = result.flown, proposal.schedule
+    flown, schedule, plant = result.flown, proposal.schedule, result.plant
+    if plant is None:
+        return {}, None
     middle = proposal.throttle[len(proposal.throttle) // 2]
     grid, place = StepGrid.of(flown.law.dt), AXES.index(result.axis)
     seed = result.settings.seed + _SEED
@@ -374,15 +347,7 @@ def _steps_and_b0(
 
 def stage_table(proposal: ADRCProposal, fresh: int) -> Table:
     """What parameters give on fresh plants, for the page."""
-    number = lambda x: "-" if np.isnan(x) else f"{x:.0f}"
-    rows = [
-        [
-            name, number(x.wc), number(x.wo), number(x.b0), f"{100 * x.stable:.1f}",
-            f"{x.peak:.2f}", f"{x.resonance:.2f}", f"{x.crossover / (2 * np.pi):.1f}",
-            f"{x.rejection:.2f}", f"{x.noise:.2f}",
-        ]
-        for name, x in proposal.stages.items()
-    ]  # fmt: skip
+    rows = [[name, *stage.cells()] for name, stage in proposal.stages.items()]
     heads = (
         "parameters", "wc", "wo", "b0", "stable, %", "worst Ms", "worst peak", "crossover, Hz",
         "torque", "noise",

@@ -24,12 +24,16 @@ _SWEEP = (0.5, 40.0, 15.0, 150.0)  # Hz, Hz, s, deg/s
 _LAG, _LATE = 0.025, 2  # of the motors in s; of speed controllers and sensor, in PID loops
 _NOISE, _GUST_TIME = 1.0, 0.3  # deg/s, s
 _START_US = 6_500_000
+_PT2_HZ = 5.0 * 1.553773974  # of the poles of anti-gravity's filter
 _ARMED, _CHIRPING = 1, 1 | 1 << 6  # flightModeFlags: ARM, CHIRP
 
 # Beyond the hold: the motors' part, and the gyro sample from the filters to the PID loop.
 CHIRP_TRUTH: Mapping[str, float] = MappingProxyType(
     {"gain": 36.0, "lag": _LAG, "delay": (_LATE + 0.5) * _DT}
 )
+
+
+Loops = Float[np.ndarray, " loops"]
 
 
 class _Axis(NamedTuple):
@@ -158,28 +162,8 @@ def _low_passed(cutoff_hz: float, signal: np.ndarray) -> np.ndarray:
     return np.asarray(lfilter([share], [1, share - 1], signal))
 
 
-def _by_throttle(throttle: np.ndarray) -> tuple[np.ndarray, ...]:
-    """TPA, anti-gravity, and dynamic low-passes of gyro and D: they act one loop later."""
-    previous = np.concatenate([throttle[:1], throttle[:-1]])
-    before = np.concatenate([throttle[:1], previous[:-1]])
-    faded = np.maximum.accumulate(previous) >= 0.05
-    low = 1 - 0.2 / 0.05 * (0.05 - previous)
-    tpa = np.where(faded, 1.0, low)  # the throttle stays below tpa_breakpoint
-    speed = np.abs(previous - before) * _LOOP_HZ * (1 - previous) ** 2
-    speed = speed * np.where(previous > before, 0.5 * (1 - previous), 1)
-    pt2 = 5.0 * 1.553773974
-    gravity = 80 * _low_passed(pt2, _low_passed(pt2, speed))
-    steps = np.rint(100 * previous) / 100
-    curve = steps * (1 - steps) * 0.5 + steps
-    gyro, dterm = (_share(low * (1 + curve), _DT) for low in (250.0, 75.0))
-    return tpa, gravity, np.asarray(gyro), np.asarray(dterm)
-
-
 def _fly_axis(
-    axis: _Axis,
-    setpoint: Float[np.ndarray, " loops"],
-    throttle: Float[np.ndarray, " loops"],
-    random: np.random.Generator,
+    axis: _Axis, setpoint: Loops, throttle: Loops, random: np.random.Generator
 ) -> Float[np.ndarray, "5 loops"]:
     """P, I, D, the gyro that the law takes and the newest raw gyro, loop by loop.
 
@@ -190,18 +174,26 @@ def _fly_axis(
     hold = np.exp(-_DT / _GUST_TIME)
     shocks = axis.gust * np.sqrt(1 - hold**2) * random.standard_normal(setpoint.size)
     gusts = np.asarray(lfilter([1], [1, -hold], shocks))
-    tpa, gravity, gyro_share, d_share = _by_throttle(throttle)
-    relax = np.ones_like(setpoint)
-    boost = np.zeros_like(setpoint)
+    # TPA, anti-gravity, and dynamic low-passes of gyro and D act one loop later.
+    previous = np.concatenate([throttle[:1], throttle[:-1]])
+    before = np.concatenate([throttle[:1], previous[:-1]])
+    # The throttle stays below tpa_breakpoint.
+    low = 1 - 0.2 / 0.05 * (0.05 - previous)
+    tpa = np.where(np.maximum.accumulate(previous) >= 0.05, 1.0, low)
+    steps = np.rint(100 * previous) / 100
+    curve = steps * (1 - steps) * 0.5 + steps
+    gyro_share, d_share = (np.asarray(_share(hz * (1 + curve), _DT)) for hz in (250.0, 75.0))
+    relax, boost = np.ones_like(setpoint), np.zeros_like(setpoint)
     if not axis.p_lowpass_hz:  # roll and pitch: iterm_relax RP, SETPOINT, and anti-gravity
         relax = np.maximum(0, 1 - np.abs(setpoint - _low_passed(15.0, setpoint)) / 40)
-        boost = gravity
+        moved = np.abs(previous - before) * _LOOP_HZ * (1 - previous) ** 2
+        moved = moved * np.where(previous > before, 0.5 * (1 - previous), 1)
+        boost = 80 * _low_passed(_PT2_HZ, _low_passed(_PT2_HZ, moved))
     kp, ki, kd = np.array([0.032029, 0.244381 * axis.integral_factor, 0.000529]) * axis.pid
     attenuated = 1 + boost / np.maximum(np.abs(setpoint) / 50, 1) * 0.0034
     inputs = (
-        setpoint, noise[:, 0], noise[:, 1], gusts, throttle > 0,
-        kp * attenuated, (ki + 0.34 * boost) * _DT * relax, kd * _LOOP_HZ * tpa, gyro_share,
-        d_share,
+        setpoint, noise[:, 0], noise[:, 1], gusts, throttle > 0, kp * attenuated,
+        (ki + 0.34 * boost) * _DT * relax, kd * _LOOP_HZ * tpa, gyro_share, d_share,
     )  # fmt: skip
     ceiling, limit = 0.8 * axis.sum_limit, float(axis.sum_limit)
     step, gain = _DT / 2, axis.gain

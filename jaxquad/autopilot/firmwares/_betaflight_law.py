@@ -88,17 +88,17 @@ class DMax(eqx.Module):
     range: tuple[Filter, ...] | None = None
     smooth: tuple[Filter, ...] | None = None
 
-    def chains(self, rate_hz: float) -> tuple[FilterChain, FilterChain]:
-        """The low-pass of delta and that of the factor, at the loop's rate."""
+    def chains(self, dt: float) -> tuple[FilterChain, FilterChain]:
+        """The low-pass of delta and that of the factor."""
         range = (PT2(85.0),) if self.range is None else self.range
         smooth = (PT2(35.0),) if self.smooth is None else self.smooth
-        return FilterChain(range, rate_hz), FilterChain(smooth, rate_hz)
+        return FilterChain(range, 1 / dt), FilterChain(smooth, 1 / dt)
 
     def factor(
-        self, chains: tuple[FilterChain, FilterChain], memory: tuple[PyTree, PyTree],
-        delta: Signal, speed: Signal, d: Array,
-    ) -> tuple[tuple[PyTree, PyTree], Signal]:  # fmt: skip
+        self, dt: float, memory: tuple[PyTree, PyTree], delta: Signal, speed: Signal, d: Array
+    ) -> tuple[tuple[PyTree, PyTree], Signal]:
         """Of the D gain, 1 or above."""
+        chains = self.chains(dt)
         state, quick = chains[0].step(memory[0], delta)
         base = broadcast_gain(d, delta)
         most = broadcast_gain(self.ceiling, delta) / jnp.where(base > 0, base, 1.0)
@@ -193,6 +193,13 @@ class BetaflightPID(BetaflightRate):
     def derivative_chain(self, axis: int) -> FilterChain:
         return FilterChain(self.dterm, 1 / self.dt)
 
+    def levelled(self) -> Self:
+        """Inside of an angle loop, the integral is held from a fifth of the speed on."""
+        if self.relax is None:
+            return self
+        relax = dataclasses.replace(self.relax, threshold=0.2 * self.relax.threshold)
+        return dataclasses.replace(self, relax=relax)
+
     def holds_integral(self, axis: int) -> bool:
         return self.relax is not None and float(np.broadcast_to(self.relax.share, (3,))[axis]) > 0
 
@@ -211,7 +218,7 @@ class BetaflightPID(BetaflightRate):
         if self.relax is not None:
             memory["slow"] = zero
         if self.d_max is not None:
-            memory["d_max"] = tuple(x.init(zero) for x in self.d_max.chains(1 / self.dt))
+            memory["d_max"] = tuple(x.init(zero) for x in self.d_max.chains(self.dt))
         return memory
 
     def advance(
@@ -238,8 +245,9 @@ class BetaflightPID(BetaflightRate):
         boost = 1 + at(self.p_boost) / jnp.maximum(jnp.abs(DEGREES * r) / _BOOSTED, 1.0)
         delta, factor = (memory["d"] - next["d"]) / self.dt, jnp.ones_like(y)
         if self.d_max is not None:
+            at_speed = DEGREES * speed
             next["d_max"], factor = self.d_max.factor(
-                self.d_max.chains(1 / self.dt), memory["d_max"], delta, DEGREES * speed, self.d
+                self.dt, memory["d_max"], delta, at_speed, self.d
             )
         terms = {
             "P": next["p"] * boost, "I": next["integral"],
@@ -347,13 +355,10 @@ def adrc_b0(gain: Float[ArrayLike, "..."], lag: Float[ArrayLike, "..."]) -> Floa
 def tpa_factor(
     throttle: Float[ArrayLike, "..."], rate: float = 65.0, breakpoint: float = 0.35
 ) -> Float[Array, "..."]:
-    """Betaflight's throttle PID attenuation: 1 up to the breakpoint, then falling.
+    """Betaflight's throttle PID attenuation at a throttle of 0 to 1.
 
-    **Arguments:**
-
-    - `throttle`: 0 to 1.
-    - `rate`: tpa_rate in percent, at full throttle.
-    - `breakpoint`: (tpa_breakpoint - 1000)/1000.
+    It is 1 up to the `breakpoint`, (tpa_breakpoint - 1000)/1000, then falls by `rate` percent
+    (tpa_rate) at full throttle.
     """
     above = jnp.clip((as_float(throttle) - breakpoint) / (1 - breakpoint), 0.0, 1.0)
     return 1 - rate / 100 * above
@@ -375,9 +380,9 @@ def dynamic_cutoff(
 class BetaflightAngle(AngleLoop):
     """Betaflight's angle mode around a rate loop: angles in rad in, pidsum units out.
 
-    The rate's set-point is level/10 times the error of the angle, through a pt3 at 50 Hz. Feed-
-    forward is off, and the relaxation of the integral begins at 8 deg/s. The rate that the inner
-    loop sees is the difference of the measured angles over a sample. Source: docs/autopilots.md.
+    The rate's set-point is level/10 times the error of the angle, through a pt3 at 50 Hz.
+    Feed-forward is off, and the relaxation of the integral begins at 8 deg/s. Source:
+    docs/autopilots.md.
 
     **Arguments:**
 
@@ -385,9 +390,7 @@ class BetaflightAngle(AngleLoop):
     - `level`: angle_p_gain, 50 is 5 1/s.
     - `smooth`: the filters of the rate's set-point; None is a pt3 at 50 Hz.
 
-    **Raises:**
-
-    - `ValueError`: the level is not above 0.
+    **Raises:** `ValueError`: the level is not above 0.
     """
 
     outer: ClassVar[tuple[str, ...]] = ("level",)
@@ -403,10 +406,7 @@ class BetaflightAngle(AngleLoop):
         return FilterChain((PT3(50.0),) if self.smooth is None else self.smooth, 1 / self.dt)
 
     def inner(self) -> BetaflightPID:
-        relax = self.rate.relax
-        if relax is not None:
-            relax = dataclasses.replace(relax, threshold=0.2 * relax.threshold)
-        return dataclasses.replace(self.rate, f=jnp.zeros_like(self.rate.f), relax=relax)
+        return dataclasses.replace(self.rate.levelled(), f=jnp.zeros_like(self.rate.f))
 
     def outer_rest(self, zero: Signal) -> dict[str, PyTree]:
         return {"smooth": self._smooth.init(zero)}

@@ -212,7 +212,16 @@ def command_hold(log: Log) -> tuple[float | None, tuple[str, ...]]:
     """
     # us, and loops of the gyro for one of the PID
     period = 1e-6 * number_of(log, "looptime") * number_of(log, "pid_process_denom", 1.0)
-    stated, stamped = plausible_hold(period), plausible_hold(_period_of_stamps(log))
+    stated, stamped = plausible_hold(period), None
+    for table in log.tables.values():
+        counter, time = table.columns.get("loopIteration"), table.time
+        if counter is not None and time is not None:
+            stride, loops = min(_STRIDE, time.size - 1), np.asarray(counter, np.float64)
+            loops, time = (x[stride:] - x[:-stride] for x in (loops, time))
+            good = (loops > 0) & (time > 0)
+            if good.any():
+                stamped = plausible_hold(float(np.median(time[good] / loops[good])))
+            break
     if stated is None or stamped is None or abs(stamped / stated - 1) < _TOLERANCE:
         return stated, ()
     remark = (
@@ -221,18 +230,6 @@ def command_hold(log: Log) -> tuple[float | None, tuple[str, ...]]:
         f"how long the command is held (--hold takes another)"
     )
     return float(f"{stamped:.6g}"), (remark,)
-
-
-def _period_of_stamps(log: Log) -> float:
-    """The median time for one loopIteration in s; 0 where the log does not count them."""
-    for table in log.tables.values():
-        counter = table.columns.get("loopIteration")
-        if counter is not None and table.time is not None:
-            stride, loops = min(_STRIDE, table.time.size - 1), np.asarray(counter, np.float64)
-            loops, time = (x[stride:] - x[:-stride] for x in (loops, table.time))
-            good = (loops > 0) & (time > 0)
-            return float(np.median(time[good] / loops[good])) if good.any() else 0.0
-    return 0.0
 
 
 _FULL = 500.0  # of rcCommand

@@ -110,7 +110,6 @@ class CrazyflieRate(RateLoop):
 class CrazyflieAttitude(AngleLoop):
     """The Crazyflie's angle PID around its rate loop: angles in rad in, the int16 command out.
 
-    The rate that the inner loop sees is the difference of the measured angles over a sample.
     Source: docs/autopilots.md.
 
     **Arguments:** (each number is a scalar, one value per axis, or `[axes, *ensemble]`)
@@ -119,9 +118,7 @@ class CrazyflieAttitude(AngleLoop):
     - `kp`, `ki`, `kd`: pid_attitude.roll_kp and so on, from deg to deg/s.
     - `integral_limit`: of the integral of the error, in deg s.
 
-    **Raises:**
-
-    - `ValueError`: `kp` is not above 0.
+    **Raises:** `ValueError`: `kp` is not above 0.
     """
 
     outer: ClassVar[tuple[str, ...]] = ("kp", "ki", "kd")

@@ -135,8 +135,7 @@ class PX4Attitude(AngleLoop):
     """PX4's attitude loop around a rate loop: angles in rad in, normalised torque out.
 
     The rate's set-point is `p` times the error of the angle, plus a `Setpoint`'s rate, within
-    `rate_limit`. There is no integral and no derivative of the angle. The rate that the inner loop
-    sees is the difference of the measured angles over a sample. Source: docs/autopilots.md.
+    `rate_limit`. There is no integral and no derivative of the angle. Source: docs/autopilots.md.
 
     **Arguments:** (each number is a scalar, one value per axis, or `[axes, *ensemble]`)
 
@@ -144,9 +143,7 @@ class PX4Attitude(AngleLoop):
     - `p`: MC_ROLL_P, MC_PITCH_P, MC_YAW_P in 1/s.
     - `rate_limit`: MC_xRATE_MAX in rad/s, 220 deg/s by default.
 
-    **Raises:**
-
-    - `ValueError`: `p` or the limit is not above 0.
+    **Raises:** `ValueError`: `p` or the limit is not above 0.
     """
 
     rate: PX4Rate
@@ -181,9 +178,7 @@ def px4_loop(values: Mapping[str, str], *, gyro_rate_hz: float = 8000.0) -> Flow
     - `gyro_rate_hz`: at which the gyro's filters run, which no parameter says; it is rounded to a
         multiple of the loop's.
 
-    **Raises:**
-
-    - `ValueError`: a gain is missing.
+    **Raises:** `ValueError`: a gain is missing.
     """
     read = Numbers(values)
     rate = read.number("IMU_GYRO_RATEMAX", 400.0) or 400.0

@@ -41,7 +41,17 @@ def px4_setup(log: Log, wanted: Selection) -> Setup:
         raise RecordError(
             "the log has no vehicle_angular_velocity. Choose a logging profile that has it."
         )
-    tuned = {x: span for x, span in _autotuned(log).items() if axis in (None, x)}
+    tuned: dict[str, list[Injection]] = {}  # of each axis, all runs of it
+    table = log.tables.get(_AUTOTUNE)
+    if table is not None and table.time is not None and {"state", "rate_sp"} <= set(table.columns):
+        state = table.columns["state"]
+        for number, x in _STATES.items() if state.ndim == 1 else ():
+            rows = np.flatnonzero(state == number)
+            cuts = np.flatnonzero((np.diff(rows) > 1) & (np.diff(table.time[rows]) > _BREAK)) + 1
+            parts = [part for part in np.split(rows, cuts) if part.size > 1]
+            if parts and axis in (None, x):
+                ends = (table.time[part[[0, -1]]].tolist() for part in parts)
+                tuned[x] = [Injection(start, stop) for start, stop in ends]
     if tuned:
         axis = max(tuned, key=lambda x: max(run.stop - run.start for run in tuned[x]))
     axis = axis or most_active_axis(signals, rates)
@@ -75,24 +85,6 @@ def px4_setup(log: Log, wanted: Selection) -> Setup:
             f"it moved enough"
         )
     return Setup(axis, {command: 1.0}, rates[axis], remarks=tuple(remarks))
-
-
-def _autotuned(log: Log) -> dict[str, list[Injection]]:
-    """When autotune excited each axis; more than one run of it may be in a log."""
-    table = log.tables.get(_AUTOTUNE)
-    if table is None or table.time is None or not {"state", "rate_sp"} <= set(table.columns):
-        return {}
-    if table.columns["state"].ndim != 1:
-        return {}
-    runs = {}
-    for state, axis in _STATES.items():
-        rows = np.flatnonzero(table.columns["state"] == state)
-        cuts = np.flatnonzero((np.diff(rows) > 1) & (np.diff(table.time[rows]) > _BREAK)) + 1
-        parts = [part for part in np.split(rows, cuts) if part.size > 1]
-        if parts:
-            ends = (table.time[part[[0, -1]]].tolist() for part in parts)
-            runs[axis] = [Injection(start, stop) for start, stop in ends]
-    return runs
 
 
 LOG = FirmwareLog(

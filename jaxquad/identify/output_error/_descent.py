@@ -40,6 +40,7 @@ _STEP_FIXED_SLOPES = 1e-5  # relative; its square is the error
 
 Vector = Float[np.ndarray, " n"]  # free parameters and initial states
 Residuals = list[Float[np.ndarray, "samples outputs"]]  # of each record
+Begin = tuple[OutputError, Vector, Evaluation, int]  # residuals of unit size; steps
 Models = list[list[NoiseModel]]  # of each output of each record
 
 
@@ -76,12 +77,16 @@ class Point(NamedTuple):
         normal = self.evaluation.normal
         return np.asarray(normal.gradient), np.asarray(normal.hessian)
 
+    def errors_of(self, change: Vector) -> float:
+        """A change of z in standard errors."""
+        return float(np.sqrt(max(change @ self.slopes()[1] @ change, 0.0)))
+
     def moved(self, change: Vector) -> "Point":
-        return _point(self.problem, self.z + change)
+        return Point.at(self.problem, self.z + change)
 
-
-def _point(problem: OutputError, z: Vector) -> Point:
-    return Point(problem, z, evaluate_misfits(np.asarray(z), problem))
+    @staticmethod
+    def at(problem: OutputError, z: Vector) -> "Point":
+        return Point(problem, z, evaluate_misfits(np.asarray(z), problem))
 
 
 def descend(
@@ -90,7 +95,7 @@ def descend(
     """The minimum near `z`, to a last step of `tolerance`; the steps, and why it is none."""
     start = filtered_point(problem, z) if is_filtered(problem) else None
     if start is None or not start.is_precise:
-        start = _point(problem, z)
+        start = Point.at(problem, z)
     if not np.isfinite(start.cost):
         raise ValueError(
             "the simulated output of the model, or its derivative, is not finite at the starting "
@@ -102,7 +107,7 @@ def descend(
     if isinstance(start, FilteredPoint):
         end, status, steps = minimise_on_host(start, FilteredPoint.moved, **options)
         precise = end.is_precise
-        stop = Point(problem, end.z, end.evaluation) if precise else _point(problem, end.z)
+        stop = Point(problem, end.z, end.evaluation) if precise else Point.at(problem, end.z)
     else:
         precise, stop, status, steps = False, start, RUNNING, 0
     if not precise:
@@ -166,15 +171,6 @@ def sizes_of(problem: OutputError, evaluation: Evaluation) -> list[Float[np.ndar
     return sizes
 
 
-class _Start(NamedTuple):
-    """A problem whose residuals have unit size at `z`."""
-
-    problem: OutputError
-    z: Vector
-    evaluation: Evaluation
-    steps: int
-
-
 class _End(NamedTuple):
     """Where the turns ended."""
 
@@ -208,9 +204,18 @@ def descend_with_noise(
             total += 2 * sum(sum(model.order) for model in models)
         return total if np.isfinite(total) else np.inf
 
+    def begin(after_output_error: bool) -> Begin:
+        if not after_output_error:
+            evaluation = evaluate_misfits(z := _start_of(problem), problem)
+            if all(np.all(np.isfinite(misfit)) for misfit in evaluation.misfits):
+                sizes = sizes_of(problem, evaluation)
+                return problem.reweighted(sizes), z, evaluation.reweighted(sizes), 0
+        first = descend_by_turns(problem, max_steps, _NEAR)
+        return first.problem, np.asarray(first.z), first.evaluation, first.solution.steps
+
     ends: list[_End] = []
-    for begin in (_at_start,) if near else (_at_start, _after_output_error):
-        ends.append(_alternate(begin(problem, max_steps), noise, max_steps, ends))
+    for after in (False,) if near else (False, True):
+        ends.append(_alternate(*begin(after), noise, max_steps, ends))
     plain, problem, stop, steps, message, residuals, models = min(ends, key=akaike)
     noises = []
     for term, residual, row in zip(plain.terms, residuals, models, strict=True):
@@ -231,23 +236,11 @@ def descend_with_noise(
     )
 
 
-def _at_start(plain: OutputError, max_steps: int) -> _Start:
-    z = _start_of(plain)
-    evaluation = evaluate_misfits(z, plain)
-    if not all(np.all(np.isfinite(misfit)) for misfit in evaluation.misfits):
-        return _after_output_error(plain, max_steps)
-    sizes = sizes_of(plain, evaluation)
-    return _Start(plain.reweighted(sizes), z, evaluation.reweighted(sizes), 0)
-
-
-def _after_output_error(plain: OutputError, max_steps: int) -> _Start:
-    first = descend_by_turns(plain, max_steps, _NEAR)
-    return _Start(first.problem, np.asarray(first.z), first.evaluation, first.solution.steps)
-
-
-def _alternate(start: _Start, noise: Noise, max_steps: int, ends: Sequence[_End]) -> _End:
+def _alternate(
+    plain: OutputError, z: Vector, evaluation: Evaluation, steps: int, noise: Noise,
+    max_steps: int, ends: Sequence[_End],
+) -> _End:  # fmt: skip
     """The end of the turns from a start; one of the `ends`, if the first turn leads next to it."""
-    plain, z, evaluation, steps = start
     # Least squares alone makes the initial state follow slow noise, at the price of a jump in the
     # first samples: residuals of one that suits coloured noise.
     misfits = [np.asarray(misfit) for misfit in evaluation.misfits]
@@ -272,19 +265,14 @@ def _alternate(start: _Start, noise: Noise, max_steps: int, ends: Sequence[_End]
         stop, more, message = descend(problem, z, max_steps, _NEAR)
         change, steps, z = stop.z - z, steps + more, stop.z
         for end in () if turn else ends:
-            if _distance(stop, z - end.stop.z) < _NEXT:
+            if stop.errors_of(z - end.stop.z) < _NEXT:
                 return end
         residuals = _residuals(evaluate_misfits(np.asarray(z), plain), models)
-        if message or (turn and _distance(stop, change) < _STILL):
+        if message or (turn and stop.errors_of(change) < _STILL):
             break
     else:
         message = f"the noise model still changed after {_TURNS} turns"
     return _End(plain, problem, stop, steps, message, residuals, models)
-
-
-def _distance(stop: Point, change: Vector) -> float:
-    """Of a change of z, in standard errors."""
-    return float(np.sqrt(max(change @ stop.slopes()[1] @ change, 0.0)))
 
 
 def _estimate_all(residuals: Residuals, kinds: list[list[Noise]]) -> Models:

@@ -26,7 +26,7 @@ from jaxquad.models import sample_rational, TransferFunction
 
 from ..frequency_domain._parameters import Numbers
 from ..frequency_domain._solve import evaluate, Frame, take_apart
-from ._coloured_noise import row_products
+from ._noise import row_products
 from ._problem import Evaluation, insert_parameters, OutputError, RecordTerm
 from ._simulated import band_filter, linear_model
 
@@ -38,6 +38,9 @@ _REFINEMENTS = 3
 _CLOSE = 1e-8  # a step, relative to 1 + |z|, whose square is rounding
 _GONE = 1e-20  # of the states, relative to their start
 
+Samples = Float[np.ndarray, " samples"]
+Values = Float[np.ndarray, " parameters"]  # in the coordinates of the descent
+Moving = Float[np.ndarray, "motions moving"]
 Rows = Float[np.ndarray, "rows samples"]
 
 
@@ -58,9 +61,9 @@ class Columns(NamedTuple):
     These are biases and initial values, up to the sample at which nothing is left of them.
     """
 
-    shift: Float[np.ndarray, " samples"]  # within the band
-    free: Float[np.ndarray, "motions moving"]
-    filtered: Float[np.ndarray, "motions moving"]  # within the band, in which they last longer
+    shift: Samples  # within the band
+    free: Moving
+    filtered: Moving  # within the band, in which they last longer
     scale: Float[np.ndarray, " rows"]  # that brings shift and motions to unit length
     normal: Float[np.ndarray, "rows rows"]  # their products at unit length, with a ridge
 
@@ -69,9 +72,7 @@ class Columns(NamedTuple):
         moving = self.filtered.shape[1]
         return np.concatenate([(x @ self.shift)[None], self.filtered @ x[..., :moving].T])
 
-    def taken_off(
-        self, x: Float[np.ndarray, " samples"], unknowns: Float[np.ndarray, " rows"]
-    ) -> Float[np.ndarray, " samples"]:
+    def taken_off(self, x: Samples, unknowns: Float[np.ndarray, " rows"]) -> Samples:
         """The series without so much of each."""
         left = x - unknowns[0] * self.shift
         left[: self.filtered.shape[1]] -= unknowns[1:] @ self.filtered
@@ -89,13 +90,13 @@ class Simulated(NamedTuple):
     """One record: what is left of it, and what its slopes are made of."""
 
     sampled: Sampled
-    driven: Float[np.ndarray, " samples"]  # u / A
-    output: Float[np.ndarray, " samples"]  # with the free motions
+    driven: Samples  # u / A
+    output: Samples  # with the free motions
     columns: Columns
-    misfit: Float[np.ndarray, " samples"]  # weighted, and orthogonal to the columns
+    misfit: Samples  # weighted, and orthogonal to the columns
 
 
-Program = Callable[[Float[np.ndarray, " parameters"]], Sampled]
+Program = Callable[[Values], Sampled]
 
 
 def is_filtered(problem: OutputError) -> bool:
@@ -116,7 +117,7 @@ class FilteredPoint:
 
     problem: OutputError
     programs: list[Program]  # of each record
-    z: Float[np.ndarray, " parameters"]
+    z: Values
     records: list[Simulated]
     prior_misfits: Float[np.ndarray, " priors"]
     prior_slopes: Float[np.ndarray, "priors parameters"]
@@ -130,7 +131,7 @@ class FilteredPoint:
         return cost if np.isfinite(cost) else np.inf
 
     @ft.cached_property
-    def behind(self) -> list[Float[np.ndarray, " samples"]]:
+    def behind(self) -> list[Samples]:
         """y / A of each record."""
         if self.next_to is not None:
             return self.next_to.behind
@@ -169,12 +170,12 @@ class FilteredPoint:
     def slopes(self) -> tuple[np.ndarray, np.ndarray]:
         return self.normal
 
-    def moved(self, change: Float[np.ndarray, " parameters"]) -> "FilteredPoint":
+    def moved(self, change: Values) -> "FilteredPoint":
         if self._is_last(change):
             return self._next_to(change)
         return _point(self.problem, self.programs, self.z + change)
 
-    def _is_last(self, change: Float[np.ndarray, " parameters"]) -> bool:
+    def _is_last(self, change: Values) -> bool:
         """Whether the misfit after a step of Gauss and Newton is known by its slopes."""
         if np.max(np.abs(change) / (1 + np.abs(self.z))) > _CLOSE or self.next_to is not None:
             return False
@@ -182,7 +183,7 @@ class FilteredPoint:
         # A step that damping has shortened is none of these, and its cost has to be seen.
         return np.allclose(hessian @ change, -gradient, rtol=0.1, atol=0.0)
 
-    def _next_to(self, change: Float[np.ndarray, " parameters"]) -> "FilteredPoint":
+    def _next_to(self, change: Values) -> "FilteredPoint":
         parts = zip(self.records, self.rows, strict=True)
         misfits = [_project_out(one.misfit + change @ rows, one.columns)[0] for one, rows in parts]
         return dataclasses.replace(
@@ -216,14 +217,14 @@ class FilteredPoint:
         return Evaluation(misfits, slopes, columns, normal)
 
 
-def filtered_point(problem: OutputError, z: Float[np.ndarray, " parameters"]) -> FilteredPoint:
+def filtered_point(problem: OutputError, z: Values) -> FilteredPoint:
     """Where a descent begins."""
     frame, arrays = take_apart(OutputError(problem.base, (), problem.zeros))
 
     def sampler(term: RecordTerm) -> Program:
         run = _program(frame, term.hold)
 
-        def sample(z: Float[np.ndarray, " parameters"]) -> Sampled:
+        def sample(z: Values) -> Sampled:
             coefficients, motion, shift = map(np.asarray, run(z, term.dt, arrays))
             both = motion.shape[1]
             above, below = np.split(coefficients[:, 0], [both // 2 + 2])
@@ -285,7 +286,7 @@ def _simulated(term: RecordTerm, sampled: Sampled) -> Simulated:
     return Simulated(sampled, driven, forced, columns, float(term.weights[0]) * misfit)
 
 
-def _over(below: Float[np.ndarray, " poles"], x: Float[np.ndarray, " samples"]) -> np.ndarray:
+def _over(below: Float[np.ndarray, " poles"], x: Samples) -> np.ndarray:
     """`x` / A, from rest."""
     from scipy.signal import lfilter
 
@@ -297,9 +298,7 @@ def _in_band(term: RecordTerm, x: Float[np.ndarray, "*rows samples"]) -> np.ndar
     return x if term.gain is None else np.asarray(band_filter(x.T, np.asarray(term.gain))).T
 
 
-def _free_motions(
-    term: RecordTerm, sampled: Sampled, samples: int
-) -> Float[np.ndarray, "motions moving"]:
+def _free_motions(term: RecordTerm, sampled: Sampled, samples: int) -> Moving:
     """Biases on the slow motions and initial values of the fast ones, as far as any is left."""
     assert term.motions is not None
     slow, fast = map(np.asarray, term.motions)
@@ -320,7 +319,7 @@ def _free_motions(
     return ways @ motion[:, :done]
 
 
-def _columns(term: RecordTerm, free: Float[np.ndarray, "motions moving"]) -> Columns:
+def _columns(term: RecordTerm, free: Moving) -> Columns:
     samples = len(term.y)
     shift, filtered = _in_band(term, np.ones(samples)), free
     if term.gain is not None:
@@ -334,9 +333,7 @@ def _columns(term: RecordTerm, free: Float[np.ndarray, "motions moving"]) -> Col
     return Columns(shift, free, filtered, scale, ridged)
 
 
-def _project_out(
-    misfit: Float[np.ndarray, " samples"], columns: Columns
-) -> tuple[Float[np.ndarray, " samples"], Float[np.ndarray, " rows"]]:
+def _project_out(misfit: Samples, columns: Columns) -> tuple[Samples, Float[np.ndarray, " rows"]]:
     """The misfit that no start, trim or shift explains, and how much of each does explain."""
     aim, unknowns = columns.scale * columns.products(misfit), np.zeros(len(columns.scale))
     if not np.all(np.isfinite(aim)):

@@ -64,10 +64,7 @@ class KnownController(Protocol):
 def feedback_response(
     loop: KnownController, record: Record, hold: str
 ) -> Float[np.ndarray, " samples"]:
-    """The command of a controller after a unit sample of the output, over the record.
-
-    Raise ValueError for a record that it cannot have closed a loop in.
-    """
+    """The command after a unit sample of the output; ValueError where no such loop was closed."""
     if not isinstance(loop, KnownController):
         raise ValueError(
             f"loop is a {type(loop).__name__}: give the controller that closed the loop, with a "

@@ -11,7 +11,7 @@ from jaxquad._core import Message, require_x64
 from jaxquad.records import Record
 
 from ..uncertainty._verdict import UndeterminedError, Verdict
-from ._coloured_noise import orthonormal, projected_noise
+from ._noise import orthonormal, projected_noise
 from ._simulated import (
     band_filter,
     band_gain,

@@ -17,14 +17,7 @@ from jaxquad.models import evaluate_response, simulate_linear, TransferFunction
 from ..frequency_domain._parameters import number_at, Parameters
 from ..output_error._simulated import linear_model
 from ._error_budget import Matrix
-from ._verdict import (
-    Combination,
-    LIMIT,
-    NO_MINIMUM,
-    reach_of_interval,
-    UndeterminedError,
-    USUAL,
-)
+from ._verdict import Combination, LIMIT, NO_MINIMUM, reach_of_interval, UndeterminedError, USUAL
 
 
 if TYPE_CHECKING:

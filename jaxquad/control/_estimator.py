@@ -18,7 +18,7 @@ from jaxquad._core import (
     require_positive,
 )
 
-from .._protocols import InertiaEstimate
+from ._protocols import Gain, InertiaEstimate, Signal
 
 
 PLAUSIBLE = 10.0  # times the nominal inertia, or a share of it
@@ -27,10 +27,10 @@ PLAUSIBLE = 10.0  # times the nominal inertia, or a share of it
 class LastEstimate(NamedTuple):
     """An estimate between the samples or windows that renew it."""
 
-    inertia: Float[Array, " axes *ensemble"]  # kg m^2
-    variance: Float[Array, " axes *ensemble"]  # (kg m^2)^2, when it was made
-    age: Float[Array, " axes *ensemble"]  # relative variance that has come with time
-    informed: Float[Array, " axes *ensemble"]  # 1 once there was excitation
+    inertia: Signal  # kg m^2
+    variance: Signal  # (kg m^2)^2, when it was made
+    age: Signal  # relative variance that has come with time
+    informed: Signal  # 1 once there was excitation
 
 
 State = TypeVar("State", bound=Any)  # a NamedTuple with the field `last`, a LastEstimate
@@ -42,10 +42,8 @@ class AbstractInertia(eqx.Module):
     A plant of the inertia J answers a command u with J angle'' = `torque_gain` u + disturbances.
     """
 
-    torque_gain: Float[Array, "..."] = per_member(
-        rank=1, converter=as_float
-    )  # N m per unit of command
-    nominal: Float[Array, "..."] = per_member(rank=1, converter=as_float)  # kg m^2
+    torque_gain: Gain = per_member(rank=1, converter=as_float)  # N m per unit of command
+    nominal: Gain = per_member(rank=1, converter=as_float)  # kg m^2
     trust: float = eqx.field(static=True, default=0.1, kw_only=True)
     drift: float = eqx.field(static=True, default=0.01, kw_only=True)  # 1/sqrt(s)
     dt: float = eqx.field(static=True, default=0.002, kw_only=True)  # s
@@ -71,7 +69,7 @@ class AbstractInertia(eqx.Module):
         last = state.last
         return state._replace(last=last._replace(age=jnp.ones_like(last.age)))
 
-    def _start(self, like: Float[Array, " axes *ensemble"]) -> LastEstimate:
+    def _start(self, like: Signal) -> LastEstimate:
         """The nominal inertia, before any excitation."""
         zero = jnp.zeros_like(like)
         return LastEstimate(
@@ -97,33 +95,29 @@ class AbstractInertia(eqx.Module):
 class Past(NamedTuple):
     """What differences need of the samples before."""
 
-    angle: Float[Array, " axes *ensemble"]
-    change: Float[Array, " axes *ensemble"]  # of the angle over the last sample
-    command: Float[Array, " axes *ensemble"]  # held during it
+    angle: Signal
+    change: Signal  # of the angle over the last sample
+    command: Signal  # held during it
     samples: Int[Array, ""]  # samples, counted to 2
 
 
 class Equation(NamedTuple):
     """Both sides of J acceleration = torque at one sample, each centred on the sample before."""
 
-    acceleration: Float[Array, " axes *ensemble"]  # rad/s^2
-    torque: Float[Array, " axes *ensemble"]  # N m
-    rate: Float[Array, " axes *ensemble"]  # rad/s
-    angle: Float[Array, " axes *ensemble"]  # rad
+    acceleration: Signal  # rad/s^2
+    torque: Signal  # N m
+    rate: Signal  # rad/s
+    angle: Signal  # rad
     valid: Float[Array, ""]  # 0 for the first two samples, whose differences have no past
 
 
-def empty_past(like: Float[Array, " axes *ensemble"]) -> Past:
+def empty_past(like: Signal) -> Past:
     zero = jnp.zeros_like(like)
     return Past(zero, zero, zero, jnp.zeros((), jnp.int32))
 
 
 def motion(
-    past: Past,
-    torque_gain: Float[Array, "..."],
-    command: Float[Array, " axes *ensemble"],
-    measurement: Float[Array, " axes *ensemble"],
-    dt: float,
+    past: Past, torque_gain: Gain, command: Signal, measurement: Signal, dt: float
 ) -> tuple[Past, Equation]:
     """The sampled equation of motion of an angle under held torques, without error:
 
@@ -155,9 +149,7 @@ class MatchedFilters(eqx.Module):
     under zero-order hold, q0' = bandwidth (rate - q0), would bias the inertia by bandwidth dt / 2.
     """
 
-    torque_gain: Float[Array, "..."] = per_member(
-        rank=1, converter=as_float
-    )  # N m per unit of command
+    torque_gain: Gain = per_member(rank=1, converter=as_float)  # N m per unit of command
     bandwidth: Float[Array, ""] = eqx.field(converter=as_float)  # rad/s
     order: int = eqx.field(static=True)
     dt: float = eqx.field(static=True)
@@ -174,15 +166,12 @@ class MatchedFilters(eqx.Module):
     def signals(self) -> int:
         return 5 if self.angle else 4
 
-    def init(self, like: Float[Array, " axes *ensemble"]) -> FilterState:
+    def init(self, like: Signal) -> FilterState:
         stage = jnp.zeros((self.signals, *like.shape), like.dtype)
         return FilterState(empty_past(like), (stage,) * self.order)
 
     def __call__(
-        self,
-        state: FilterState,
-        command: Float[Array, " axes *ensemble"],
-        measurement: Float[Array, " axes *ensemble"],
+        self, state: FilterState, command: Signal, measurement: Signal
     ) -> tuple[FilterState, Float[Array, " signals axes *ensemble"]]:
         """The filtered terms after one more sample."""
         past, now = motion(state.past, self.torque_gain, command, measurement, self.dt)
@@ -197,9 +186,7 @@ class MatchedFilters(eqx.Module):
         return FilterState(past, tuple(stages)), out
 
 
-def has_settled(
-    terms: Float[Array, " signals axes *ensemble"],
-) -> Float[Array, " axes *ensemble"]:
+def has_settled(terms: Float[Array, " signals axes *ensemble"]) -> Signal:
     """1 once the filter has forgotten its start, 0 before.
 
     The first difference of a counted angle is wrong by up to a count per sample interval, which
@@ -210,7 +197,7 @@ def has_settled(
 
 class ProbeState(NamedTuple):
     index: Int[Array, ""]  # samples
-    exciting: Float[Array, " axes *ensemble"]  # 1 while the tones are on
+    exciting: Signal  # 1 while the tones are on
 
 
 class ProbeTones(eqx.Module):
@@ -234,9 +221,7 @@ class ProbeTones(eqx.Module):
     """
 
     frequencies: tuple[float, ...] = eqx.field(static=True, default=(2.0,))  # Hz
-    amplitude: Float[Array, "..."] = per_member(
-        rank=1, converter=as_float, default=0.3
-    )  # of each sine
+    amplitude: Gain = per_member(rank=1, converter=as_float, default=0.3)  # of each sine
     above: float = eqx.field(static=True, default=0.08)
     below: float = eqx.field(static=True, default=0.04)
 
@@ -250,16 +235,14 @@ class ProbeTones(eqx.Module):
             )
         require_nonnegative("amplitude", self.amplitude, "give units of the command")
 
-    def init(self, like: Float[Array, " axes *ensemble"]) -> ProbeState:
+    def init(self, like: Signal) -> ProbeState:
         return ProbeState(jnp.zeros((), jnp.int32), jnp.ones_like(like))
 
     def step(self, state: ProbeState, estimate: InertiaEstimate) -> ProbeState:
         """The state one sample later, switched by the `estimate`."""
         return ProbeState(state.index + 1, self.switch(state.exciting, estimate))
 
-    def switch(
-        self, exciting: Float[Array, " axes *ensemble"], estimate: InertiaEstimate
-    ) -> Float[Array, " axes *ensemble"]:
+    def switch(self, exciting: Signal, estimate: InertiaEstimate) -> Signal:
         """Whether the tones are on after this sample, 1 or 0."""
         if self.above == 0:
             return jnp.ones_like(exciting)
@@ -268,14 +251,12 @@ class ProbeTones(eqx.Module):
         needed = (deviation > self.above * inertia) | (self._amplitude(exciting) == 0)
         return jnp.where(needed, 1, staying)
 
-    def signal(self, state: ProbeState, dt: float) -> Float[Array, " axes *ensemble"]:
+    def signal(self, state: ProbeState, dt: float) -> Signal:
         """The sines, where they are on, in units of the command."""
         time = dt * state.index.astype(state.exciting.dtype)
         return self.wave(time * jnp.asarray(self.frequencies, time.dtype), state.exciting)
 
-    def wave(
-        self, phase: Float[Array, " tones"], exciting: Float[Array, " axes *ensemble"]
-    ) -> Float[Array, " axes *ensemble"]:
+    def wave(self, phase: Float[Array, " tones"], exciting: Signal) -> Signal:
         """The sines at these phases in cycles."""
         wave = jnp.sum(jnp.sin(2 * jnp.pi * (phase % 1)))
         return self._amplitude(exciting) * wave * exciting
@@ -293,11 +274,11 @@ class NoProbe(eqx.Module):
     with b0 = 1.6 one in seven trusted an inertia that was up to 40 % off.
     """
 
-    def init(self, like: Float[Array, " axes *ensemble"]) -> ProbeState:
+    def init(self, like: Signal) -> ProbeState:
         return ProbeState(jnp.zeros((), jnp.int32), jnp.ones_like(like))
 
     def step(self, state: ProbeState, estimate: InertiaEstimate) -> ProbeState:
         return state
 
-    def signal(self, state: ProbeState, dt: float) -> Float[Array, " axes *ensemble"]:
+    def signal(self, state: ProbeState, dt: float) -> Signal:
         return jnp.zeros_like(state.exciting)

@@ -1,6 +1,6 @@
-"""The step response of a flown loop, by deconvolution of its output from its reference."""
+"""What a flown loop does: its response broken at the error, and the step response of an output."""
 
-from typing import NamedTuple
+from typing import get_args, Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Complex, Float
@@ -8,7 +8,16 @@ from jaxtyping import Bool, Complex, Float
 from jaxquad._core import Message
 from jaxquad.records import Record
 
+from ._estimators import (
+    COHERENT,
+    Grid,
+    Response,
+)
 
+
+_LINES = 40  # frequencies, log-spaced
+_CYCLES = 4  # of the lowest frequency in a window
+_PARTS = 10  # windows that a record is cut into, about
 _LENGTHS = 4  # lengths of the response in a window: what precedes a window then hardly reaches in
 _WINDOWS = 12  # that a record is cut into, at least, for the default length
 _LONGEST = 3.0  # s, of the default length
@@ -24,8 +33,138 @@ _SETTLED = 0.05  # of the final value
 _DOUBT = 0.1  # of the final value, by which error, drift and blur may change it
 _RESOLVED = 1.5  # times the estimator's own rise time, that a rise has to take
 
+Entry = Literal["set-point", "plant input"]
 Samples = Float[np.ndarray, " samples"]
 _Spectra = Complex[np.ndarray, "windows frequencies"]
+
+
+class BrokenLoop(NamedTuple):
+    """The response of a loop L that is broken at its error, as `estimate_broken_loop` estimates it.
+
+    **Attributes:**
+
+    - `omega`: rad/s.
+    - `response`: L, with negative feedback: closed as 1 + L = 0.
+    - `error`: standard error, relative and in rad.
+    - `coherence`: of the reference with what it was estimated from.
+    """
+
+    omega: Grid
+    response: Response
+    error: Grid
+    coherence: Grid
+
+    @property
+    def crossover(self) -> float:
+        """Where |L| falls through 1 for the last time, in rad/s; nan if not in the band."""
+        falls = self._falls(np.log(np.abs(self.response)))
+        return falls[-1][0] if falls else float("nan")
+
+    @property
+    def phase_margin(self) -> tuple[float, float]:
+        """At the crossover, with its standard error, in rad."""
+        falls = self._falls(np.log(np.abs(self.response)))
+        if not falls:
+            return float("nan"), float("nan")
+        _, k, share = falls[-1]
+        phase = np.unwrap(np.angle(-self.response))
+        margin = phase[k] + share * (phase[k + 1] - phase[k])
+        turn = 2 * np.pi
+        return float((margin + np.pi) % turn - np.pi), float(self.error[k : k + 2].max())
+
+    @property
+    def gain_margin(self) -> tuple[float, float]:
+        """Factor at the first crossing of -180 deg beyond the crossover, and where in rad/s."""
+        phase = np.unwrap(np.angle(-self.response))
+        start = np.searchsorted(self.omega, self.crossover) if self.crossover > 0 else 0
+        phase = phase - 2 * np.pi * np.round(phase[min(start, phase.size - 1)] / (2 * np.pi))
+        falls = [fall for fall in self._falls(phase) if fall[1] + 1 >= start]
+        if not falls:
+            return float("nan"), float("nan")
+        (omega, k, share), level = falls[0], np.log(np.abs(self.response))
+        return float(np.exp(-(level[k] + share * (level[k + 1] - level[k])))), omega
+
+    def _falls(self, level: Grid) -> list[tuple[float, int, float]]:
+        """Where a level falls through 0 in rad/s, the point before it, and how far behind that."""
+        place, falls = np.log(self.omega), []
+        for k in np.flatnonzero((level[:-1] > 0) & (level[1:] <= 0)).tolist():
+            share = float(level[k] / (level[k] - level[k + 1]))
+            falls.append((float(np.exp(place[k] + share * (place[k + 1] - place[k]))), k, share))
+        return falls
+
+
+def estimate_broken_loop(
+    record: Record,
+    *,
+    entry: Entry,
+    reference: str | None = None,
+    output: str | None = None,
+    input: str | None = None,
+    band: tuple[float, float] | None = None,
+) -> BrokenLoop:
+    """Estimate the broken loop L of a flight, without knowing plant or controller.
+
+    A reference that is compared with the output closes as y = T r, T = L / (1 + L), so that
+    L = T / (1 - T). One that is added to the plant's input closes as u = S r, S = 1 / (1 + L), so
+    that L = 1 / S - 1. T and S are averages over tapered windows and neighbouring frequencies, and
+    their errors are propagated to first order.
+    Source: Tischler and Remple, "Aircraft and Rotorcraft System Identification", 2nd ed., sec. 5.7
+    and 9.2 (the random error of an average).
+
+    **Arguments:**
+
+    - `record`: with a reference.
+    - `entry`: where the reference enters, "set-point" or "plant input".
+    - `reference`, `output`, `input`: channels, by default the first of each.
+    - `band`: in rad/s; by default from four cycles in a window to a fifth of the sample rate.
+
+    **Returns:** a `BrokenLoop` of the frequencies with a coherence of 0.6 or more; it may be empty.
+
+    **Raises:** ValueError for a record without a reference, and for another entry.
+    """
+    if entry not in get_args(Entry):
+        entries = " or ".join(map(repr, get_args(Entry)))
+        raise ValueError(f"entry is {entry!r}: say where the reference enters, {entries}")
+    if reference is None and not record.reference_names:
+        raise ValueError(
+            Message(
+                "the record has no reference, so its loop is not known: name one («reference=»)"
+            )
+        )
+    source = reference or record.reference_names[0]
+    answer = output or record.output_names[0]
+    answer = answer if entry == "set-point" else input or record.input_names[0]
+    size = 2 * (record.samples // (_PARTS + 1))
+    starts = np.arange(0, record.samples - size + 1, size // 2)
+    taper = np.sin(np.pi * (np.arange(size) + 0.5) / size) ** 2
+    one, other = (
+        np.fft.rfft(taper * (x - x.mean())[starts[:, None] + np.arange(size)], axis=1)
+        for x in (record.channel(source), record.channel(answer))
+    )
+    fine = 2 * np.pi * np.fft.rfftfreq(size, record.dt)
+    low, high = band or (_CYCLES * fine[1], 0.2 * 2 * np.pi * record.sample_rate)
+    edges = np.geomspace(max(low, 2 * fine[1]), min(high, fine[-2]), _LINES + 1)
+    parts = []
+    for begin, end in zip(edges[:-1], edges[1:], strict=True):
+        bins = np.flatnonzero((fine >= begin) & (fine < end))
+        if not bins.size:
+            continue
+        # Over windows and neighbours, at the frequency where the reference has its power.
+        x, y, powers = one[:, bins], other[:, bins], np.abs(one[:, bins]) ** 2
+        power, cross = np.maximum(np.sum(powers), 1e-150), np.sum(np.conj(x) * y)
+        total = np.maximum(np.sum(np.abs(y) ** 2), 1e-150)
+        # Windows that overlap, and neighbours of tapered spectra, are half as many as they seem.
+        count = max(power**2 / np.maximum(np.sum(powers**2), 1e-300) / 2, 1.0)
+        raw = np.abs(cross) ** 2 / (power * total)
+        coherence = float(np.clip((count * raw - 1) / max(count - 1, 1e-3), 0.0, 1.0))
+        error = np.sqrt((1 - coherence) / max(2 * count * coherence, 1e-9))
+        parts.append((powers.sum(axis=0) @ fine[bins] / power, cross / power, error, coherence))
+    table = np.array(parts, complex).reshape(-1, 4).T
+    omega, closed, error, coherence = table[0].real, table[1], table[2].real, table[3].real
+    kept = (coherence >= COHERENT) & (closed != 0) & (closed != 1)
+    omega, closed, error, coherence = (x[kept] for x in (omega, closed, error, coherence))
+    loop = closed / (1 - closed) if entry == "set-point" else 1 / closed - 1
+    return BrokenLoop(omega, loop, error / np.abs(1 - closed), coherence)
 
 
 class StepResponse(NamedTuple):
@@ -200,25 +339,31 @@ def estimate_step(
             basis = np.linalg.qr(np.vander(np.linspace(-1, 1, size), drift + 1))[0]
             windows = windows - away @ basis @ basis.T
         answers.append(np.fft.rfft(taper * windows, axis=1) * moves)
+    before, after = int(round(length / 4 / dt)), int(round(length / dt))
+
+    def integrate(transfer: _Spectra) -> Float[np.ndarray, "windows samples"]:
+        """Step responses from a quarter of the length before the step."""
+        impulse = np.roll(np.fft.irfft(transfer, size, axis=-1), before, axis=-1)
+        return np.cumsum(impulse[..., : before + after + 1], axis=-1)
+
     transfers = [np.sum(np.conj(source) * one, axis=0) / bottom for one in answers]
-    time, steps = _integrate(np.stack([power / bottom + 0j, *transfers]), size, dt, length)
+    steps = integrate(np.stack([power / bottom + 0j, *transfers]))
     # What each window's rest adds to the transfer function: the infinitesimal jackknife.
     near = _smooth(np.abs(source) ** 2)
     leverage = np.minimum(near / np.maximum(np.sum(near, axis=0), 1e-300), 0.9)
     scatter = []
     for one, transfer in zip(answers, transfers, strict=True):
         error = np.conj(source) * (one - transfer * source) / bottom / (1 - leverage)
-        _, added = _integrate(error, size, dt, length)
+        added = integrate(error)
         # Windows that overlap share half of their samples.
         alone, shared = np.sum(added**2, axis=0), np.sum(added[1:] * added[:-1], axis=0)
         scatter.append(np.sqrt(alone + np.maximum(2 * shared, 0.0)))
     single = np.conj(source) * answer / np.maximum(np.abs(source) ** 2 + noise, 1e-300)
     active = _moves(record.channel(names[0]), size, _ACTIVE)
-    _, windows = _integrate(single[active], size, dt, length)
-    response = StepResponse(time, steps[1], scatter[0], windows, steps[0], len(source), names)
-    if simulated is None:
-        return response
-    return response._replace(simulated=steps[2], simulated_error=scatter[1])
+    time, windows = dt * np.arange(-before, after + 1), integrate(single[active])
+    model = (steps[2], scatter[1]) if simulated is not None else (None, None)
+    fields = time, steps[1], scatter[0], windows, steps[0], len(source), names
+    return StepResponse(*fields, *model)
 
 
 def default_length(record: Record) -> float:
@@ -245,18 +390,18 @@ def _smooth(values: Float[np.ndarray, "*windows frequencies"]) -> Float[np.ndarr
     return sum(padded[..., k : k + count] for k in range(1, _WIDTH)) + padded[..., :count]
 
 
-def _above_rounding(power: Float[np.ndarray, " frequencies"]) -> Float[np.ndarray, " frequencies"]:
-    """Sums over neighbouring frequencies, no smaller than what rounding makes of the largest."""
-    near = _smooth(power)
-    return np.maximum(near, max(np.finfo(float).eps * float(np.max(near)), 1e-150))
-
-
 def _noise_over_response(source: _Spectra, answer: _Spectra) -> Float[np.ndarray, " frequencies"]:
     """The power of noise over that of the response, in units of the reference's power."""
+
+    def above_rounding(power: np.ndarray) -> np.ndarray:
+        """Sums over neighbours, no smaller than what rounding makes of the largest."""
+        near = _smooth(power)
+        return np.maximum(near, max(np.finfo(float).eps * float(np.max(near)), 1e-150))
+
     powers, total = np.abs(source) ** 2, np.sum(np.abs(answer) ** 2, axis=0)
     cross = np.sum(np.conj(source) * answer, axis=0)
     near_cross = _smooth(cross.real) + 1j * _smooth(cross.imag)
-    near_power, near_total = _above_rounding(np.sum(powers, axis=0)), _above_rounding(total)
+    near_power, near_total = above_rounding(np.sum(powers, axis=0)), above_rounding(total)
     coherence = np.abs(near_cross) ** 2 / (near_power * near_total)
     # Windows and neighbours that count: one that holds all the power makes any pair coherent.
     # Neighbours of a tapered spectrum are half as many as they seem.
@@ -269,30 +414,14 @@ def _noise_over_response(source: _Spectra, answer: _Spectra) -> Float[np.ndarray
     return noise / _WIDTH
 
 
-def _integrate(
-    transfer: Complex[np.ndarray, "windows frequencies"], size: int, dt: float, length: float
-) -> tuple[Samples, Float[np.ndarray, "windows samples"]]:
-    """Step responses from a quarter of the length before the step, and their times."""
-    impulse = np.fft.irfft(transfer, size, axis=-1)
-    before, after = int(round(length / 4 / dt)), int(round(length / dt))
-    around = np.roll(impulse, before, axis=-1)[..., : before + after + 1]
-    time = dt * np.arange(-before, after + 1)
-    return time, np.cumsum(around, axis=-1)
-
-
 def _rise(time: Samples, level: Samples) -> float:
     """From the last time below 10 % before the first above 90 %, in s."""
     high = np.flatnonzero(level >= 0.9)
-    if not high.size or high[0] == 0:
-        return float("nan")
-    low = np.flatnonzero(level[: high[0]] < 0.1)
+    low = np.flatnonzero(level[: high[0]] < 0.1) if high.size else high
     if not low.size:
         return float("nan")
-    return float(
-        _crossing(time, level, int(high[0]) - 1, 0.9) - _crossing(time, level, int(low[-1]), 0.1)
+    begin, end = (
+        time[k] + (bound - level[k]) / (level[k + 1] - level[k]) * (time[k + 1] - time[k])
+        for k, bound in ((low[-1], 0.1), (high[0] - 1, 0.9))
     )
-
-
-def _crossing(time: Samples, level: Samples, k: int, bound: float) -> float:
-    share = (bound - level[k]) / (level[k + 1] - level[k])
-    return float(time[k] + share * (time[k + 1] - time[k]))
+    return float(end - begin)

@@ -21,8 +21,10 @@ from ._estimator import (
     ProbeState,
     ProbeTones,
 )
+from ._protocols import Signal
 
 
+Terms = Float[Array, " signals axes *ensemble"]
 NUISANCES = ("offset", "rate", "angle")
 
 
@@ -30,69 +32,30 @@ class Sums(NamedTuple):
     """Weighted sums over the samples: products of the terms, and the scatter of the score."""
 
     products: Float[Array, " signals signals axes *ensemble"]
-    recent: Float[Array, " axes *ensemble"]  # scores of the last moment
-    scatter: Float[Array, " axes *ensemble"]  # long-run variance of the sum of scores
+    recent: Signal  # scores of the last moment
+    scatter: Signal  # long-run variance of the sum of scores
 
 
 class Solution(NamedTuple):
     """A regression solved for the inertia alone."""
 
-    inertia: Float[Array, " axes *ensemble"]  # kg m^2
-    variance: Float[Array, " axes *ensemble"]  # (kg m^2)^2
-    weight: Float[Array, " axes *ensemble"]  # samples that count
-    informed: Float[Array, " axes *ensemble"]  # 1 where the acceleration stands out
+    inertia: Signal  # kg m^2
+    variance: Signal  # (kg m^2)^2
+    weight: Signal  # samples that count
+    informed: Signal  # 1 where the acceleration stands out
 
 
-def empty_sums(signals: int, like: Float[Array, " axes *ensemble"]) -> Sums:
+def empty_sums(signals: int, like: Signal) -> Sums:
     zero = jnp.zeros_like(like)
     return Sums(jnp.zeros((signals, signals, *like.shape), like.dtype), zero, zero)
 
 
-def add_sample(
-    sums: Sums,
-    terms: Float[Array, " signals axes *ensemble"],
-    keep: Float[Array, " axes *ensemble"],
-    *,
-    nuisance: tuple[str, ...],
-    excitation: float,
-    forget: float,
-    previous: Float[Array, " axes *ensemble"],
-) -> tuple[Sums, Solution]:
-    """The sums after one more sample, old ones weighted by `keep`, and what they say.
-
-    The inertia is the regression of torque on acceleration beside the `nuisance` terms. Where the
-    acceleration that they leave is below `excitation` in rad/s^2 rms the `previous` inertia stays.
-    The scores x e of neighbouring samples are correlated, since both are filtered: the variance of
-    their sum weighs pairs of samples by (1 - `forget`)^|k - l|.
-    """
-    products = keep[None, None] * sums.products + terms[:, None] * terms[None]
-    rest = _eliminate(products, terms, nuisance)
-    weight = products[0, 0]
-    floor = 64 * jnp.finfo(terms.dtype).eps * products[-2, -2]
-    informed = rest.square > jnp.maximum(weight * excitation**2, floor)
-    inverse = _inverse(rest.square, informed)
-    inertia = jnp.where(informed, rest.product * inverse, previous)
-    score = rest.acceleration * (rest.torque - inertia * rest.acceleration)
-    recent = (1 - forget) * keep * sums.recent
-    scatter = keep**2 * sums.scatter + score * (score + 2 * recent)
-    variance = jnp.maximum(scatter, 0) * inverse**2
-    solved = Solution(inertia, variance, weight, informed.astype(terms.dtype))
-    return Sums(products, recent + score, scatter), solved
-
-
-class _Residual(NamedTuple):
-    """What no nuisance term explains."""
-
-    square: Array  # of the acceleration, summed
-    product: Array  # with the torque, summed
-    acceleration: Array  # at this sample
-    torque: Array
-
-
 def _eliminate(products, terms, nuisance):
-    """Gauss' elimination of the nuisance terms, without pivoting: the matrix is definite.
+    """What no nuisance term explains: of the acceleration the sum of squares and of products with
+    the torque, and at this sample acceleration and torque.
 
-    Entry by entry, which compiles to one pass over the ensemble.
+    Gauss' elimination without pivoting, as the matrix is definite; entry by entry, which compiles
+    to one pass over the ensemble.
     """
     a, u = len(terms) - 2, len(terms) - 1
     left = {(i, j): products[i, j] for i in range(len(terms)) for j in range(i, len(terms))}
@@ -108,7 +71,7 @@ def _eliminate(products, terms, nuisance):
         for i, j in left:
             if i in row and j in row:
                 left[i, j] = left[i, j] - ratio[i] * row[j]
-    return _Residual(left[a, a], left[a, u], now[a], now[u])
+    return left[a, a], left[a, u], now[a], now[u]
 
 
 def _inverse(x, safe):
@@ -144,18 +107,29 @@ class AbstractRegression(AbstractInertia):
         return MatchedFilters(self.torque_gain, self.bandwidth, self.order, self.dt, angle)
 
     def _add(
-        self,
-        sums: Sums,
-        terms: Float[Array, " signals axes *ensemble"],
-        keep: Float[Array, " axes *ensemble"],
-        last: LastEstimate,
+        self, sums: Sums, terms: Terms, keep: Signal, last: LastEstimate
     ) -> tuple[Sums, Solution]:
-        return add_sample(
-            sums, terms, keep, nuisance=self.nuisance, excitation=self.excitation,
-            forget=min(1.0, self.dt / self.correlation), previous=last.inertia,
-        )  # fmt: skip
+        """The sums after one more sample, old ones weighted by `keep`, and what they say.
 
-    def probe(self, state: "WindowedState | RecursiveState") -> Float[Array, " axes *ensemble"]:
+        Where the acceleration that the nuisance terms leave is below `excitation` the last inertia
+        stays. The scores x e of neighbouring samples are correlated, since both are filtered: the
+        variance of their sum weighs pairs of samples by (1 - dt / correlation)^|k - l|.
+        """
+        products = keep[None, None] * sums.products + terms[:, None] * terms[None]
+        square, product, acceleration, torque = _eliminate(products, terms, self.nuisance)
+        weight = products[0, 0]
+        floor = 64 * jnp.finfo(terms.dtype).eps * products[-2, -2]
+        informed = square > jnp.maximum(weight * self.excitation**2, floor)
+        inverse = _inverse(square, informed)
+        inertia = jnp.where(informed, product * inverse, last.inertia)
+        score = acceleration * (torque - inertia * acceleration)
+        recent = (1 - min(1.0, self.dt / self.correlation)) * keep * sums.recent
+        scatter = keep**2 * sums.scatter + score * (score + 2 * recent)
+        variance = jnp.maximum(scatter, 0) * inverse**2
+        solved = Solution(inertia, variance, weight, informed.astype(terms.dtype))
+        return Sums(products, recent + score, scatter), solved
+
+    def probe(self, state: "WindowedState | RecursiveState") -> Signal:
         """The test signal to add to the next command."""
         return self.tones.signal(state.probe, self.dt)
 
@@ -217,7 +191,7 @@ class WindowedInertia(AbstractRegression):
     def samples(self) -> int:
         return round(self.window / self.dt)
 
-    def init(self, like: Float[Array, " axes *ensemble"]) -> WindowedState:
+    def init(self, like: Signal) -> WindowedState:
         """Before the first sample; shaped as the measurement `like` and as the ensemble."""
         like = jnp.zeros(signal_shape(like, self.ensemble), like.dtype)
         filters = self._filters()
@@ -226,12 +200,7 @@ class WindowedInertia(AbstractRegression):
             self.tones.init(like), jnp.zeros((), jnp.int32),
         )  # fmt: skip
 
-    def update(
-        self,
-        state: WindowedState,
-        command: Float[Array, " axes *ensemble"],
-        measurement: Float[Array, " axes *ensemble"],
-    ) -> WindowedState:
+    def update(self, state: WindowedState, command: Signal, measurement: Signal) -> WindowedState:
         """Add the command held during the last sample and the angle at its end."""
         filters, terms = self._filters()(state.filters, command, measurement)
         sums = jax.tree.map(lambda x: jnp.where(state.index == 0, 0, x), state.sums)
@@ -249,7 +218,7 @@ class WindowedInertia(AbstractRegression):
 
 class RecursiveState(NamedTuple):
     filters: FilterState
-    power: Float[Array, " axes *ensemble"]  # of the filtered acceleration, (rad/s^2)^2
+    power: Signal  # of the filtered acceleration, (rad/s^2)^2
     sums: Sums
     last: LastEstimate
     probe: ProbeState
@@ -290,7 +259,7 @@ class RecursiveInertia(AbstractRegression):
                 f"{100 * self.dt:g} s or more."
             )
 
-    def init(self, like: Float[Array, " axes *ensemble"]) -> RecursiveState:
+    def init(self, like: Signal) -> RecursiveState:
         """Before the first sample; shaped as the measurement `like` and as the ensemble."""
         like = jnp.zeros(signal_shape(like, self.ensemble), like.dtype)
         filters = self._filters()
@@ -299,12 +268,7 @@ class RecursiveInertia(AbstractRegression):
             self._start(like), self.tones.init(like),
         )  # fmt: skip
 
-    def update(
-        self,
-        state: RecursiveState,
-        command: Float[Array, " axes *ensemble"],
-        measurement: Float[Array, " axes *ensemble"],
-    ) -> RecursiveState:
+    def update(self, state: RecursiveState, command: Signal, measurement: Signal) -> RecursiveState:
         """Add the command held during the last sample and the angle at its end."""
         filters, terms = self._filters()(state.filters, command, measurement)
         power = state.power + self.dt / 0.5 * (terms[-2] ** 2 - state.power)
@@ -318,3 +282,33 @@ class RecursiveInertia(AbstractRegression):
         last = LastEstimate(solved.inertia, solved.variance, age, informed)
         probe = self.tones.step(state.probe, self._assess(last))
         return RecursiveState(filters, power, sums, last, probe)
+
+
+def paper_inertia(
+    q0: Float[Array, " samples"],
+    q1: Float[Array, " samples"],
+    *,
+    J_n: float | Float[Array, ""],
+    dt: float,
+) -> Float[Array, ""]:
+    """Eq. (22)-(24): the inertia in kg m^2 over one window of samples.
+
+    J_n cancels: what is left is the regression of q1 on q0'. It is the inertia itself where the
+    integrals of q0 q0' and of q0' vanish, over whole periods of a steady motion.
+
+    **Arguments:**
+
+    - `q0`, `q1`: Eq. (19) at the same samples: `q0` of the mean rate over the sample interval, in
+        rad/s, `q1` of the mean torque over it and the one before, in N m. For torques that are held
+        over each interval the estimate is then exact.
+    - `J_n`: the nominal inertia in kg m^2.
+    - `dt`: the sample interval in s.
+
+    **Returns:**
+
+    The estimate of J_x.
+    """
+    q0_dot = jnp.diff(q0) / dt
+    M_c = J_n * q0_dot - q1[1:]  # (18)
+    dJ = -jnp.sum(M_c * q0_dot) / jnp.sum(q0_dot**2)  # (22) summed, (23)
+    return J_n + dJ  # (24)

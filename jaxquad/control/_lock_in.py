@@ -10,20 +10,14 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxquad._core import require_all_positive, signal_shape
 
 from ._estimator import AbstractInertia, empty_past, LastEstimate, motion, Past, ProbeTones
+from ._protocols import Signal
 
 
 class LockInSolution(NamedTuple):
-    inertia: Float[Array, " axes *ensemble"]  # kg m^2
-    variance: Float[Array, " axes *ensemble"]  # (kg m^2)^2
-    stiffness: Float[Array, " axes *ensemble"]  # N m/rad
-    informed: Float[Array, " axes *ensemble"]  # 1 where enough tones stand out
-
-
-class _Tones(NamedTuple):
-    """The measurement at each tone: [tones, axes, *ensemble]."""
-
-    ratio: Array  # real part of torque / acceleration, kg m^2
-    weight: Array  # 1 / variance of it, 0 where the tone does not stand out
+    inertia: Signal  # kg m^2
+    variance: Signal  # (kg m^2)^2
+    stiffness: Signal  # N m/rad
+    informed: Signal  # 1 where enough tones stand out
 
 
 def solve(
@@ -42,50 +36,40 @@ def solve(
     is the disturbance, whose power, of four degrees of freedom, gives the variance. A tone counts
     if its acceleration has `contrast` times the power of its neighbours'.
     """
-    tones = _ratios(acceleration, torque, contrast)
-    return _stiff(tones, square) if stiff else _free(tones)
-
-
-def _ratios(acceleration, torque, contrast):
     a, u = acceleration[:, :, 1], torque[:, :, 1]
     power = jnp.sum(a**2, axis=0)
     neighbours = jnp.sum(acceleration[:, :, ::2] ** 2, axis=(0, 2)) / 2
-    out = power > contrast * neighbours
-    inverse = jnp.where(out, 1 / jnp.where(out, power, 1), 0)
-    real = jnp.sum(a * u, axis=0) * inverse
+    stands_out = power > contrast * neighbours
+    inverse = jnp.where(stands_out, 1 / jnp.where(stands_out, power, 1), 0)
+    ratio = jnp.sum(a * u, axis=0) * inverse  # of each tone, kg m^2
     imaginary = (a[0] * u[1] - a[1] * u[0]) * inverse
     x, y = acceleration[:, :, ::2]
-    left = torque[:, :, ::2] - jnp.stack(
-        [real[:, None] * x - imaginary[:, None] * y, real[:, None] * y + imaginary[:, None] * x]
-    )
+    explained = [
+        ratio[:, None] * x - imaginary[:, None] * y,
+        ratio[:, None] * y + imaginary[:, None] * x,
+    ]
+    left = torque[:, :, ::2] - jnp.stack(explained)
     noise = jnp.sum(left**2, axis=(0, 2)) / 4
     rounding = 1e-12 * jnp.sum(u**2, axis=0)  # keeps the weights of a perfect record finite
-    return _Tones(real, jnp.where(out, power / jnp.where(out, noise + rounding, 1), 0))
-
-
-def _free(tones):
-    total = jnp.sum(tones.weight, axis=0)
+    # 1 / variance of the ratio.
+    weight = jnp.where(stands_out, power / jnp.where(stands_out, noise + rounding, 1), 0)
+    total = jnp.sum(weight, axis=0)
     some = total > 0
-    inverse = jnp.where(some, 1 / jnp.where(some, total, 1), 0)
-    inertia = jnp.sum(tones.weight * tones.ratio, axis=0) * inverse
-    return LockInSolution(inertia, inverse, jnp.zeros_like(inertia), some.astype(inertia.dtype))
-
-
-def _stiff(tones, square):
-    """Weighted least squares of the ratios on 1 and -1/w^2."""
-    mean = _free(tones)
-    away = -1 / square - jnp.sum(tones.weight / -square, axis=0)[None] * mean.variance[None]
-    spread = jnp.sum(tones.weight * away**2, axis=0)
-    some = spread * mean.variance > 1e-9 / jnp.max(square) ** 2
+    variance = jnp.where(some, 1 / jnp.where(some, total, 1), 0)
+    inertia = jnp.sum(weight * ratio, axis=0) * variance
+    if not stiff:
+        return LockInSolution(
+            inertia, variance, jnp.zeros_like(inertia), some.astype(inertia.dtype)
+        )
+    # Weighted least squares of the ratios on 1 and -1/w^2.
+    away = -1 / square - jnp.sum(weight / -square, axis=0)[None] * variance[None]
+    spread = jnp.sum(weight * away**2, axis=0)
+    some = spread * variance > 1e-9 / jnp.max(square) ** 2
     inverse = jnp.where(some, 1 / jnp.where(some, spread, 1), 0)
-    stiffness = jnp.sum(tones.weight * away * tones.ratio, axis=0) * inverse
-    centre = jnp.sum(tones.weight / -square, axis=0) * mean.variance
-    return LockInSolution(
-        mean.inertia - centre * stiffness,
-        mean.variance + centre**2 * inverse,
-        stiffness,
-        some.astype(stiffness.dtype),
-    )
+    stiffness = jnp.sum(weight * away * ratio, axis=0) * inverse
+    centre = jnp.sum(weight / -square, axis=0) * variance
+    inertia, variance = inertia - centre * stiffness, variance + centre**2 * inverse
+    return LockInSolution(inertia, variance, stiffness, some.astype(stiffness.dtype))
 
 
 BESIDE = 2  # periods per window: the nearest that a Hann window separates from the tone
@@ -112,25 +96,23 @@ class LockInWindows(eqx.Module):
                 "a whole number of samples from 100 to 40000."
             )
         for frequency in self.frequencies:
-            self._require_whole(frequency)
+            periods = frequency * self.window
+            if abs(periods - round(periods)) > 1e-6 * periods:
+                raise ValueError(
+                    f"A tone of {frequency} Hz has {periods:g} periods in a window of "
+                    f"{self.window} s: give a whole number, such as "
+                    f"{max(round(periods), 5) / self.window:g} Hz."
+                )
+            if not 5 <= round(periods) <= self.samples / 10:
+                raise ValueError(
+                    f"A tone of {frequency} Hz has {periods:g} periods in a window of "
+                    f"{self.window} s: give it from 5 to {self.samples // 10}."
+                )
         spacing = np.diff(sorted(self.periods))
         if np.any(spacing < 2 * BESIDE):
             raise ValueError(
                 f"Tones of {self.frequencies} Hz are closer than {2 * BESIDE / self.window:g} Hz, "
                 f"the resolution of a window of {self.window} s: give a longer window."
-            )
-
-    def _require_whole(self, frequency):
-        periods = frequency * self.window
-        if abs(periods - round(periods)) > 1e-6 * periods:
-            raise ValueError(
-                f"A tone of {frequency} Hz has {periods:g} periods in a window of {self.window} s: "
-                f"give a whole number, such as {max(round(periods), 5) / self.window:g} Hz."
-            )
-        if not 5 <= round(periods) <= self.samples / 10:
-            raise ValueError(
-                f"A tone of {frequency} Hz has {periods:g} periods in a window of {self.window} s: "
-                f"give it from 5 to {self.samples // 10}."
             )
 
     @property
@@ -146,22 +128,19 @@ class LockInWindows(eqx.Module):
         """Of the tones in cycles."""
         return _cycles(self.periods, index, self.samples)
 
-    def square(self, signal: Float[Array, " axes *ensemble"]) -> Float[Array, " tones *ones"]:
+    def square(self, signal: Signal) -> Float[Array, " tones *ones"]:
         """w^2 in (rad/s)^2, as the second difference of a sampled sine shows it."""
         w = 2 / self.dt * np.sin(np.pi * self.periods / self.samples)
         return jnp.asarray(w**2, signal.dtype).reshape((-1,) + (1,) * signal.ndim)
 
-    def init(self, like: Float[Array, " axes *ensemble"]) -> WindowSums:
+    def init(self, like: Signal) -> WindowSums:
         lines = 3 * len(self.frequencies)
         correlations = jnp.zeros((2, 2, lines, 2, *like.shape), like.dtype)
         valid = jnp.zeros((2, *like.shape), like.dtype)
         return WindowSums(correlations, valid, jnp.zeros((), jnp.int32))
 
     def add(
-        self,
-        sums: WindowSums,
-        signals: Float[Array, " signals axes *ensemble"],
-        counts: Float[Array, " axes *ensemble"],
+        self, sums: WindowSums, signals: Float[Array, " signals axes *ensemble"], counts: Signal
     ) -> WindowSums:
         """One more sample, `counts` 0 where its window is not to count."""
         place = self._place(sums.index)
@@ -211,8 +190,8 @@ class LockInState(NamedTuple):
     past: Past
     sums: WindowSums
     last: LastEstimate
-    stiffness: Float[Array, " axes *ensemble"]  # N m/rad
-    exciting: Float[Array, " axes *ensemble"]  # 1 while the tones are on
+    stiffness: Signal  # N m/rad
+    exciting: Signal  # 1 while the tones are on
 
 
 class LockInInertia(AbstractInertia):
@@ -268,18 +247,13 @@ class LockInInertia(AbstractInertia):
     def _windows(self) -> LockInWindows:
         return LockInWindows(self.tones.frequencies, self.window, self.dt)
 
-    def init(self, like: Float[Array, " axes *ensemble"]) -> LockInState:
+    def init(self, like: Signal) -> LockInState:
         """Before the first sample; shaped as the measurement `like` and as the ensemble."""
         like = zero = jnp.zeros(signal_shape(like, self.ensemble), like.dtype)
         sums = self._windows().init(like)
         return LockInState(empty_past(like), sums, self._start(like), zero, zero + 1)
 
-    def update(
-        self,
-        state: LockInState,
-        command: Float[Array, " axes *ensemble"],
-        measurement: Float[Array, " axes *ensemble"],
-    ) -> LockInState:
+    def update(self, state: LockInState, command: Signal, measurement: Signal) -> LockInState:
         """Add the command held during the last sample and the angle at its end."""
         past, now = motion(state.past, self.torque_gain, command, measurement, self.dt)
         windows = self._windows()
@@ -306,11 +280,11 @@ class LockInInertia(AbstractInertia):
         renew = ft.partial(jnp.where, (valid > 0) & (solved.informed > 0))
         return jax.tree.map(renew, (new, solved.stiffness), (last, stiffness))
 
-    def stiffness(self, state: LockInState) -> Float[Array, " axes *ensemble"]:
+    def stiffness(self, state: LockInState) -> Signal:
         """In N m/rad beside the inertia; 0 unless the nuisance is "angle"."""
         return state.stiffness
 
-    def probe(self, state: LockInState) -> Float[Array, " axes *ensemble"]:
+    def probe(self, state: LockInState) -> Signal:
         """The test signal to add to the next command."""
         phase = self._windows().phase(state.sums.index).astype(state.exciting.dtype)
         return self.tones.wave(phase, state.exciting)

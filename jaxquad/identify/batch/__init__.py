@@ -1,1 +1,0 @@
-"""Many fits of one model in one compiled call."""
