@@ -182,9 +182,6 @@ def _silent_pairs(
 _evaluate = eqx.filter_jit(evaluate_response)
 
 
-Part = Float[Array, "outputs inputs frequencies"]
-
-
 def _log_ratios(z: Float[Array, " n"], problem: Problem) -> list[tuple[Part, Part]]:
     """`ln|T/T^|` and wrapped phase of `T/T^` in rad, per record in its condition."""
     # Frequencies come last until all is done: derivatives are then fast loops over them.

@@ -442,7 +442,8 @@ def _content(fit: Fit) -> dict[str, object]:
 
     parameters, per_parameter = [], (fit.values, fit.standard_errors, fit.determined)
     for k, name in enumerate(fit.names):
-        facts = (*(part[k] for part in per_parameter), fit.noise_standard_errors[k])
+        value, error, determined = (part[k] for part in per_parameter)
+        facts = value, error, determined, fit.noise_standard_errors[k]
         parameters.append(
             {
                 "name": name,

@@ -134,7 +134,7 @@ def reduce_structure(
         except ValueError:  # the model has no response then
             trial = None
         if trial is None or not np.isfinite(trial.cost):
-            numbers = (np.inf,) * 4
+            numbers = (np.inf, np.inf, np.inf, np.inf)
             steps.append(Step(name, reason, *numbers, False, "kept: no fit without it"))
             continue
         higher = trial.average_cost - best.average_cost
