@@ -2,7 +2,7 @@
 
 import functools as ft
 from collections.abc import Callable, Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -48,6 +48,11 @@ class Place(NamedTuple):
     leaf: int
     index: int
     path: str  # `F[1][1]`, which is the name too unless the model gives it one
+
+    def number(self, model: PyTree) -> Any:
+        """The number that is there in a model, of JAX or of NumPy as its array."""
+        leaves = [leaf for leaf in jax.tree.leaves(model) if eqx.is_inexact_array(leaf)]
+        return leaves[self.leaf].reshape(-1)[self.index]
 
 
 Tie = Callable[[PyTree], Float[Array, ""]]
@@ -133,16 +138,6 @@ def with_values(model: PyTree, places: Sequence[Place], values: Float[Numbers, "
     return jax.tree.unflatten(structure, all_leaves)
 
 
-def number_at(place: Place) -> Callable[[PyTree], Float[Array, ""]]:
-    """The function that picks this number of a model."""
-
-    def pick(model: PyTree) -> Float[Array, ""]:
-        leaves = [leaf for leaf in jax.tree.leaves(model) if eqx.is_inexact_array(leaf)]
-        return jnp.asarray(leaves[place.leaf]).reshape(-1)[place.index]
-
-    return pick
-
-
 def name_places(model: PyTree) -> list[Place]:
     """Every floating-point number of a model: `lag`, `numerator[0]`, `axis.inertia[2]`."""
     leaves, structure = jax.tree.flatten(model)
@@ -201,17 +196,13 @@ def select_parameters(
     """
     places = name_places(model)
     values, by_name = _numbers(model, places), _by_name(places)
+    ties = tuple((find_place(model, name, "to tie"), tie) for name, tie in (tied or {}).items())
     for name, tie in (tied or {}).items():
-        if name not in by_name:
-            raise ValueError(
-                f"no parameter {name!r} to tie; the model has: {', '.join(p.name for p in places)}"
-            )
         if not callable(tie):
             raise ValueError(
                 f"{name} is tied to {tie!r}: give a function of the model, "
                 "lambda m: -m.F[0, 1]; a plain number belongs in the model"
             )
-    ties = tuple((by_name[name], tie) for name, tie in (tied or {}).items())
     bound = {place.name for place, _ in ties}
     chosen, scales, logs = [], [], []
     for item in _expand(model, places, free, bound):
@@ -359,8 +350,7 @@ class Changed:
     def __call__(self, model: PyTree) -> PyTree:
         """The model with the change."""
         place = find_place(model, self.parameter, "for a condition")
-        arrays = [leaf for leaf in jax.tree.leaves(model) if eqx.is_inexact_array(leaf)]
-        value = self.times * arrays[place.leaf].reshape(-1)[place.index] + self.plus
+        value = self.times * place.number(model) + self.plus
         return with_values(model, (place,), value[None])
 
 

@@ -270,9 +270,7 @@ class _Named(NamedTuple):
     name: str
 
     def __call__(self, model: PyTree) -> Float[Array, ""]:
-        place = find_place(model, self.name, "for a prior")
-        leaves = jax.tree.leaves(eqx.filter(model, eqx.is_inexact_array))
-        return leaves[place.leaf].reshape(-1)[place.index]
+        return find_place(model, self.name, "for a prior").number(model)
 
 
 def require_model(function: str, model: object) -> None:

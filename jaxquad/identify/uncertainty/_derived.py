@@ -14,7 +14,7 @@ from jaxquad._compile import hasty_options, Jit
 from jaxquad._core import as_array
 from jaxquad.models import evaluate_response, simulate_linear, TransferFunction
 
-from ..frequency_domain._parameters import number_at, Parameters
+from ..frequency_domain._parameters import Parameters
 from ..output_error._simulated import linear_model
 from ._error_budget import Matrix
 from ._verdict import Combination, LIMIT, NO_MINIMUM, reach_of_interval, UndeterminedError, USUAL
@@ -76,7 +76,7 @@ def tied_parameters(fit: "Fit") -> tuple[Tied, ...]:
     """The tied parameters, in the order of `tied=`; none where nothing was fitted."""
     ties = []
     for place, _ in fit.parameters.ties if fit.verdict.fitted else ():
-        value, slope, is_open = _propagate(fit, number_at(place))
+        value, slope, is_open = _propagate(fit, place.number)
         parts = (fit.relative_covariance, fit.relative_noise_covariance)
         error, by_noise = (float(np.sqrt(max(slope @ part @ slope, 0.0))) for part in parts)
         sharp = fit.identifiable or error <= LIMIT * abs(value)
@@ -209,7 +209,7 @@ def factors(fit: "Fit") -> Factors:
     # Derivatives of the coefficients, free and tied, by the relative changes of the free ones.
     slopes = dict(zip(fit.names, np.diag(fit.units), strict=True))
     for place, _ in fit.parameters.ties:
-        slopes[place.name] = _propagate(fit, number_at(place))[1]
+        slopes[place.name] = _propagate(fit, place.number)[1]
     none = np.zeros(len(fit.names))
     rows = lambda field, count: np.array(
         [slopes.get(f"{field}[{k}]", none) for k in range(count)]
