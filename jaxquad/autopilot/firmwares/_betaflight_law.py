@@ -1,7 +1,7 @@
 """Betaflight's PID, its proposed ADRC, its angle mode, and what changes them in flight."""
 
 import dataclasses
-from typing import ClassVar, Literal, Self, TYPE_CHECKING
+from typing import ClassVar, Literal
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -115,15 +115,12 @@ class BetaflightRate(RateLoop):
     firmware: ClassVar[str] = "betaflight"
     feed_forward: ClassVar[tuple[str, ...]] = ("f",)
     of_sticks: ClassVar[bool] = True
-    if TYPE_CHECKING:
-
-        @property
-        def filters(self) -> tuple[Filter, ...]: ...  # of the gyro, at the loop's rate
+    filters: eqx.AbstractVar[tuple[Filter, ...]]  # of the gyro, at the loop's rate
 
     def gyro_chains(self) -> list[FilterChain]:
         return [self.gyro, FilterChain(self.filters, 1 / self.dt)] if self.filters else [self.gyro]
 
-    def without_gyro_filters(self) -> Self:
+    def without_gyro_filters(self) -> "BetaflightRate":
         return dataclasses.replace(self, gyro=FilterChain(), filters=())
 
 
@@ -193,7 +190,7 @@ class BetaflightPID(BetaflightRate):
     def derivative_chain(self, axis: int) -> FilterChain:
         return FilterChain(self.dterm, 1 / self.dt)
 
-    def levelled(self) -> Self:
+    def levelled(self) -> "BetaflightPID":
         """Inside of an angle loop, the integral is held from a fifth of the speed on."""
         if self.relax is None:
             return self
