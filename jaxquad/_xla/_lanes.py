@@ -438,7 +438,10 @@ def _scan(lanes: Lanes, equation: JaxprEqn, *args: Cells) -> list[Cells]:
     return [*carry, *(np.stack(column) for column in zip(*rows, strict=True))]
 
 
-def _other_axes(lanes: Lanes, equation: JaxprEqn, axes: Sequence[int]) -> tuple[int, ...]:
+Axes = Sequence[int | np.integer]
+
+
+def _other_axes(lanes: Lanes, equation: JaxprEqn, axes: Axes) -> tuple[int | np.integer, ...]:
     """The axes, none of which is that of the members."""
     shape, name = _shape(equation), equation.primitive.name
     _require(not any(lanes.is_members(shape, axis) for axis in axes), f"{name} over the members")

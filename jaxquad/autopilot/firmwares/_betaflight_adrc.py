@@ -41,11 +41,10 @@ class ADRCFrame(NamedTuple):
     def parameters(self) -> dict[str, float]:
         """By the firmware's names."""
         return {
-            "adrc_gyro_lpf_hz": self.lowpass_hz,
-            "adrc_td_hz": self.setpoint_hz,
+            "adrc_gyro_lpf_hz": self.lowpass_hz, "adrc_td_hz": self.setpoint_hz,
             "adrc_hover_throttle": 100 * self.schedule.hover,
             "adrc_sigma_decay": 10 * self.forgetting,
-        }
+        }  # fmt: skip
 
 
 class FlownADRC(FlownLoop[BetaflightADRC]):
