@@ -123,9 +123,8 @@ class FlightChannels:
     @property
     def mixer_range(self) -> Samples | None:
         """Highest less lowest motor, over what a motor can be."""
-        return (
-            None if self.motors is None else np.ptp(self.motors, axis=1) / np.ptp(self.motor_ends)
-        )
+        reach = np.ptp(self.motor_ends)
+        return None if self.motors is None else np.ptp(self.motors, axis=1) / reach
 
 
 def read_channels_if_any(
@@ -143,16 +142,18 @@ def read_channels_if_any(
     injected = {setup.reference: 1.0} if setup.injected_at == "mixer" else {}
     try:
         logged = frozenset(channel.name for channel in channels(path))
-
-        def median(name: str) -> float:
-            record = _read(path, logged, [name], span).get(name)
-            return _median(record, name, (None, None))
-
+        median = lambda x: _median(_read(path, logged, [x], span).get(x), x, (None, None))
         unfiltered = names.unfiltered or firmware.unfiltered_gyro(logged, values, median)
         wanted = [*filtered, *unfiltered, *names.terms, *names.motors, setpoint, setup.reference]
         wanted += [*names.output, *names.stick, *names.mixed, *names.slewed, *injected]
         records = _read(path, logged, [*wanted, *setup.throttle], span)
-        tracked_hz = _tracked(path, logged, firmware.tracked_channels(), span)
+        tracked_hz: dict[int, tuple[float, ...]] = {}
+        for mode, pattern in firmware.tracked_channels().items():
+            turned = sorted(name for name in logged if re.fullmatch(pattern, name))
+            speeds = _read(path, logged, turned, (None, None)).items()
+            medians = [_median(record, name, span) / 60 for name, record in speeds]
+            if turning := tuple(speed for speed in medians if speed > 0):
+                tracked_hz[mode] = turning
     except (ReadError, RecordError):
         return None
     if rate not in records or setpoint not in records:
@@ -202,20 +203,6 @@ def _channel_prefix(proposal: Proposal) -> str:
     rate = log.rates[axis] if axis < len(log.rates) else ""
     full = proposal.setup.rate
     return full.removesuffix(rate) if rate and full.endswith(f".{rate}") else ""
-
-
-def _tracked(
-    path: Path, logged: frozenset[str], patterns: Mapping[int, str], span: Span
-) -> dict[int, tuple[float, ...]]:
-    """The median speeds in Hz that the log holds, of those that turn."""
-    tracked: dict[int, tuple[float, ...]] = {}
-    for mode, pattern in patterns.items():
-        names = sorted(name for name in logged if re.fullmatch(pattern, name))
-        records = _read(path, logged, names, (None, None)) if names else {}
-        medians = [_median(record, name, span) / 60 for name, record in records.items()]
-        if turning := tuple(speed for speed in medians if speed > 0):
-            tracked[mode] = turning
-    return tracked
 
 
 def _median(record: Record | None, name: str, span: Span) -> float:
@@ -345,7 +332,7 @@ def read_flown(
         raise ValueError(
             f"{path}: P, I and D of {setup.axis} are all 0, so there is no rate loop to tune"
         )
-    angle = firmware.angle_loop(logged.values, axis, loop.law.interval(), levelled=setup.levelled)
+    angle = firmware.angle_loop(logged.values, axis, loop.law.dt, levelled=setup.levelled)
     chains = tuple(chain for chain in loop.law.gyro_chains() if chain.filters)
     filters, text = best_filters(chains, loop.unmodelled, flight, axis)
     return FlownAutopilot(

@@ -26,13 +26,12 @@ from jaxquad.report import (
     Table,
 )
 
-from ._files import ParameterChange, WordChange
+from ._filter_bank import gyro_noise, GyroNoise, hann_spectra, NoNoise, SLOWEST
 from ._filters import FilterChain
 from ._firmware import firmware_named
 from ._flight_channels import FlightChannels
-from ._gyro_noise import gyro_noise, GyroNoise, hann_spectra, NoNoise, SLOWEST
 from ._law import RateLoop
-from ._parameters import gains_in, gains_of
+from ._parameters import gains_in, gains_of, ParameterChange, WordChange
 from ._rate_loops import gyro_chain_response, law_paths, StepGrid
 from ._stages import limits_text, Stage, WAYS
 
@@ -85,14 +84,8 @@ def write_pilot_page(path: str | Path, *pages: PilotPage) -> Path:
     """Write one self-contained HTML page on proposals for an autopilot, whole or not at all.
 
     It is made as `jaxquad.report.write_report` makes its page: figures inside it, nothing fetched,
-    texts from a log escaped, and a section or a figure that cannot be computed says why.
-
-    **Arguments:**
-
-    - `path`: of the page.
-    - `pages`: what it shows, one for each axis; the provenance is that of the first.
-
-    **Returns:** the path.
+    texts from a log escaped, and a section or a figure that cannot be computed says why. There is a
+    page for each axis; the provenance is that of the first. Returns the path.
     """
     first, origin = pages[0], pages[0].provenance
     axes = []
@@ -255,6 +248,7 @@ VERDICTS = {
     "cannot tell": ("bad", "THIS LOG CANNOT TELL"), "not to be flown": ("bad", "NOT TO BE FLOWN"),
 }  # fmt: skip
 Designs = Mapping[str, tuple[RateLoop, Float[np.ndarray, " gains"]]]
+Spectra = dict[str, Spectrum]
 Part = TypeVar("Part")
 
 
@@ -271,25 +265,23 @@ def pilot_page(proposal: "AutopilotProposal", origin: Provenance, overview: str)
             failures[section] = reason_of(error)
             return missing
 
-    def shown_noise() -> GyroNoise | None:
-        if proposal.noise is not None or flight is None:
-            return proposal.noise
-        try:
-            return gyro_noise(flight, law, axis, SLOWEST)
-        except NoNoise:
-            return None
+    def spectra() -> tuple[GyroNoise | None, Spectra, Spectra]:
+        noise = proposal.noise
+        if noise is None and flight is not None:
+            try:
+                noise = gyro_noise(flight, law, axis, SLOWEST)
+            except NoNoise:
+                pass
+        return noise, *(({}, {}) if noise is None else noise_spectra(noise, axis, designs))
 
     designs = {"flown": (law, gains_of(law, axis))}
     if new:
         changed = {} if filters is None else {name: new[name] for name in filters.flown}
         after = flown.with_filters(changed) if changed else law
         designs["proposed"] = (after, gains_in(law, axis, new))
-    noise = computed("noise", shown_noise, None)
-    spectra = lambda: ({}, {}) if noise is None else noise_spectra(noise, axis, designs)
-    gyro, derivative = computed("noise", spectra, ({}, {}))
-    steps = lambda: (
-        step_bands(proposal, designs) if proposal.identification.fit.identifiable else {}
-    )
+    noise, gyro, derivative = computed("noise", spectra, (None, {}, {}))
+    fitted = proposal.identification.fit.identifiable
+    steps = computed("steps", lambda: step_bands(proposal, designs) if fitted else {}, {})
     logged = flight is not None and {"P", "I"} <= set(flight.terms)
     compute_terms = lambda: (
         {} if flight is None else logged_terms(flight) if logged
@@ -326,7 +318,7 @@ def pilot_page(proposal: "AutopilotProposal", origin: Provenance, overview: str)
             f"Noise of {noise.source}, less what the set-point explains. Below "
             f"{noise.least_hz:.0f} Hz motion is taken for noise, so the level above is used."
         ),
-        steps=computed("steps", steps, {}),
+        steps=steps,
         terms=computed("balance", compute_terms, {}),
         terms_are="as logged" if logged else "computed by the law from set-point and rate",
         motors=[] if flight is None else motor_rows(flight),
@@ -353,9 +345,7 @@ def chains_of(law: RateLoop, axis: int) -> dict[str, tuple[FilterChain, ...]]:
     return chains
 
 
-def noise_spectra(
-    noise: GyroNoise, axis: int, designs: Designs
-) -> tuple[dict[str, Spectrum], dict[str, Spectrum]]:
+def noise_spectra(noise: GyroNoise, axis: int, designs: Designs) -> tuple[Spectra, Spectra]:
     """Of gyro and D term: before all filters, then behind those of each design."""
     inside = (noise.before.hertz > 1.0) & (noise.before.hertz <= noise.known_hz)
     hertz, before = noise.before.hertz[inside], noise.before.power[inside]

@@ -11,11 +11,18 @@ from jaxtyping import Float, Int
 
 from jaxquad._core import announce
 
-from ._files import propose_changes
-from ._filter_bank import filter_choices, FilterBank, noise_growth, Picks, shared_change
+from ._filter_bank import (
+    filter_choices,
+    FilterBank,
+    gyro_noise,
+    GyroNoise,
+    noise_growth,
+    NoNoise,
+    Picks,
+    shared_change,
+)
 from ._firmware import FilterChoice, firmware_named, OuterLoop, Parameter
 from ._flight_channels import FlownAutopilot
-from ._gyro_noise import gyro_noise, GyroNoise, NoNoise
 from ._parameters import (
     ceiling_in,
     FIELDS,
@@ -24,6 +31,7 @@ from ._parameters import (
     gains_of,
     names_by_field,
     parameters_of,
+    propose_changes,
 )
 from ._proposal import AutopilotProposal
 from ._rate_loops import Gains, grouped, OneGains, RateLoops
@@ -171,7 +179,7 @@ class _Design:
         """What flew of these filters."""
         flown = {}
         for choice in self.choices if names else ():
-            flown |= choice.options[choice.flown].parameters
+            flown |= choice.flown_parameters
         return {name: flown[name] for name in names}
 
     def filtered(self, loops: RateLoops, filters: Mapping[str, float]) -> RateLoops:
@@ -237,7 +245,7 @@ class _Design:
     ) -> tuple[_Certified, FilterVerdict]:
         """Gains alone beside gains and filters, on the same fresh plants."""
         alone, freed, law = plain.stages[-1], both.stages[-1], self.flown.law
-        names = ", ".join(name for choice in bank.choices for name in choice.names)
+        names = ", ".join(name for choice in bank.choices for name in choice.flown_parameters)
         heard = f"the noise is of {noise.source}"
         if not both.filters or freed.rejection > _FILTERS_WORTH * alone.rejection:
             text = (

@@ -66,9 +66,7 @@ class FuzzyMap(eqx.Module):
     - `centres`: of the sets, two or more values of delta that rise.
     - `increments`: of b0, one for each set.
 
-    **Raises:**
-
-    - `ValueError`: the centres do not rise, or an increment leaves no b0 above 0.
+    **Raises:** `ValueError`: the centres do not rise, or an increment leaves no b0 above 0.
     """
 
     nominal: Gain = per_member(rank=1, converter=as_float)  # kg m^2
@@ -166,9 +164,7 @@ class InertiaMap(eqx.Module):
     - `knots`: ln(J / nominal), two or more values that rise.
     - `values`: ln b0 at each knot, `[knots]`, `[knots, axes]` or `[knots, axes, *ensemble]`.
 
-    **Raises:**
-
-    - `ValueError`: the knots do not rise, or the shapes do not fit.
+    **Raises:** `ValueError`: the knots do not rise, or the shapes do not fit.
     """
 
     nominal: Gain = per_member(rank=1, converter=as_float)  # kg m^2; axes *ensemble
@@ -236,13 +232,7 @@ def certainty_equivalence(
     - `knots`: how many.
     - `factor`: with a lag in the loop a value above 1 is better, about 1.8 for 20 ms.
 
-    **Returns:**
-
-    An `InertiaMap`.
-
-    **Raises:**
-
-    - `ValueError`: a value is not positive, or the span is not one.
+    **Raises:** `ValueError`: a value is not positive, or the span is not one.
     """
     torque_gain, nominal = as_float(torque_gain), as_float(nominal)
     require_positive("torque_gain", torque_gain, "give N m per unit of command, L Kf of the Hover")
@@ -264,9 +254,9 @@ def _log_gain(torque_gain: Gain, nominal: Gain, factor: Float[Array, ""]) -> Gai
     return jnp.log(factor * multiply_gains(torque_gain, 1 / nominal))
 
 
-class _ScheduledByMap(eqx.Module):
-    ladrc: eqx.AbstractVar[LADRC | LADRCLaw]
-    map: eqx.AbstractVar[InertiaToGain]
+class _ScheduledByMap:
+    ladrc: LADRC | LADRCLaw
+    map: InertiaToGain
 
     @property
     def dt(self) -> float:
@@ -308,7 +298,7 @@ class _ScheduledByMap(eqx.Module):
         return self.ladrc.observer_barrier(names)
 
 
-class ScheduledLADRC(_ScheduledByMap):
+class ScheduledLADRC(_ScheduledByMap, eqx.Module):
     """A `LADRC` whose b0 is `map(inertia)` of an inertia in kg m^2 that it is given.
 
     The `ladrc`'s own b0 has no effect. A loop flies and analyses `scheduled_at(inertia)`; exported
@@ -394,7 +384,7 @@ class AdaptiveLADRCState(NamedTuple):
     estimator: PyTree
 
 
-class AdaptiveLADRC(_ScheduledByMap):
+class AdaptiveLADRC(_ScheduledByMap, eqx.Module):
     """A `LADRC` of order 2 whose b0 follows the inertia that an estimator finds in flight.
 
     b0 starts as the `ladrc`'s. While the estimate is trusted, b0 moves towards `map(inertia)` by a
@@ -411,9 +401,7 @@ class AdaptiveLADRC(_ScheduledByMap):
     - `map`: from an inertia in kg m^2 to b0, such as `certainty_equivalence(..)`.
     - `settling`: in s.
 
-    **Raises:**
-
-    - `ValueError`: the estimator was made for another `dt`, or the ladrc is of order 1.
+    **Raises:** `ValueError`: the estimator was made for another `dt`, or the ladrc is of order 1.
     """
 
     ladrc: LADRC | LADRCLaw

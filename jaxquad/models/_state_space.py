@@ -19,6 +19,14 @@ from ._response import Matrices, response
 from ._transfer_function import as_frequencies, Convertible, Frequencies
 
 
+Realisation = tuple[
+    Float[Array, "states states"],
+    Float[Array, "states inputs"],
+    Float[Array, "outputs states"],
+    Float[Array, "outputs inputs"],
+]
+
+
 class StateSpace(Convertible):
     """M x' = F x + G u(t - input_delay), y(t + output_delay) = H0 x + H1 x': CIFER's DERIVID form.
 
@@ -34,10 +42,8 @@ class StateSpace(Convertible):
     - `input_delay`: (inputs,) in s; `output_delay`: (outputs,) in s; None for none.
     - `names`: of entries, as `{"Lp": "F[1][1]", "Lda": "G[1][0]"}`.
 
-    **Raises:**
-
-    - `ValueError`: the shapes do not fit together, a value is not finite, a delay is negative, M is
-        singular, or a name stands for no entry.
+    **Raises:** `ValueError`: the shapes do not fit together, a value is not finite, a delay is
+    negative, M is singular, or a name stands for no entry.
     """
 
     F: Float[Array, "states states"] = eqx.field(converter=as_float)
@@ -176,14 +182,7 @@ class StateSpace(Convertible):
         return rows[:, None] + columns[None]
 
 
-def explicit(
-    model: StateSpace,
-) -> tuple[
-    Float[Array, "states states"],
-    Float[Array, "states inputs"],
-    Float[Array, "outputs states"],
-    Float[Array, "outputs inputs"],
-]:
+def explicit(model: StateSpace) -> Realisation:
     """A, B, C, D of x' = A x + B u, y = C x + D u: the model without M, H1 and its delays."""
     A, B, C = model.F, model.G, model.H0
     if model.M is not None:
@@ -283,13 +282,9 @@ class Mode(NamedTuple):
 def modes(model: HasPoles) -> tuple[Mode, ...]:
     """Frequency, damping and time constant of each mode of a linear model, slowest first.
 
-    **Arguments:**
+    **Arguments:** `model`: has `poles` in rad/s. They are computed by NumPy, so not under jit.
 
-    - `model`: has `poles` in rad/s. They are computed by NumPy, so not under jit.
-
-    **Returns:**
-
-    One `Mode` for each real pole and each pair of complex ones.
+    **Returns:** One `Mode` for each real pole and each pair of complex ones.
     """
     poles = [complex(pole) for pole in np.asarray(model.poles)]
     upper = [pole for pole in poles if pole.imag >= 0]

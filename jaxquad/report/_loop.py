@@ -255,7 +255,28 @@ def loop_section(
             return None
         model, note = None, _ASSUMED[entry]
         origin = f"from {record.reference_names[0]} as {entry}"
-    facts = _margins(loop, model)
+    # Margins that are not seen are those of the model, where there is one.
+    shown, crossover, by = loop, loop.crossover, ""
+    if model is not None and np.isnan(crossover):
+        shown, crossover, by = model, model.crossover, " by the identified model"
+    if np.isnan(crossover):
+        low, high = shown.omega[[0, -1]] / (2 * np.pi)
+        where = f"|L| does not fall through 1 from {low:.3g} to {high:.3g} Hz"
+        facts = {"crossover": f"not seen: {where}, where the loop can be estimated"}
+    else:
+        (margin, error), (gain, place), beyond = shown.phase_margin, shown.gain_margin, ""
+        if model is not None and not np.isfinite(gain):
+            (gain, place), beyond = model.gain_margin, " by the identified model"
+        sure = f" \u00b1 {np.degrees(_SIGMAS * error):.2g} deg (95 %)" if error else " deg"
+        lowest = "not seen: the phase does not pass -180 deg where the loop can be estimated"
+        if np.isfinite(gain):
+            lowest = f"{20 * np.log10(gain):.3g} dB at {place / (2 * np.pi):.3g} Hz "
+            lowest += f"({place:.3g} rad/s){beyond}; 6 dB or more is usual"
+        facts = {
+            "crossover": f"{crossover / (2 * np.pi):.3g} Hz ({crossover:.3g} rad/s){by}",
+            "phase margin": f"{np.degrees(margin):.3g}{sure}; 45 deg or more is usual",
+            "gain margin": lowest,
+        }
     image = embed_figure(
         lambda: _draw_loop(loop, model),
         alt=f"Bode diagram of the broken loop with its 95 % band; crossover {facts['crossover']}.",
@@ -274,34 +295,6 @@ def entry_of(record: Record, frf: FrequencyResponse) -> Entry | None:
         return None
     entries: dict[str, Entry] = {output: "set-point", source: "plant input"}
     return entries.get(unit)
-
-
-def _margins(loop: BrokenLoop, model: BrokenLoop | None) -> dict[str, str]:
-    """Those that are not seen are those of the model, where there is one."""
-    crossover, by = loop.crossover, ""
-    if model is not None and np.isnan(crossover):
-        loop, crossover, by = model, model.crossover, " by the identified model"
-    if np.isnan(crossover):
-        low, high = loop.omega[[0, -1]] / (2 * np.pi)
-        where = f"|L| does not fall through 1 from {low:.3g} to {high:.3g} Hz"
-        return {"crossover": f"not seen: {where}, where the loop can be estimated"}
-    margin, error = loop.phase_margin
-    gain, place = loop.gain_margin
-    beyond = ""
-    if model is not None and not np.isfinite(gain):
-        (gain, place), beyond = model.gain_margin, " by the identified model"
-    sure = f" \u00b1 {np.degrees(_SIGMAS * error):.2g} deg (95 %)" if error else " deg"
-    facts = {
-        "crossover": f"{crossover / (2 * np.pi):.3g} Hz ({crossover:.3g} rad/s){by}",
-        "phase margin": f"{np.degrees(margin):.3g}{sure}; 45 deg or more is usual",
-        "gain margin": "not seen: the phase does not pass -180 deg where the loop can be estimated",
-    }
-    if np.isfinite(gain):
-        facts["gain margin"] = (
-            f"{20 * np.log10(gain):.3g} dB at {place / (2 * np.pi):.3g} Hz ({place:.3g} rad/s)"
-            f"{beyond}; 6 dB or more is usual"
-        )
-    return facts
 
 
 def _draw_loop(loop: BrokenLoop, model: BrokenLoop | None) -> Figure:

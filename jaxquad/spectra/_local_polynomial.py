@@ -31,10 +31,10 @@ from ._global_model import (
     left_moving,
     response_left,
     Rest,
-    shared_errors,
     subtract_models,
     take_off,
     weighted_models,
+    with_models,
 )
 from ._local_fit import (
     Bins,
@@ -107,8 +107,14 @@ def estimate_local_polynomial(
         width, rational = np.full(at.size, float(options.width)), np.zeros(at.size, bool)
     else:
         widest = reach(windows.grid, windows.narrow, windows.widest, rest.bins, rest.sources)
-        respond = setup.to_plant(rest, sources)
-        chosen = choose_widths(windows.grid, windows.least, widest, noise, respond)
+        to_moved = setup.to_moved(rest)
+
+        def to_plant(omega: Grid, half_width: Grid, shape: Shape) -> LocalFit:
+            moved = to_moved(omega, half_width, shape)
+            left = setup.factors(moved)[0]
+            return coloured_gain(setup.plant(moved), sources, left, omega, rest.bins)
+
+        chosen = choose_widths(windows.grid, windows.least, widest, noise, to_plant)
         width, rational = (part[at] for part in chosen)
     respond = setup.to_moved(rest)
     moved = respond(omega, width, "polynomial")
@@ -117,7 +123,12 @@ def estimate_local_polynomial(
         moved = moved.replace_rows(rational, part)
     # Where the fit leaves much more than the noise, and where an input hardly moves.
     far_off = unresolved(omega, moved, sources, at, bins, rest.moved) & (options.width is None)
-    unmoved = find_unmoved(moved, sources, at, inputs) if joint else np.zeros_like(far_off)
+    unmoved = np.zeros_like(far_off)
+    if joint:  # there the ratio is that of two noises: -1 over the controller
+        invertible, _, turn = joint_factors(moved, inputs)
+        effect = np.sum(np.abs(np.swapaxes(turn, 1, 2) @ moved.effect) ** 2, axis=2)
+        relative = np.sqrt(sources.power[at][:, :inputs] * effect / 2)
+        unmoved = invertible & np.any(relative > _DIVISIBLE, axis=1)
     lost = far_off | unmoved
     blank = moved.rows(lost)
     names = "response", "effect", "gain", "scatter"
@@ -134,8 +145,10 @@ def estimate_local_polynomial(
     direct, multiple = (of(fit, power)[at] for of in (partial_coherence, multiple_coherence))
     coherence, finite = direct, np.isfinite(plant.response)
     if joint:
-        spread = windows.grid, windows.narrow, from_sources, inputs
-        coherence = coherence_of_references(*spread)[at]
+        # The smaller of the shares of input and output (Bendat and Piersol, Random Data, ch. 7).
+        power, alone = sources.power, power_alone(narrow)[:, None, :]
+        coherence = partial_coherence(narrow, power[:, inputs:])
+        coherence = np.minimum(coherence, alone / (alone + power[:, None, :inputs]))[at]
     coherent = np.any(coherence >= COHERENT, axis=(1, 2))
     coherence = np.where(finite, coherence, 0.0)
     ringing = np.zeros(at.size, bool)
@@ -144,10 +157,11 @@ def estimate_local_polynomial(
         ends = [x[-max(int(_END * len(x)), _FEWEST) :].copy() for x in columns]
         ringing = left_moving(rest, ends, windows.grid, sources)[at]
     left, right = setup.factors(moved)
-    models = shared_errors(rest, bins, omega, moved, sources, left, right)
     edges, freedom = window_slices(windows.grid, windows.narrow, bins), narrow.freedom
     log_noise = smoothed(windows.grid, covariance_of_bands(*edges, freedom), freedom)
-    errors = error_covariance(omega, plant, noise, at, bins, back, sources, left, models)
+    parts = error_covariance(omega, plant, noise, at, bins, back, sources, left)
+    right = right * np.where(plant.determined[:, None, None], back, 0)
+    errors = with_models(*parts, rest, bins, moved, sources, left, right)
     response = plant.response * back
     with np.errstate(divide="ignore", invalid="ignore"):
         error = np.where(finite, np.sqrt(errors.variance() / 2) / np.abs(response), np.inf)
@@ -159,18 +173,11 @@ def estimate_local_polynomial(
         bool(np.any(unmoved) and not np.any(finite)), ringing & coherent & ~far_off,
         None if options.width is None else windows.least[at],
     )  # fmt: skip
+    direct, log_noise = np.where(finite, direct, 0.0), log_noise[np.ix_(at, at)]
     return Estimate(
-        omega,
-        response,
-        coherence,
-        np.where(finite, direct, 0.0),
-        multiple,
-        errors,
-        error,
-        log_noise[np.ix_(at, at)],
-        remarks,
+        omega, response, coherence, direct, multiple, errors, error, log_noise, remarks,
         divided=share_of_inputs(left, sources, at, inputs) if joint else None,
-    )
+    )  # fmt: skip
 
 
 class Setup(NamedTuple):
@@ -220,17 +227,6 @@ class Setup(NamedTuple):
 
         return respond
 
-    def to_plant(self, rest: Rest, sources: Noise) -> Respond:
-        """Fits from inputs to outputs, with the gain of the noise `sources` of what is moved."""
-        to_moved = self.to_moved(rest)
-
-        def respond(omega: Grid, half_width: Grid, shape: Shape) -> LocalFit:
-            moved = to_moved(omega, half_width, shape)
-            left = self.factors(moved)[0]
-            return coloured_gain(self.plant(moved), sources, left, omega, rest.bins)
-
-        return respond
-
 
 def _repair_models(setup: Setup, rest: Rest) -> tuple[Rest, LocalFit]:
     """What better models leave where those of `rest` miss the response, and the narrow fits of it.
@@ -259,10 +255,7 @@ def _repair_models(setup: Setup, rest: Rest) -> tuple[Rest, LocalFit]:
 
 
 def _narrowly(setup: Setup, rest: Rest) -> tuple[LocalFit, Float[np.ndarray, " moved"]]:
-    """Fits from the sources to what they move, and what models leave, to what the fits leave.
-
-    A rational fit counts where its residual is so much smaller that there must be a resonance.
-    """
+    """Fits from the sources to what they move; what models leave, to what the fits leave."""
     grid, width = setup.windows.grid, setup.windows.narrow
     respond = setup.to_moved(rest)
     fit, wider = respond(grid, width, "polynomial"), width
@@ -378,22 +371,8 @@ def joint_fit(fit: LocalFit, inputs: int) -> LocalFit:
     return LocalFit(response * blank, effect, boost, gain, fit.first, scatter, freedom, power)
 
 
-def coherence_of_references(omega: Grid, half_width: Grid, fit: LocalFit, inputs: int) -> Pairs:
-    """Partial coherence of the joint estimate: the smaller of the shares of input and output.
-
-    Source: Bendat and Piersol, Random Data, ch. 7.
-    """
-    noise = smooth_noise(omega, half_width, fit.scatter, fit.freedom)
-    moved = noise.power[:, None, :inputs]
-    plant = joint_fit(fit, inputs)
-    alone = power_alone(plant)[:, None, :]
-    through = partial_coherence(plant, noise.power[:, inputs:])
-    return np.minimum(through, alone / (alone + moved))
-
-
 def share_of_inputs(left: np.ndarray, noise: Noise, at: Places, inputs: int) -> Pairs:
-    """Share of a joint estimate's squared error by the noise of T_ru, half of what both make
-    included."""
+    """Share of the squared error by noise of T_ru, with half of what both make."""
     root = noise.root()[at]
     total = left @ root
     of_inputs = left[:, :, :inputs] @ root[:, :inputs]
@@ -401,12 +380,3 @@ def share_of_inputs(left: np.ndarray, noise: Noise, at: Places, inputs: int) -> 
     mine = np.sum(np.real(of_inputs * np.conj(total)), axis=2)
     share = np.clip(mine / np.maximum(power, 1e-300), 0.0, 1.0)
     return np.repeat(share[:, :, None], inputs, axis=2)
-
-
-def find_unmoved(moved: LocalFit, noise: Noise, at: Places, inputs: int) -> Where:
-    """Where references hardly move an input: the joint ratio of two noises is -1 over the
-    controller."""
-    invertible, _, back = joint_factors(moved, inputs)
-    effect = np.sum(np.abs(np.swapaxes(back, 1, 2) @ moved.effect) ** 2, axis=2)
-    relative = np.sqrt(noise.power[at][:, :inputs] * effect / 2)
-    return invertible & np.any(relative > _DIVISIBLE, axis=1)

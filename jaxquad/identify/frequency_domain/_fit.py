@@ -30,7 +30,7 @@ from ._cost import (
     Weights,
     widen_band,
 )
-from ._parameters import Condition, Free, select_parameters, Tie
+from ._parameters import Condition, Free, Numbers, select_parameters, Tie
 from ._problem import (
     make_problem,
     Prior,
@@ -209,7 +209,7 @@ def _fit(model: PyTree, frfs: Sequence[FrequencyResponse], options: Options, rou
         """Only a likelihood knows what it would mean that points share noise."""
         return problem.weighted(weights, mixings_of(points, weights) if is_likelihood else None)
 
-    def are_close(old: Sequence[Weights], new: Sequence[Weights], share: float) -> bool:
+    def are_close(old: Sequence[Numbers], new: Sequence[Weights], share: float) -> bool:
         both = zip(map(np.asarray, old), new, strict=True)
         return all(np.all(np.abs(one - other) <= share * np.abs(other)) for one, other in both)
 

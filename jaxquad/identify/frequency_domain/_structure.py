@@ -88,13 +88,7 @@ def reduce_structure(
     - `rise`: leave out by the rise of the average cost instead, which is to be no more than this;
         1 to 2 is usual with CIFER.
 
-    **Returns:**
-
-    `jq.identify.Reduction`: the smallest structure, and what was tried.
-
-    **Raises:**
-
-    - `ValueError`: a name in `null` that is not free, and what `jq.fit` refuses.
+    **Raises:** ValueError for a name in `null` that is not free, and for what `jq.fit` refuses.
 
     Source: Tischler & Remple, ch. 13, model structure determination.
     """
@@ -140,7 +134,7 @@ def reduce_structure(
         except ValueError:  # the model has no response then
             trial = None
         if trial is None or not np.isfinite(trial.cost):
-            numbers = (np.inf,) * 4
+            numbers = (np.inf, np.inf, np.inf, np.inf)
             steps.append(Step(name, reason, *numbers, False, "kept: no fit without it"))
             continue
         higher = trial.average_cost - best.average_cost
@@ -183,9 +177,8 @@ def fit_damped(fit: Fit, *, unmodelled: float = 0.05) -> Fit:
     **Returns:** the fit with a free `damping`; `fit` itself where the response shows none, where
     nothing was fitted, and where its damping is not 0 or free already.
 
-    **Raises:**
-
-    - `ValueError`: the fit is one of another model, or none of `jq.fit`; `unmodelled` is negative.
+    **Raises:** ValueError where the fit is one of another model, or none of `jq.fit`, and where
+    `unmodelled` is negative.
 
     !!! example
 

@@ -195,6 +195,9 @@ class Mixture(NamedTuple):
         return float(np.sqrt(np.sum(self.powers)))
 
 
+_NO_DISCREPANCY = Mixture(np.zeros(len(LENGTHS)), 1.0)
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class ErrorBudget:
     """A problem at its solution, to first order in relative changes, and the errors there."""
@@ -202,7 +205,7 @@ class ErrorBudget:
     records: list[ResponseTerm]
     prior: PriorRows
     count: int  # of free parameters, the first of all
-    mixtures: tuple[Mixture, Mixture] = (Mixture(np.zeros(len(LENGTHS)), 1.0),) * 2
+    mixtures: tuple[Mixture, Mixture] = (_NO_DISCREPANCY, _NO_DISCREPANCY)
 
     @ft.cached_property
     def products(self) -> tuple[Matrix, Float[np.ndarray, " parameters"]]:

@@ -313,15 +313,16 @@ def _determine(information: Information, bounds: tuple[Bound, ...]) -> Verdict:
         spread, directions = np.linalg.eigh(information.covariance)
         most = {int(np.argmax(spread * directions[k] ** 2)) for k in np.flatnonzero(left)}
         null = _sparse(np.concatenate([null, directions.T[sorted(most)]]))
-    undetermined, remedies = tuple(places[k].name for k in np.flatnonzero(lost)), []
+    names, remedies = [place.name for place in places[:count]], []
+    undetermined = tuple(name for name, one in zip(names, lost, strict=True) if one)
     combinations, alternatives, curved = _analyse_groups(null, exact, information)
     if undetermined:
-        names = " or ".join(undetermined)
+        both = " or ".join(undetermined)
         remedies = [
-            f"fix {names} at a measured value« (leave it out of free=)»",
+            f"fix {both} at a measured value« (leave it out of free=)»",
             "give a known value: "
             "priors=[jq.identify.Prior(name or function, value, standard error)]",
-            f"fit a second record under a known change of {names}: "
+            f"fit a second record under a known change of {both}: "
             "conditions=(None, jq.identify.Changed(name, change))",
         ]
     return Verdict(
@@ -329,7 +330,7 @@ def _determine(information: Information, bounds: tuple[Bound, ...]) -> Verdict:
         undetermined=undetermined,
         combinations=tuple(combinations),
         null_directions=tuple(
-            {places[k].name: float(row[k]) for k in np.flatnonzero(row)} for row in null
+            {name: float(x) for name, x in zip(names, row, strict=True) if x} for row in null
         ),
         reasons=(),
         remedies=as_messages(remedies),
