@@ -26,35 +26,15 @@ def _function(name: str) -> Expression:
     return lambda kind, params, *args: f"{name}({', '.join(args)})"
 
 
-def _absolute(kind: str, params: dict, x: str) -> str:
-    return f"fabs({x})" if kind in _FLOATS else f"{x} < 0 ? -{x} : {x}"
-
-
-def _remainder(kind: str, params: dict, a: str, b: str) -> str:
-    return f"fmod({a}, {b})" if kind in _FLOATS else f"{a} % {b}"
-
-
 def _select(kind: str, params: dict, which: str, first: str, *cases: str) -> str:
     for k, case in enumerate(cases, 1):
         first = f"({which} >= {k} ? {case} : {first})"
     return first
 
 
-def _quotient_of_choices(
-    kind: str, params: dict, over: str, n0: str, n1: str, under: str, d0: str, d1: str
-) -> str:
-    return f"{over} ? ({under} ? {n1} / {d1} : {n1} / {d0}) : ({under} ? {n0} / {d1} : {n0} / {d0})"
-
-
-def _round(kind: str, params: dict, x: str) -> str:
-    away = params["rounding_method"] == lax.RoundingMethod.AWAY_FROM_ZERO
-    return f"{'round' if away else 'rint'}({x})"
-
-
-def _converted(kind: str, params: dict, x: str) -> str:
-    return f"{x} != 0" if kind == "bool" else f"({kind}){x}"
-
-
+_ROUNDED = {
+    lax.RoundingMethod.AWAY_FROM_ZERO: "round", lax.RoundingMethod.TO_NEAREST_EVEN: "rint",
+}  # fmt: skip
 _SIGNS = {
     "add": "+", "add_any": "+", "sub": "-", "mul": "*", "div": "/", "and": "&", "or": "|",
     "xor": "^", "eq": "==", "ne": "!=", "lt": "<", "le": "<=", "gt": ">", "ge": ">=",
@@ -64,9 +44,11 @@ _SAME_IN_C = """
     asinh acosh atanh erf erfc
 """.split()
 _WRITTEN: dict[str, Expression] = {
-    "abs": _absolute,
+    "abs": lambda kind, params, x: f"fabs({x})" if kind in _FLOATS else f"{x} < 0 ? -{x} : {x}",
     "clamp": lambda kind, params, low, x, high: f"smaller(larger({x}, {low}), {high})",
-    "convert_element_type": _converted,
+    "convert_element_type": lambda kind, params, x: (
+        f"{x} != 0" if kind == "bool" else f"({kind}){x}"
+    ),
     "integer_pow": lambda kind, params, x: f"integer_power<{params['y']}>({x})",
     "is_finite": lambda kind, params, x: f"{x} - {x} == 0",
     "logistic": lambda kind, params, x: f"1 / (1 + exp(-{x}))",
@@ -74,10 +56,12 @@ _WRITTEN: dict[str, Expression] = {
     "min": _function("smaller"),
     "neg": lambda kind, params, x: f"-{x}",
     "not": lambda kind, params, x: f"!{x}" if kind == "bool" else f"~{x}",
-    "quotient_of_choices": _quotient_of_choices,
+    "quotient_of_choices": lambda kind, params, over, n0, n1, under, d0, d1: (
+        f"{over} ? ({under} ? {n1} / {d1} : {n1} / {d0}) : ({under} ? {n0} / {d1} : {n0} / {d0})"
+    ),
     "pow": lambda kind, params, x, y: f"pow({x}, ({kind}){y})",
-    "rem": _remainder,
-    "round": _round,
+    "rem": lambda kind, params, a, b: f"fmod({a}, {b})" if kind in _FLOATS else f"{a} % {b}",
+    "round": lambda kind, params, x: f"{_ROUNDED[params['rounding_method']]}({x})",
     "rsqrt": lambda kind, params, x: f"1 / sqrt({x})",
     "select_n": _select,
     "sign": lambda kind, params, x: f"{x} > 0 ? 1 : {x} < 0 ? -1 : {x}",
@@ -108,22 +92,14 @@ EXPRESSIONS: dict[str, Expression] = (
 # minimax, within 4e-18 and 5e-20, in single precision within 4e-9 and 1e-10.
 _DOUBLE = {
     "sine": (
-        -0.16666666666666632,
-        0.00833333333332248,
-        -0.00019841269829846725,
-        2.755731370215645e-06,
-        -2.5050759361193126e-08,
-        1.5896852413321754e-10,
+        -0.16666666666666632, 0.00833333333332248, -0.00019841269829846725, 2.755731370215645e-06,
+        -2.5050759361193126e-08, 1.5896852413321754e-10,
     ),
     "cosine": (
-        0.0416666666666666,
-        -0.0013888888888874465,
-        2.4801587289662216e-05,
-        -2.755731439745978e-07,
-        2.0875728697899716e-09,
-        -1.135989972166348e-11,
+        0.0416666666666666, -0.0013888888888874465, 2.4801587289662216e-05, -2.755731439745978e-07,
+        2.0875728697899716e-09, -1.135989972166348e-11,
     ),
-}
+}  # fmt: skip
 _SINGLE = {
     "sine": (-0.16666655242443085, 0.008332191035151482, -0.00019518604676704854),
     "cosine": (0.04166664555668831, -0.00138873013202101, 2.4430670237052254e-05),

@@ -11,7 +11,6 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax.core import ShapedArray
 from jax.extend.core import ClosedJaxpr, jaxpr_as_fun, Primitive
 from jax.interpreters import ad, batching, mlir
@@ -26,6 +25,7 @@ from ._loop import (
     Loop,
     reverse_in_lanes,
     segments_of,
+    Shaped,
     size,
     split,
     step_in_lanes,
@@ -184,9 +184,7 @@ def _primitive(name: str, kernel: Callable[..., Flat], plain: Callable[..., Flat
 
 
 _loop = _primitive(
-    "ensemble_loop",
-    lambda *args, loop, scan, keep: run_forward(loop, *args, keep=keep),
-    _plain,
+    "ensemble_loop", lambda *args, loop, scan, keep: run_forward(loop, *args, keep=keep), _plain
 )
 _tangent = _primitive("ensemble_loop_tangent", _plain_tangents, _plain_tangents)
 _cotangent = _primitive(
@@ -196,36 +194,28 @@ _cotangent = _primitive(
 )
 
 
-def _shaped(shape: tuple[int, ...], kind: np.dtype) -> ShapedArray:
-    return ShapedArray(shape, kind)
+def _shaped(loop: Loop, still: Sequence[Shaped], timed: Sequence[Shaped]) -> list[ShapedArray]:
+    """As the whole loop has them."""
+    shapes = [x.shape for x in still] + [(loop.count, *x.shape) for x in timed]
+    kinds = [x.dtype for x in (*still, *timed)]
+    return [ShapedArray(shape, kind) for shape, kind in zip(shapes, kinds, strict=True)]
 
 
-def _results(loop: Loop) -> list[ShapedArray]:
-    carry, stored = loop.results
-    timed = [_shaped((loop.count, *x.shape), x.dtype) for x in stored]
-    return [*(_shaped(x.shape, x.dtype) for x in carry), *timed]
+@_loop.def_abstract_eval
+def _(*_: Any, loop: Loop, scan: Scan, keep: bool) -> list[ShapedArray]:
+    return _shaped(loop, *loop.results) + _shaped(loop, kept_avals(loop) if keep else (), ())
 
 
-def _arguments(loop: Loop) -> list[ShapedArray]:
+@_tangent.def_abstract_eval
+def _(*_: Any, loop: Loop, scan: Scan, which: tuple[bool, ...]) -> list[ShapedArray]:
+    return [x for x in _shaped(loop, *loop.results) if is_float(x.dtype)]
+
+
+@_cotangent.def_abstract_eval
+def _(*_: Any, loop: Loop, scan: Scan, which: tuple[bool, ...]) -> list[ShapedArray]:
     consts, carry, signals = loop.avals
-    timed = [_shaped((loop.count, *x.shape), x.dtype) for x in signals]
-    return [*(_shaped(x.shape, x.dtype) for x in (*consts, *carry)), *timed]
-
-
-_loop.def_abstract_eval(
-    lambda *_, loop, scan, keep: [
-        *_results(loop),
-        *(_shaped(x.shape, x.dtype) for x in (kept_avals(loop) if keep else ())),
-    ]
-)
-_tangent.def_abstract_eval(
-    lambda *_, loop, scan, which: [x for x in _results(loop) if is_float(x.dtype)]
-)
-_cotangent.def_abstract_eval(
-    lambda *_, loop, scan, which: [
-        x for x, wanted in zip(_arguments(loop), which, strict=True) if wanted
-    ]
-)
+    arguments = _shaped(loop, [*consts, *carry], signals)
+    return [x for x, wanted in zip(arguments, which, strict=True) if wanted]
 
 
 def _loop_derivative(
@@ -237,11 +227,9 @@ def _loop_derivative(
     moved = [x for x in tangents if not isinstance(x, ad.Zero)]
     if any(which):
         moved = _tangent.bind(*primals, *kept, *moved, loop=loop, scan=scan, which=which)
-    moved_in_order = iter(moved)
+    in_order = iter(moved)
     still = lambda x: ad.Zero(jax.typeof(x).to_tangent_aval())
-    out_tangents = [
-        next(moved_in_order, still(x)) if is_float(x.dtype) else still(x) for x in results
-    ]
+    out_tangents = [next(in_order, still(x)) if is_float(x.dtype) else still(x) for x in results]
     kept = kept if keep else []
     # What is made of the kept carries is differentiated by the arguments, which lead to them.
     return [*results, *kept], [*out_tangents, *map(still, kept)]

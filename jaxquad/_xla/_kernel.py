@@ -256,13 +256,13 @@ def evaluate_once(function: Callable[..., PyTree], *, least: int) -> Callable[..
         leaves, structure = jax.tree.flatten(args)
         flat = lambda *xs: function(*jax.tree.unflatten(structure, xs))
         closed, shape = jax.make_jaxpr(flat, return_shape=True)(*leaves)
-        values = _Once(least).evaluate(closed.jaxpr, closed.consts, leaves)
+        values = _Evaluation(least).evaluate(closed.jaxpr, closed.consts, leaves)
         return jax.tree.unflatten(jax.tree.structure(shape), values)
 
     return run
 
 
-class _Once:
+class _Evaluation:
     """Evaluates jaxprs, and remembers what it has computed: slopes by different parameters were
     traced apart, and what they share has to be found again."""
 
@@ -285,7 +285,7 @@ class _Once:
             inner = params[_INLINED[name]]
             is_marked = (equation.ctx.xla_metadata or {}).get("inlineable") == "false"
             if is_marked and max(sizes) >= _LARGE:  # by `no_fuse`, and longer than a call
-                return self._once(("call", id(inner)), args, lambda: _bind(equation, args))
+                return self._remembered(("call", id(inner)), args, lambda: _bind(equation, args))
             return self.evaluate(inner.jaxpr, inner.consts, args)
         if equation.primitive.multiple_results:
             return _bind(equation, args)
@@ -301,9 +301,9 @@ class _Once:
                 return [no_fuse(lambda *xs: _bind(equation, xs)[0], *args)]
             return _bind(equation, args)
 
-        return self._once((name, str(params)), args, compute)
+        return self._remembered((name, str(params)), args, compute)
 
-    def _once(
+    def _remembered(
         self, what: tuple, args: Sequence[Value], compute: Callable[[], list[Value]]
     ) -> list[Value]:
         key = (*what, *map(_key_of, args))
@@ -316,7 +316,7 @@ class _Once:
             squared = jnp.real(value) ** 2 + jnp.imag(value) ** 2
             return jax.lax.complex(jnp.real(value) / squared, -jnp.imag(value) / squared)
 
-        return self._once(("reciprocal",), [value], lambda: [no_fuse(reciprocal, value)])[0]
+        return self._remembered(("reciprocal",), [value], lambda: [no_fuse(reciprocal, value)])[0]
 
 
 def _key_of(arg: Value) -> Value:

@@ -246,15 +246,12 @@ def _transpose(lanes: Lanes, equation: JaxprEqn, x: Cells) -> Cells:
 
 @_rule("rev")
 def _reverse(lanes: Lanes, equation: JaxprEqn, x: Cells) -> Cells:
-    axes = equation.params["dimensions"]
-    _keep_apart(lanes, equation, axes)
-    return np.flip(x, axes)
+    return np.flip(x, _other_axes(lanes, equation, equation.params["dimensions"]))
 
 
 @_rule("concatenate")
 def _concatenate(lanes: Lanes, equation: JaxprEqn, *parts: Cells) -> Cells:
-    axis = equation.params["dimension"]
-    _keep_apart(lanes, equation, (axis,))
+    [axis] = _other_axes(lanes, equation, (equation.params["dimension"],))
     lanes.small(_result(equation))
     return np.concatenate(parts, axis)
 
@@ -267,15 +264,13 @@ def _stack(lanes: Lanes, equation: JaxprEqn, *parts: Cells) -> Cells:
 
 @_rule("unstack")
 def _unstack(lanes: Lanes, equation: JaxprEqn, x: Cells) -> list[Cells]:
-    axis = equation.params["axis"]
-    _keep_apart(lanes, equation, (axis,))
+    [axis] = _other_axes(lanes, equation, (equation.params["axis"],))
     return [as_cells(part) for part in np.moveaxis(x, axis, 0)]
 
 
 @_rule("split")
 def _split(lanes: Lanes, equation: JaxprEqn, x: Cells) -> list[Cells]:
-    axis = equation.params["axis"]
-    _keep_apart(lanes, equation, (axis,))
+    [axis] = _other_axes(lanes, equation, (equation.params["axis"],))
     return np.split(x, np.cumsum(equation.params["sizes"])[:-1], axis)
 
 
@@ -359,7 +354,7 @@ def _empty(lanes: Lanes, equation: JaxprEqn) -> Cells:
 def _reduce(lanes: Lanes, equation: JaxprEqn, x: Cells) -> Cells:
     name, axes = equation.primitive.name, equation.params["axes"]
     if not (lanes.leave_sums and name == "reduce_sum"):
-        _keep_apart(lanes, equation, axes)
+        _other_axes(lanes, equation, axes)
     kept = [axis for axis in range(x.ndim) if axis not in axes]
     shape = tuple(x.shape[axis] for axis in kept)
     rows = x.transpose(*kept, *axes).reshape(math.prod(shape), -1)
@@ -368,8 +363,7 @@ def _reduce(lanes: Lanes, equation: JaxprEqn, x: Cells) -> Cells:
 
 @_rule("cumsum")
 def _accumulate(lanes: Lanes, equation: JaxprEqn, x: Cells) -> Cells:
-    axis, out = equation.params["axis"], np.empty_like(x)
-    _keep_apart(lanes, equation, (axis,))
+    [axis], out = _other_axes(lanes, equation, (equation.params["axis"],)), np.empty_like(x)
     turned = (lambda a: np.flip(a, axis)) if equation.params["reverse"] else (lambda a: a)
     rows, totals = (np.moveaxis(turned(a), axis, 0) for a in (x, out))
     for k, row in enumerate(rows):
@@ -384,7 +378,7 @@ def _accumulate(lanes: Lanes, equation: JaxprEqn, x: Cells) -> Cells:
 def _dot(lanes: Lanes, equation: JaxprEqn, a: Cells, b: Cells) -> Cells:
     (shared_a, shared_b), (batch_a, batch_b) = equation.params["dimension_numbers"]
     if not lanes.leave_sums:
-        _keep_apart(lanes, equation, shared_a)
+        _other_axes(lanes, equation, shared_a)
     kind = equation.outvars[0].aval.dtype  # pyright: ignore[reportAttributeAccessIssue]
     a, free_a = _matrices(a, batch_a, shared_a)
     b, free_b = _matrices(b, batch_b, shared_b)
@@ -444,10 +438,14 @@ def _scan(lanes: Lanes, equation: JaxprEqn, *args: Cells) -> list[Cells]:
     return [*carry, *(np.stack(column) for column in zip(*rows, strict=True))]
 
 
-def _keep_apart(lanes: Lanes, equation: JaxprEqn, axes: Sequence[int | np.integer]) -> None:
-    shape = _shape(equation)
-    name = equation.primitive.name
+Axes = Sequence[int | np.integer]
+
+
+def _other_axes(lanes: Lanes, equation: JaxprEqn, axes: Axes) -> tuple[int | np.integer, ...]:
+    """The axes, none of which is that of the members."""
+    shape, name = _shape(equation), equation.primitive.name
     _require(not any(lanes.is_members(shape, axis) for axis in axes), f"{name} over the members")
+    return tuple(axes)
 
 
 def _require(condition: bool, otherwise: str) -> None:

@@ -8,13 +8,13 @@ computes a segment's carries again, writes them to memory, and goes back over th
 
 import functools as ft
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend.core import ClosedJaxpr, Jaxpr, jaxpr_as_fun, JaxprEqn, Var
+from jax.extend.core import ClosedJaxpr, jaxpr_as_fun, JaxprEqn, Var
 from jax.typing import DTypeLike
 from jaxtyping import Array
 
@@ -230,57 +230,51 @@ def without_invariants(
     """A step of (consts, carry, now) as one of other consts, which are computed from these."""
     body = step.jaxpr
     constants, rest = body.invars[: len(consts)], body.invars[len(consts) :]
-    parts = _Parts(body, constants)
-    per_sample = _used(parts.in_sample, parts.outs)
+    steady: list[JaxprEqn] = []  # what is the same in every sample, each once
+    in_sample: list[JaxprEqn] = []  # what a sample has to compute
+    before: set[Var] = set()  # results that need not be computed in a sample
+    still, from_own = {*constants, *body.constvars}, {*constants}
+    same: dict[Any, Var] = {}
+    first_of: dict[Any, Sequence[Var]] = {}
+    for equation in body.eqns:
+        equation = equation.replace(invars=[_first(v, same) for v in equation.invars])
+        read = [v for v in equation.invars if isinstance(v, Var)]
+        if not still.issuperset(read):
+            in_sample.append(equation)
+            continue
+        first = first_of.setdefault(_content(equation), equation.outvars)
+        if first is not equation.outvars:
+            same.update(zip(equation.outvars, first, strict=True))
+            continue
+        still.update(equation.outvars)
+        steady.append(equation)
+        if not from_own.isdisjoint(read):
+            from_own.update(equation.outvars)
+            name = equation.primitive.name
+            kinds = {v.aval.dtype for v in equation.outvars}  # pyright: ignore[reportAttributeAccessIssue]
+            if (name in EXPRESSIONS or name in CALLS) and kinds.issubset(NUMBERS):
+                before.update(equation.outvars)
+                continue
+        in_sample.append(equation)  # what only moves numbers costs nothing there
+    outs = [_first(v, same) for v in body.outvars]
+    per_sample = _used(in_sample, outs)
     read = dict.fromkeys(
         v
-        for v in (*(v for equation in per_sample for v in equation.invars), *parts.outs)
+        for v in (*(v for equation in per_sample for v in equation.invars), *outs)
         if isinstance(v, Var)
     )
-    needed = [v for v in read if v in parts.before or v in constants]
+    needed = [v for v in read if v in before or v in constants]
     grown = max(_size(needed, members) - _size(constants, members), len(needed) - len(constants))
     if grown > _MORE:
         return step, list(consts)
-    first = body.replace(invars=constants, outvars=needed, eqns=_used(parts.steady, needed))
-    within = body.replace(invars=[*needed, *rest], outvars=parts.outs, eqns=per_sample)
+    first = body.replace(invars=constants, outvars=needed, eqns=_used(steady, needed))
+    within = body.replace(invars=[*needed, *rest], outvars=outs, eqns=per_sample)
     computed = jaxpr_as_fun(ClosedJaxpr(first, step.consts))(*consts)
     return ClosedJaxpr(within, step.consts), computed
 
 
-class _Parts:
-    """A step's equations, sorted, with one of each that are the same."""
-
-    def __init__(self, body: Jaxpr, constants: Sequence[Var]):
-        self.steady: list[JaxprEqn] = []  # what is the same in every sample
-        self.in_sample: list[JaxprEqn] = []  # what a sample has to compute
-        self.before: set[Var] = set()  # results that need not be computed in a sample
-        self._still, self._from_own = {*constants, *body.constvars}, {*constants}
-        self._same: dict[Var, Var] = {}
-        self._first_of: dict[Any, Sequence[Var]] = {}
-        for equation in body.eqns:
-            self._sort(equation.replace(invars=[self._first(v) for v in equation.invars]))
-        self.outs = [self._first(v) for v in body.outvars]
-
-    def _first(self, v: Any) -> Any:
-        return self._same.get(v, v) if isinstance(v, Var) else v
-
-    def _sort(self, equation: JaxprEqn) -> None:
-        read = [v for v in equation.invars if isinstance(v, Var)]
-        if not self._still.issuperset(read):
-            self.in_sample.append(equation)
-            return
-        first = self._first_of.setdefault(_content(equation), equation.outvars)
-        if first is not equation.outvars:
-            self._same.update(zip(equation.outvars, first, strict=True))
-            return
-        self._still.update(equation.outvars)
-        self.steady.append(equation)
-        if not self._from_own.isdisjoint(read):
-            self._from_own.update(equation.outvars)
-            if _computes(equation):
-                self.before.update(equation.outvars)
-                return
-        self.in_sample.append(equation)  # what only moves numbers costs nothing there
+def _first(v: Any, same: Mapping[Any, Var]) -> Any:
+    return same.get(v, v) if isinstance(v, Var) else v
 
 
 def _content(equation: JaxprEqn) -> Any:
@@ -289,12 +283,6 @@ def _content(equation: JaxprEqn) -> Any:
         return id(equation)
     operands = [v if isinstance(v, Var) else (str(v.val), v.aval) for v in equation.invars]
     return equation.primitive, str(equation.params), *operands
-
-
-def _computes(equation: JaxprEqn) -> bool:
-    name = equation.primitive.name
-    kinds = {v.aval.dtype for v in equation.outvars}  # pyright: ignore[reportAttributeAccessIssue]
-    return (name in EXPRESSIONS or name in CALLS) and kinds.issubset(NUMBERS)
 
 
 def _used(equations: Sequence[JaxprEqn], results: Iterable[Any]) -> list[JaxprEqn]:

@@ -1,12 +1,3 @@
-from ._files import (
-    change_table as change_table,
-    parameter_file as parameter_file,
-    ParameterChange as ParameterChange,
-    ParameterFiles as ParameterFiles,
-    propose_changes as propose_changes,
-    WordChange as WordChange,
-    write_parameter_files as write_parameter_files,
-)
 from ._filter_bank import filter_choices as filter_choices
 from ._filters import (
     ardupilot_notch as ardupilot_notch,
@@ -83,26 +74,29 @@ from ._page import (
 )
 from ._parameters import (
     change_filters as change_filters,
+    change_table as change_table,
     check_ranges as check_ranges,
     find_parameter as find_parameter,
     firmware_of as firmware_of,
     flown_loop as flown_loop,
     list_parameters as list_parameters,
+    parameter_file as parameter_file,
+    ParameterChange as ParameterChange,
+    ParameterFiles as ParameterFiles,
     PARAMETERS as PARAMETERS,
+    propose_changes as propose_changes,
     store_parameters as store_parameters,
     with_parameters as with_parameters,
+    WordChange as WordChange,
+    write_parameter_files as write_parameter_files,
 )
 from ._proposal import AutopilotProposal as AutopilotProposal, AxesProposal as AxesProposal
 from ._rate_design import design_gains as design_gains
 from ._replay import (
-    fly_again as fly_again,
-    HeldPlant as HeldPlant,
+    FlownController as FlownController,
     hold_response as hold_response,
     predict_loop as predict_loop,
     replay_terms as replay_terms,
-)
-from ._reproduce_flight import (
-    FlownController as FlownController,
     reproduce_flight as reproduce_flight,
     Reproduction as Reproduction,
 )

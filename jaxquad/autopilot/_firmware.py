@@ -38,7 +38,7 @@ class Parameter(NamedTuple):
     high: float
     integer: bool = False  # whether the firmware stores a whole number; else single precision
     # Of the law that it sets: "angle.p" is a field of the angle loop, "gyro" the cutoff of the only
-    # Butterworth low-pass of the gyro.
+    # Butterworth low-pass of the gyro, "derivative_hz" that of the D term's.
     field: str = ""
     axis: int = -1  # of that field; -1 for all
 

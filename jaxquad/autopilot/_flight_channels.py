@@ -123,9 +123,8 @@ class FlightChannels:
     @property
     def mixer_range(self) -> Samples | None:
         """Highest less lowest motor, over what a motor can be."""
-        return (
-            None if self.motors is None else np.ptp(self.motors, axis=1) / np.ptp(self.motor_ends)
-        )
+        reach = np.ptp(self.motor_ends)
+        return None if self.motors is None else np.ptp(self.motors, axis=1) / reach
 
 
 def read_channels_if_any(
@@ -143,11 +142,7 @@ def read_channels_if_any(
     injected = {setup.reference: 1.0} if setup.injected_at == "mixer" else {}
     try:
         logged = frozenset(channel.name for channel in channels(path))
-
-        def median(name: str) -> float:
-            record = _read(path, logged, [name], span).get(name)
-            return _median(record, name, (None, None))
-
+        median = lambda x: _median(_read(path, logged, [x], span).get(x), x, (None, None))
         unfiltered = names.unfiltered or firmware.unfiltered_gyro(logged, values, median)
         wanted = [*filtered, *unfiltered, *names.terms, *names.motors, setpoint, setup.reference]
         wanted += [*names.output, *names.stick, *names.mixed, *names.slewed, *injected]
@@ -345,7 +340,7 @@ def read_flown(
         raise ValueError(
             f"{path}: P, I and D of {setup.axis} are all 0, so there is no rate loop to tune"
         )
-    angle = firmware.angle_loop(logged.values, axis, loop.law.interval(), levelled=setup.levelled)
+    angle = firmware.angle_loop(logged.values, axis, loop.law.dt, levelled=setup.levelled)
     chains = tuple(chain for chain in loop.law.gyro_chains() if chain.filters)
     filters, text = best_filters(chains, loop.unmodelled, flight, axis)
     return FlownAutopilot(

@@ -158,13 +158,8 @@ def ladrc_as_pid(
 ) -> LADRCAsPID:
     """The feedback of a continuous second-order LADRC, exactly, for firmwares that have none.
 
-    The set-point passes differently: there a LADRC is slower than a PID. Source:
-    docs/autopilots.md; arXiv 2501.11374.
-
-    **Arguments:**
-
-    - `wc`, `wo`: bandwidths in rad/s.
-    - `b0`: the plant's gain.
+    The set-point passes differently: there a LADRC is slower than a PID. Its bandwidths `wc` and
+    `wo` are in rad/s. Source: docs/autopilots.md; arXiv 2501.11374.
     """
     wc, wo, b0 = as_float(wc), as_float(wo), as_float(b0)
     d0, d1 = 3 * wo**2 + 6 * wo * wc + wc**2, 3 * wo + 2 * wc
@@ -203,11 +198,9 @@ def cascade_parameters(
 
 
 def find_inexpressible(firmware: str, controller: object) -> tuple[str, ...]:
-    """What of an angle controller a firmware cannot express, a sentence each; empty if nothing.
+    """What of a `jq.PID` of the angle a firmware cannot express, a sentence each; empty if nothing.
 
-    **Arguments:**
-
-    - `controller`: a `jq.PID` of the angle. A `LADRC` is never expressible: see `ladrc_as_pid`.
+    A `LADRC` is never expressible: see `ladrc_as_pid`.
     """
     kind = firmware_named(firmware)
     name, reasons = kind.log.title, []

@@ -26,13 +26,15 @@ from jaxquad._core import (
     require_sample_interval,
     signal_shape,
 )
-from jaxquad.control import LinearController, Member, Reference, Setpoint, Transform
+from jaxquad.control import as_setpoint, LinearController, Member, Reference, Setpoint, Transform
 
 from ._filters import FilterChain, Memory, rest_of, run_sections, Section
 
 
 DEGREES = 180 / np.pi  # per radian
 Signal = Float[Array, " axes *ensemble"]
+Series = Float[np.ndarray, " samples"]
+Samples = Float[np.ndarray, "samples axes"]
 Terms = Mapping[str, Signal]
 Memories = Mapping[str, PyTree]  # filters, integrals, last samples
 Advance = tuple[dict[str, PyTree], Signal, Terms]  # memory, command and its terms
@@ -53,9 +55,10 @@ class FirmwareLoop(eqx.Module):
     Subclasses are final: they say what the law remembers at rest, and how it advances.
     """
 
-    @abc.abstractmethod
-    def interval(self) -> float:
-        """The interval of its samples in s."""
+    if TYPE_CHECKING:  # fields of each law, in its own order
+
+        @property
+        def dt(self) -> float: ...  # s
 
     @abc.abstractmethod
     def rest(self, zero: Signal) -> dict[str, PyTree]:
@@ -123,15 +126,11 @@ class RateLoop(FirmwareLoop):
     factors: ClassVar[tuple[str, ...]] = ()  # of gains
     feed_forward: ClassVar[tuple[str, ...]] = ()  # gains of it
     limits: ClassVar[tuple[str, ...]] = ()  # fields that are not below 0
-    of_sticks: ClassVar[bool] = (
-        False  # whether feed-forward is of the sticks, between their samples
-    )
-    if TYPE_CHECKING:  # fields of each law, in its own order
+    of_sticks: ClassVar[bool] = False  # whether feed-forward is theirs, between samples
+    if TYPE_CHECKING:
 
         @property
         def gyro(self) -> FilterChain: ...
-        @property
-        def dt(self) -> float: ...  # s
 
     def __check_init__(self):
         gains = {name: vars(self)[name] for name in (*self.factors, *self.feed_forward)}
@@ -143,9 +142,6 @@ class RateLoop(FirmwareLoop):
     def gains(self) -> dict[str, Array]:
         return {name: vars(self)[name] for name in self.tuned}
 
-    def interval(self) -> float:
-        return self.dt
-
     def gyro_chains(self) -> list[FilterChain]:
         """All filters of the gyro, at their own rates."""
         return [self.gyro]
@@ -155,10 +151,7 @@ class RateLoop(FirmwareLoop):
         return FilterChain((), 1 / self.dt)
 
     def without_gyro_filters(self) -> "RateLoop":
-        """The law as it acts on the logged rate, which is behind the gyro's filters.
-
-        A plant that was identified up to that rate contains the filters.
-        """
+        """The law as it acts on the logged rate: a plant up to that contains the filters."""
         return dataclasses.replace(self, gyro=FilterChain())
 
     def holds_integral(self, axis: int) -> bool:
@@ -176,10 +169,8 @@ RateLaw = TypeVar("RateLaw", bound=RateLoop)
 class FlownLoop(eqx.Module, Generic[RateLaw]):
     """The rate loop of a log, for roll, pitch and yaw, and what of it is not modelled.
 
-    **Arguments:**
-
-    - `law`: the rate loop at hover (for Betaflight, with throttle-dependent cutoffs at 30 %).
-    - `unmodelled`: sentences; their kind is "notch", "anti-gravity", "feedforward" or empty.
+    The `law` is that at hover (for Betaflight, with throttle-dependent cutoffs at 30 %). Sentences
+    of `unmodelled` have the kind "notch", "anti-gravity", "feedforward" or none.
     """
 
     law: RateLaw
@@ -205,19 +196,15 @@ class FlownLoop(eqx.Module, Generic[RateLaw]):
         """The law at one sample of a log."""
         return self.law
 
-    def surge(self, throttle: Float[np.ndarray, " samples"]) -> Float[np.ndarray, " samples"]:
+    def surge(self, throttle: Series) -> Series:
         """Anti-gravity's measure of a moving throttle times its gain, at the loop's samples."""
         return np.zeros_like(throttle)
 
-    def integral_share(
-        self, mixer_range: Float[np.ndarray, " samples"]
-    ) -> Float[np.ndarray, " samples"]:
+    def integral_share(self, mixer_range: Series) -> Series:
         """Of what the integral grows by, while the motors use this share of the mixer's range."""
         return np.ones_like(mixer_range)
 
-    def setpoint_speed(
-        self, slope: Float[np.ndarray, "samples axes"], fed: Float[np.ndarray, "samples axes"]
-    ) -> Float[np.ndarray, "samples axes"]:
+    def setpoint_speed(self, slope: Samples, fed: Samples) -> Samples:
         """In rad/s^2, by the slope of the set-point and the logged F."""
         return slope
 
@@ -234,10 +221,7 @@ class AngleLoop(FirmwareLoop):
 
     @property
     def dt(self) -> float:
-        return self.rate.interval()
-
-    def interval(self) -> float:
-        return self.dt
+        return self.rate.dt
 
     def gains(self) -> dict[str, Array]:
         outer = {name: vars(self)[name] for name in self.outer}
@@ -250,7 +234,7 @@ class AngleLoop(FirmwareLoop):
         self, memory: Memories, excess: Signal, reference: Reference, measurement: Signal
     ) -> Advance:
         rate = (measurement - memory["angle"]) / self.dt
-        outer, wanted = self.wanted_rate(memory, reference, measurement, rate)
+        outer, wanted = self.wanted_rate(memory, as_setpoint(reference), measurement, rate)
         inner, command, terms = self.inner().advance(memory["rate"], excess, wanted, rate)
         return {"rate": inner, "angle": measurement, **outer}, command, terms
 
@@ -264,7 +248,7 @@ class AngleLoop(FirmwareLoop):
 
     @abc.abstractmethod
     def wanted_rate(
-        self, memory: Memories, reference: Reference, angle: Signal, rate: Signal
+        self, memory: Memories, aim: Setpoint, angle: Signal, rate: Signal
     ) -> tuple[dict[str, PyTree], Signal]:
         """What the angle loop remembers, and the set-point of the rate in rad/s."""
 
@@ -289,14 +273,11 @@ def _derivative(law: FirmwareLoop) -> LinearController:
 
     slopes = jax.jacfwd(advance)(jnp.zeros(states + 2, zero.dtype))
     return LinearController(
-        A=slopes[:states, :states],
-        reference_in=slopes[:states, states],
-        measurement_in=slopes[:states, states + 1],
-        C=slopes[states, :states],
-        reference_through=slopes[states, states],
-        measurement_through=slopes[states, states + 1],
-        dt=law.interval(),
-    )
+        A=slopes[:states, :states], C=slopes[states, :states],
+        reference_in=slopes[:states, states], measurement_in=slopes[:states, states + 1],
+        reference_through=slopes[states, states], measurement_through=slopes[states, states + 1],
+        dt=law.dt,
+    )  # fmt: skip
 
 
 def require_gains(dt: float, gains: Mapping[str, Array], limits: Mapping[str, Array]) -> None:

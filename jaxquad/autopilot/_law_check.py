@@ -135,7 +135,7 @@ def check_law(flown: FlownLoop, axis: int, flight: FlightChannels) -> LawCheck:
     output = stated.terms.get("output")
     if output is None or output.share <= _SHIFTED:
         return stated
-    step = flown.law.interval()
+    step = flown.law.dt
     others = [_checked(law, flight, flight.late + way * step) for way in (1, -1)]
     best = min(others, key=lambda check: check.terms["output"].left)
     if best.terms["output"].left > _BETTER * output.left:
@@ -171,7 +171,7 @@ def _checked(law: FlownLoop, flight: FlightChannels, late: float) -> LawCheck:
             output = output - np.interp(time - late, time, flight.injected)
         logged["output"] = output
         terms["output"] = terms["P"] + terms["I"] + terms["D"] + terms["F"]
-    slower = max(0.0, float(np.log2(flight.dt / law.law.interval())) - 2)
+    slower = max(0.0, float(np.log2(flight.dt / law.law.dt)) - 2)
     compared = {x: _compared(logged[x], terms[x], x, flight, slower) for x in logged}
     slewed = 0.0 if flight.slewed is None else float(1 - np.mean(flight.slewed))
     return LawCheck(compared, late, slewed=slewed)

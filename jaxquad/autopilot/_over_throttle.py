@@ -20,10 +20,9 @@ from jaxquad.identify import (
 from jaxquad.records import Proposal, Record, RecordWarning
 from jaxquad.records.firmware import firmware_names
 
-from ._files import ParameterChange, propose_changes
 from ._firmware import firmware_named
 from ._flight_channels import FlownAutopilot, IdentifiedPlant
-from ._parameters import find_parameter
+from ._parameters import find_parameter, ParameterChange, propose_changes
 
 
 ReadBeside = Callable[[Mapping[str, Mapping[str, float]]], Sequence[Record]]

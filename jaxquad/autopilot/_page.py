@@ -26,13 +26,12 @@ from jaxquad.report import (
     Table,
 )
 
-from ._files import ParameterChange, WordChange
+from ._filter_bank import gyro_noise, GyroNoise, hann_spectra, NoNoise, SLOWEST
 from ._filters import FilterChain
 from ._firmware import firmware_named
 from ._flight_channels import FlightChannels
-from ._gyro_noise import gyro_noise, GyroNoise, hann_spectra, NoNoise, SLOWEST
 from ._law import RateLoop
-from ._parameters import gains_in, gains_of
+from ._parameters import gains_in, gains_of, ParameterChange, WordChange
 from ._rate_loops import gyro_chain_response, law_paths, StepGrid
 from ._stages import limits_text, Stage, WAYS
 
@@ -85,14 +84,8 @@ def write_pilot_page(path: str | Path, *pages: PilotPage) -> Path:
     """Write one self-contained HTML page on proposals for an autopilot, whole or not at all.
 
     It is made as `jaxquad.report.write_report` makes its page: figures inside it, nothing fetched,
-    texts from a log escaped, and a section or a figure that cannot be computed says why.
-
-    **Arguments:**
-
-    - `path`: of the page.
-    - `pages`: what it shows, one for each axis; the provenance is that of the first.
-
-    **Returns:** the path.
+    texts from a log escaped, and a section or a figure that cannot be computed says why. There is a
+    page for each axis; the provenance is that of the first. Returns the path.
     """
     first, origin = pages[0], pages[0].provenance
     axes = []

@@ -11,11 +11,18 @@ from jaxtyping import Float, Int
 
 from jaxquad._core import announce
 
-from ._files import propose_changes
-from ._filter_bank import filter_choices, FilterBank, noise_growth, Picks, shared_change
+from ._filter_bank import (
+    filter_choices,
+    FilterBank,
+    gyro_noise,
+    GyroNoise,
+    noise_growth,
+    NoNoise,
+    Picks,
+    shared_change,
+)
 from ._firmware import FilterChoice, firmware_named, OuterLoop, Parameter
 from ._flight_channels import FlownAutopilot
-from ._gyro_noise import gyro_noise, GyroNoise, NoNoise
 from ._parameters import (
     ceiling_in,
     FIELDS,
@@ -24,6 +31,7 @@ from ._parameters import (
     gains_of,
     names_by_field,
     parameters_of,
+    propose_changes,
 )
 from ._proposal import AutopilotProposal
 from ._rate_loops import Gains, grouped, OneGains, RateLoops

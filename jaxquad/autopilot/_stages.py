@@ -150,27 +150,10 @@ class FilterVerdict:
         }
 
 
-@runtime_checkable
-class Certified(Protocol):
-    """What gains or parameters give on fresh plants: a `Stage`, or an `ADRCStage`."""
-
-    @property
-    def stable(self) -> float: ...
-    @property
-    def peak(self) -> float: ...
-    @property
-    def resonance(self) -> float: ...
-    @property
-    def crossover(self) -> float: ...
-    @property
-    def noise(self) -> float: ...
-
-
 def beyond_limits(
-    flown: Certified, third: Certified, proposed: Certified, limits: Limits, edge: float, *,
-    loud: float = 1.0,
-) -> list[str]:  # fmt: skip
-    """In words, what is beyond a limit: `edge` of the identified band in rad/s, `loud` of noise."""
+    flown: Any, third: Any, proposed: Any, limits: Limits, edge: float, *, loud: float = 1.0
+) -> list[str]:
+    """In words, what of a `Stage` or `ADRCStage` is beyond a limit, or `edge`, in rad/s."""
     share, hertz, limit = 100 * min(third.stable, proposed.stable), 2 * np.pi, limits.sensitivity
     most, loudest = max(limit, flown.peak), loud * limits.noise
     above = lambda text, value, highest: [text] if value > highest else []

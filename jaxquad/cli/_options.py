@@ -79,11 +79,8 @@ def add_output(
     declared: argparse.ArgumentParser, content: str, *, folder: str = "",
     file: tuple[str, str] | None = None, force: str = _FORCE, quiet: bool = True,
 ) -> None:  # fmt: skip
-    """Options on output, last in the help of a command; `content` is what --json prints.
-
-    `folder` says where the command writes by default; a command that writes a `file` has the
-    placeholder and the help of it instead.
-    """
+    """Options on output, last in the help of a command: `content` is what --json prints, `folder`
+    where the command writes by default, `file` instead placeholder and help of one."""
     add = declared.add_argument_group("output").add_argument
     if folder:
         text = f"where to write; by default {folder}"
@@ -146,10 +143,7 @@ class _NamedOnce(argparse.Action):
 def add_settings(
     declared: argparse.ArgumentParser, settings: Settings, *, only: Mapping[str, str] | None = None
 ) -> None:
-    """Declare an option for each setting; an option that is not given stays out of the result.
-
-    `only` names the settings that are declared, each with its own help or "".
-    """
+    """Declare an option for each setting, or for those in `only`, each with its own help or ""."""
     chosen = {k: o for k, o in settings.options().items() if only is None or k in only}
     used = list(dict.fromkeys(option.group for option in chosen.values()))
     used.sort(key=lambda title: GROUPS.index(title) if title in GROUPS else len(GROUPS))
@@ -186,10 +180,7 @@ def settings_of(options: argparse.Namespace, settings: type[S]) -> S:
 
 
 def start_computing() -> None:
-    """JAX in 64 bits, and programs that are kept for the next call.
-
-    What a command can say without JAX it says before.
-    """
+    """JAX in 64 bits, and programs that are kept; what can be said without JAX is said before."""
     atexit.register(gc.freeze)  # Python's last look for garbage takes half a second
     from jaxquad._compile import enable_compile_cache
     from jaxquad._core import enable_x64

@@ -102,10 +102,8 @@ def run_autopilot(
     options: argparse.Namespace, log: Path, settings: AutopilotSettings, wanted: Path,
     note: str = "",
 ) -> int:  # fmt: skip
-    """Tune the gains of the loop that flew the log, print and write what comes out.
-
-    `{page}` in `note` is the page's path.
-    """
+    """Tune the gains of the loop that flew the log, print and write what comes out; `{page}` in
+    `note` is the page's path."""
     proposal = workflows.autopilot(log, settings)
     with shell.stdout_for_json(options):
         print(in_options(str(proposal)))

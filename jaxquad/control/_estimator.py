@@ -215,9 +215,7 @@ class ProbeTones(eqx.Module):
         other signals excite the loop all the time.
     - `above`, `below`: relative standard deviations; `above=0` keeps the tones on.
 
-    **Raises:**
-
-    - `ValueError`: a frequency is not positive, or `below` is above `above`.
+    **Raises:** `ValueError`: a frequency is not positive, or `below` is above `above`.
     """
 
     frequencies: tuple[float, ...] = eqx.field(static=True, default=(2.0,))  # Hz

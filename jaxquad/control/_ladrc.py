@@ -162,10 +162,8 @@ class LADRC(eqx.Module):
     - `limit`: of |u|, in units of the command.
     - `dt`: the sample interval in s.
 
-    **Raises:**
-
-    - `ValueError`: a gain is not above 0, is too fast for `dt` or does not fit the others' shapes;
-        order, placement or observer is unknown.
+    **Raises:** `ValueError`: a gain is not above 0, is too fast for `dt` or does not fit the
+    others' shapes; order, placement or observer is unknown.
     """
 
     wc: Gain = per_member(rank=1, converter=as_float)  # rad/s

@@ -223,9 +223,8 @@ class LockInInertia(AbstractInertia):
     - `contrast`; `trust`: the relative deviation up to which an estimate is trusted; `drift`: in
         1/sqrt(s); `dt`: in s.
 
-    **Raises:**
-
-    - `ValueError`: a tone does not fit the window or the other tones, or a value is not positive.
+    **Raises:** `ValueError`: a tone does not fit the window or the other tones, or a value is not
+    positive.
     """
 
     tones: ProbeTones = eqx.field(default_factory=ProbeTones)

@@ -50,13 +50,9 @@ class BackCalculation(eqx.Module):
 
     Source: Åström & Hägglund, Advanced PID Control, section 3.5.
 
-    **Arguments:**
+    **Arguments:** `time`: the tracking time in s, usually between kd/kp and kp/ki.
 
-    - `time`: the tracking time in s, usually between kd/kp and kp/ki.
-
-    **Raises:**
-
-    - `ValueError`: the time is not above 0.
+    **Raises:** `ValueError`: the time is not above 0.
     """
 
     time: Gain = per_member(rank=1, converter=as_float)  # s; usually between kd/kp and kp/ki
@@ -194,10 +190,8 @@ class PID(eqx.Module):
         None.
     - `dt`: the sample interval in s.
 
-    **Raises:**
-
-    - `ValueError`: a gain is not finite or does not fit the others' shapes; a filter, the limit or
-        `dt` is not above 0.
+    **Raises:** `ValueError`: a gain is not finite or does not fit the others' shapes; a filter, the
+    limit or `dt` is not above 0.
     """
 
     kp: Gain = per_member(rank=1, converter=as_float)  # per rad
@@ -344,9 +338,7 @@ class PD(eqx.Module):
     - `bandwidth`: of the filter in rad/s.
     - `dt`: the sample interval in s.
 
-    **Raises:**
-
-    - `ValueError`: `dt` or `bandwidth` is not positive.
+    **Raises:** `ValueError`: `dt` or `bandwidth` is not positive.
     """
 
     proportional: Gain = per_member(rank=1, converter=as_float)  # per rad
@@ -373,9 +365,7 @@ class PD(eqx.Module):
     ) -> tuple[PDState, Signal]:
         """One sample: the command to hold until the next one.
 
-        **Raises:**
-
-        - `ValueError`: the reference is a `Setpoint`, which a PD cannot feed forward.
+        **Raises:** `ValueError`: the reference is a `Setpoint`, which a PD cannot feed forward.
         """
         if isinstance(reference, Setpoint):
             raise ValueError(
@@ -405,9 +395,7 @@ def place_pd(
     - `gain`: in rad/s^2 per unit of command, one value per axis.
     - `natural_frequency`: in rad/s; `damping`: its ratio; `dt`: the sample interval in s.
 
-    **Returns:**
-
-    The controller.
+    **Returns:** The controller.
     """
     gain = as_float(gain)
     if is_concrete(gain):

@@ -172,9 +172,8 @@ class WindowedInertia(AbstractRegression):
     - `excitation`: in rad/s^2 rms; `correlation`: in s; `trust`; `drift`: in 1/sqrt(s).
     - `dt`: in s.
 
-    **Raises:**
-
-    - `ValueError`: a value is not positive, an option is unknown, or the window is too short.
+    **Raises:** `ValueError`: a value is not positive, an option is unknown, or the window is too
+    short.
     """
 
     window: float = eqx.field(static=True, default=5.0)  # s
@@ -240,13 +239,11 @@ class RecursiveInertia(AbstractRegression):
     6 % where nothing moves the counts): tests/benchmarks/inertia_study.py.
     Source: Eq. (19) and (24) of the paper, corrected; docs/control.md.
 
-    **Arguments:**
+    **Arguments:** `memory`: in s, 100 samples or more. All others are those of
+    `jq.control.WindowedInertia`.
 
-    - `memory`: in s, 100 samples or more. All others are those of `jq.control.WindowedInertia`.
-
-    **Raises:**
-
-    - `ValueError`: a value is not positive, an option is unknown, or the memory is too short.
+    **Raises:** `ValueError`: a value is not positive, an option is unknown, or the memory is too
+    short.
     """
 
     memory: float = eqx.field(static=True, default=3.0)  # s
@@ -304,9 +301,7 @@ def paper_inertia(
     - `J_n`: the nominal inertia in kg m^2.
     - `dt`: the sample interval in s.
 
-    **Returns:**
-
-    The estimate of J_x.
+    **Returns:** The estimate of J_x.
     """
     q0_dot = jnp.diff(q0) / dt
     M_c = J_n * q0_dot - q1[1:]  # (18)

@@ -66,9 +66,7 @@ class FuzzyMap(eqx.Module):
     - `centres`: of the sets, two or more values of delta that rise.
     - `increments`: of b0, one for each set.
 
-    **Raises:**
-
-    - `ValueError`: the centres do not rise, or an increment leaves no b0 above 0.
+    **Raises:** `ValueError`: the centres do not rise, or an increment leaves no b0 above 0.
     """
 
     nominal: Gain = per_member(rank=1, converter=as_float)  # kg m^2
@@ -166,9 +164,7 @@ class InertiaMap(eqx.Module):
     - `knots`: ln(J / nominal), two or more values that rise.
     - `values`: ln b0 at each knot, `[knots]`, `[knots, axes]` or `[knots, axes, *ensemble]`.
 
-    **Raises:**
-
-    - `ValueError`: the knots do not rise, or the shapes do not fit.
+    **Raises:** `ValueError`: the knots do not rise, or the shapes do not fit.
     """
 
     nominal: Gain = per_member(rank=1, converter=as_float)  # kg m^2; axes *ensemble
@@ -236,13 +232,7 @@ def certainty_equivalence(
     - `knots`: how many.
     - `factor`: with a lag in the loop a value above 1 is better, about 1.8 for 20 ms.
 
-    **Returns:**
-
-    An `InertiaMap`.
-
-    **Raises:**
-
-    - `ValueError`: a value is not positive, or the span is not one.
+    **Raises:** `ValueError`: a value is not positive, or the span is not one.
     """
     torque_gain, nominal = as_float(torque_gain), as_float(nominal)
     require_positive("torque_gain", torque_gain, "give N m per unit of command, L Kf of the Hover")
@@ -411,9 +401,7 @@ class AdaptiveLADRC(_ScheduledByMap):
     - `map`: from an inertia in kg m^2 to b0, such as `certainty_equivalence(..)`.
     - `settling`: in s.
 
-    **Raises:**
-
-    - `ValueError`: the estimator was made for another `dt`, or the ladrc is of order 1.
+    **Raises:** `ValueError`: the estimator was made for another `dt`, or the ladrc is of order 1.
     """
 
     ladrc: LADRC | LADRCLaw

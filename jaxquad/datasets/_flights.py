@@ -16,22 +16,13 @@ _RAW = "https://raw.githubusercontent.com"
 
 
 class DataFile(NamedTuple):
-    """A published file.
+    """A published file."""
 
-    **Arguments:**
-
-    - `folder`: of the data set, within the folder that `JAXQUAD_DATA` names.
-    - `name`: of the file in it.
-    - `origin`: where its publisher has it; an address that ends with the file can be downloaded.
-    - `sha256`: of its bytes; empty where nobody has taken it, and then it is not downloaded.
-    - `others`: names of the same flight in other formats, which count as well.
-    """
-
-    folder: str
+    folder: str  # of the data set, within the folder that JAXQUAD_DATA names
     name: str
-    origin: str
-    sha256: str = ""
-    others: tuple[str, ...] = ()
+    origin: str  # an address; one that ends with the file can be downloaded
+    sha256: str = ""  # empty where nobody has taken it, and then it is not downloaded
+    others: tuple[str, ...] = ()  # names of the same flight in other formats, which count as well
 
 
 _ANTX = "https://github.com/MattiaDiMauro/Model-identification-and-state-estimation-for-a-multirotor-UAV"
@@ -40,55 +31,43 @@ _CRAZYFLIE = (
 )
 _BLACKBOX = "ilya-epifanov/fc-blackbox/de08350b2bd95f7af93b1b4adf0f27dc3dfd227a"
 _CESSNA = "xuhao1/pyAircraftIden/0aebfb7db67d1ccc258844914a56141242975ce6"
+_SWEEP = "sweep_data_2017_12_10_19_05.npy"
 _CRAZYPAD = "AerialRoboticsUUST/CrazyPAD/5448265fa1bbb3ce983a73a9336cc6e887886360"
 
 
-def _hover(name: str, sha256: str) -> DataFile:
-    path = f"{_CRAZYPAD}/data/controller_data/normal_flight/{name}"
-    return DataFile("crazypad_hover", name, f"{_RAW}/{path}", sha256)
-
+_HOVERS = {
+    "E8_log00": "f53df39f807f3ffdeab37efa3a2a463a239a4d79703c92a8a93db1fe24001510",
+    "E8_log01": "fea67514d5960352ce7944dd7a07eff22aa19e9118446c39382b9f7d3ab53b70",
+    "E9_log00": "358100a9845755841fa0ab1febc8238e8d0a6515ff387b5b6a2bba0c3aaeb904",
+}
+_NORMAL = f"{_RAW}/{_CRAZYPAD}/data/controller_data/normal_flight"
 
 FILES: Mapping[str, DataFile] = {
     "antx_pitch prbs": DataFile(
-        "antx_pitch",
-        "log_3_2024-5-22-17-30-40_2dd (1).mat",
-        _ANTX,
+        "antx_pitch", "log_3_2024-5-22-17-30-40_2dd (1).mat", _ANTX,
         others=("antx_log3_prbs.npz",),
     ),
     "antx_pitch sweep": DataFile(
-        "antx_pitch",
-        "log_2_2024-5-22-17-28-50_2dd (1).mat",
-        _ANTX,
+        "antx_pitch", "log_2_2024-5-22-17-28-50_2dd (1).mat", _ANTX,
         others=("antx_log2_sweep.npz",),
     ),
     "crazyflie_rollpitch": DataFile(
-        "crazyflie_rollpitch",
-        "log15",
-        f"{_RAW}/{_CRAZYFLIE}/logs_crazyflie/log15",
+        "crazyflie_rollpitch", "log15", f"{_RAW}/{_CRAZYFLIE}/logs_crazyflie/log15",
         "364dea627205f4eee3e8d54f72b0ba8fd93442dcea9c8cc4a42b59004ecf3a31",
     ),
     "betaflight_ar8": DataFile(
-        "betaflight_ar8",
-        "LOG00037.BFL",
-        f"{_RAW}/{_BLACKBOX}/src/test-data/LOG00037.BFL",
+        "betaflight_ar8", "LOG00037.BFL", f"{_RAW}/{_BLACKBOX}/src/test-data/LOG00037.BFL",
         "5fb78729580c414f41654d3b2103417088a972c9049ce873303835fc5c66c8f2",
     ),
     "cessna_xplane": DataFile(
-        "cessna_xplane",
-        "sweep_data_2017_12_10_19_05.npy",
-        f"{_RAW}/{_CESSNA}/data/sweep_data_2017_12_10_19_05.npy",
+        "cessna_xplane", _SWEEP, f"{_RAW}/{_CESSNA}/data/{_SWEEP}",
         "8f64fc161750af94febf9f5da4cb5a1ecc47d09ce039e8c79e13aa8c8d85df38",
     ),
-    "crazypad_hover E8_log00": _hover(
-        "E8_log00", "f53df39f807f3ffdeab37efa3a2a463a239a4d79703c92a8a93db1fe24001510"
-    ),
-    "crazypad_hover E8_log01": _hover(
-        "E8_log01", "fea67514d5960352ce7944dd7a07eff22aa19e9118446c39382b9f7d3ab53b70"
-    ),
-    "crazypad_hover E9_log00": _hover(
-        "E9_log00", "358100a9845755841fa0ab1febc8238e8d0a6515ff387b5b6a2bba0c3aaeb904"
-    ),
-}
+    **{
+        f"crazypad_hover {name}": DataFile("crazypad_hover", name, f"{_NORMAL}/{name}", sha256)
+        for name, sha256 in _HOVERS.items()
+    },
+}  # fmt: skip
 
 
 def locate(file: DataFile) -> Path:
@@ -161,10 +140,7 @@ def antx_pitch(flight: Literal["prbs", "sweep"] = "prbs") -> Record:
 
     - `flight`: "prbs" to identify, "sweep" to verify.
 
-    **Raises:**
-
-    - `ReadError`: as `jq.datasets.locate`. Its publisher's file has no known checksum: it is not
-        downloaded.
+    Its publisher's file has no known checksum: it is not downloaded.
     """
     path = locate(FILES[f"antx_pitch {flight}"])
     start, stop = {"prbs": (50.0, 76.0), "sweep": (132.8, 158.0)}[flight]
@@ -191,10 +167,6 @@ def crazyflie_rollpitch(axis: Literal["roll", "pitch"] = "roll") -> Record:
     **Arguments:**
 
     - `axis`: "roll" or "pitch".
-
-    **Raises:**
-
-    - `ReadError`: as `jq.datasets.locate`.
     """
     rate = {"roll": {"p": {"gyro.x": _RADIANS}}, "pitch": {"q": {"gyro.y": _RADIANS}}}[axis]
     motors = [f"motor.m{k}" for k in (1, 2, 3, 4)]
@@ -217,10 +189,6 @@ def betaflight_ar8(axis: Literal["roll", "pitch", "yaw"] = "pitch") -> Record:
     **Arguments:**
 
     - `axis`: "roll", "pitch" or "yaw".
-
-    **Raises:**
-
-    - `ReadError`: as `jq.datasets.locate`.
     """
     k = _AXES.index(axis)
     return read(
@@ -245,10 +213,6 @@ def crazypad_hover(
 
     - `flight`: one of three.
     - `axis`: "roll", "pitch" or "yaw".
-
-    **Raises:**
-
-    - `ReadError`: as `jq.datasets.locate`.
     """
     rate, group = _RATES[_AXES.index(axis)], "fixedFrequency.controller"
     return read(
@@ -264,10 +228,6 @@ def cessna_xplane() -> Record:
 
     Open loop, a sweep of 290 s, logged every 20 to 50 ms and resampled to 40 Hz. CIFER's numbers
     for it are in `fits/cessna_navfit.py`. Licence: MIT, by the README of its publisher.
-
-    **Raises:**
-
-    - `ReadError`: as `jq.datasets.locate`.
     """
     return read(
         locate(FILES["cessna_xplane"]),

@@ -2,13 +2,11 @@
 
 from ._excitation import (
     check_guidelines as check_guidelines,
+    check_lines as check_lines,
+    doublet as doublet,
     Excitation as Excitation,
     Guideline as Guideline,
     Guidelines as Guidelines,
-)
-from ._signals import (
-    check_lines as check_lines,
-    doublet as doublet,
     harmonics as harmonics,
     multisine as multisine,
     sweep as sweep,

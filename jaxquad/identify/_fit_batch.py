@@ -9,7 +9,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Complex, Float, Int, PyTree
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from jaxquad._compile import evaluate_once, Jit
 from jaxquad._core import (
@@ -77,6 +77,11 @@ class Batch(NamedTuple):
     hold: float  # s
     omega: Float[Numbers, " frequencies"]
 
+    @property
+    def evaluates_singly(self) -> bool:
+        """Whether members are evaluated one after the other: a `jq.StateSpace` without ties."""
+        return type(self.model) is StateSpace and not self.parameters.ties and not self.hold
+
 
 Active = Bool[Array, " members"]
 Evaluate = Callable[[Float[Array, "parameters members"], Active], Normal]
@@ -89,14 +94,9 @@ def normal_equations_of(batch: Batch, member: Member) -> Evaluate:
     its states are a loop of their own. Any other model of plain arithmetic becomes one kernel, at a
     quarter of the cost of what evaluates the rest: at all frequencies at once.
     """
-    if evaluates_singly(batch):
+    if batch.evaluates_singly:
         return _one_by_one(batch, member)
     return lambda z, active: _at_all_frequencies(batch, z, member)
-
-
-def evaluates_singly(batch: Batch) -> bool:
-    """Whether members are evaluated one after the other: a `jq.StateSpace` without ties."""
-    return type(batch.model) is StateSpace and not batch.parameters.ties and not batch.hold
 
 
 def _one_by_one(batch: Batch, member: Member) -> Evaluate:
@@ -211,7 +211,7 @@ def _insert(model: PyTree, parameters: Parameters, z: list[Float[Array, ""]]) ->
     return model
 
 
-def _write(model: PyTree, places: tuple[Place, ...], values: list[Float[Array, ""]]) -> PyTree:
+def _write(model: PyTree, places: tuple[Place, ...], values: list[Array]) -> PyTree:
     arrays, rest = eqx.partition(model, eqx.is_inexact_array)
     leaves, structure = jax.tree.flatten(arrays)
     for leaf in {place.leaf for place, _ in zip(places, values, strict=False)}:
@@ -243,48 +243,16 @@ class BatchSolution(NamedTuple):
 Mixings = Sequence[Mixing | None]
 
 
-def solve_batch(
-    model: PyTree,
-    parameters: Parameters,
-    omega: Float[Numbers, " frequencies"],
-    measured: Complex[Numbers, "batch frequencies outputs inputs"],
-    weights: Float[Numbers, "..."],
-    *,
-    mixings: Mixings = (),
-    start: Float[Numbers, "batch parameters"] | None = None,
-    hold: float = 0.0,
-    max_steps: int = 64,
-    tolerance: float = TOLERANCE,
-) -> BatchSolution:
-    """Fit every response of the batch, by Levenberg-Marquardt.
+def _members(measured: np.ndarray, weights: np.ndarray, mixings: Mixings) -> Member:
+    """What the members are fitted to, which are on the first axis.
 
-    `weights` (batch, frequencies, outputs, inputs, 2) are those of `ln|T/T^|` and of the wrapped
-    phase of `T/T^` in rad, as of `jq.fit`, 0 where a point does not count; `mixings`, one for each
-    member or none at all, take points together that share noise. All start from the model's values,
-    or from `start`. The model is evaluated at all frequencies at once, inputs held for `hold` s
-    (0: not held). A member that did not reach a stationary point has `converged` false, and its
-    decrement says how far it is; one in a local minimum shows by its cost alone.
-    Raises ValueError for shapes that do not match, no batch at all, or a response that at one
-    frequency depends on which others are asked for.
+    `mixings`, one for each member or none at all, take points together that share noise.
     """
-    if measured.shape[0] == 0 or (*measured.shape, 2) != weights.shape:
+    if (*measured.shape, 2) != weights.shape:
         raise ValueError(
             f"measured has shape {measured.shape} and weights {weights.shape}: give at least one "
             "response (batch, frequencies, outputs, inputs), and weights with a last axis of two"
         )
-    omega = np.asarray(omega)
-    where = Batch(model, parameters, hold, _pad(omega))
-    _check_pointwise(where, measured.shape[2:])
-    members = _members(np.asarray(measured), np.asarray(weights), mixings)
-    if start is None:
-        start = np.broadcast_to(
-            parameters.start[: parameters.count], (len(measured), parameters.count)
-        )
-    return _solve_calls(where, members, np.asarray(start), max_steps, tolerance)
-
-
-def _members(measured: np.ndarray, weights: np.ndarray, mixings: Mixings) -> Member:
-    """What the members are fitted to, which are on the first axis."""
     used = np.any(weights > 0, axis=-1)
     # Points that do not count may hold anything, NaN included.
     with np.errstate(invalid="ignore"):
@@ -311,18 +279,13 @@ def _members(measured: np.ndarray, weights: np.ndarray, mixings: Mixings) -> Mem
     return Member(parts, weights, split(factors), split(across) if pairs > 1 else None)
 
 
-def _padded(size: int) -> int:
-    """The frequencies of a program that takes this many: few lengths, few programs."""
-    step = max(8, 1 << max((size - 1).bit_length() - 3, 0))
-    return size + -size % step
-
-
 def _pad(array: np.ndarray, axis: int = 0) -> np.ndarray:
-    """Filled up with the last frequency; the array itself where it is full."""
+    """Filled up with the last frequency: few lengths, few programs. The array where it is full."""
     size = array.shape[axis]
-    if _padded(size) == size:
+    step = max(8, 1 << max((size - 1).bit_length() - 3, 0))
+    if not size % step:
         return array
-    return np.take(array, np.minimum(np.arange(_padded(size)), size - 1), axis)
+    return np.take(array, np.minimum(np.arange(size + -size % step), size - 1), axis)
 
 
 @eqx.filter_jit
@@ -350,9 +313,8 @@ def _places(batch: int, chunk: int) -> Int[np.ndarray, "chunks chunk"]:
     return np.minimum(np.arange(batch + -batch % chunk), batch - 1).reshape(-1, chunk)
 
 
-def _solve_calls(
-    where: Batch, members: Member, start: np.ndarray, max_steps: int, tolerance: float
-) -> BatchSolution:
+def _solve(where: Batch, members: Member, start: np.ndarray, max_steps: int) -> BatchSolution:
+    """Fit every member from its start, by Levenberg-Marquardt."""
     chunks = _CHUNKS if members.factor is None else 1  # factors are large
 
     def solve(places: Int[np.ndarray, "chunks chunk"]) -> BatchSolution:
@@ -364,11 +326,10 @@ def _solve_calls(
             return filled
 
         mine, z0 = jax.tree.map(arrange, (members, start))
-        options = np.asarray(len(places)), np.asarray(max_steps), tolerance
-        parts = _solve_call(where, mine, z0, *options)
+        parts = _solve_call(where, mine, z0, np.asarray(len(places)), np.asarray(max_steps))
         return BatchSolution(*(np.asarray(part)[: places.size] for part in parts))
 
-    places = _places(len(start), _CHUNK_OF_SINGLES if evaluates_singly(where) else _CHUNK)
+    places = _places(len(start), _CHUNK_OF_SINGLES if where.evaluates_singly else _CHUNK)
     count = max(-(-len(places) // chunks), min(len(places), available_cores()))
     calls = np.array_split(places, count)
     if len(calls) > 1:
@@ -381,14 +342,14 @@ def _solve_calls(
 
 
 @Jit
-def _solve_call(where, members, z0, chunks, max_steps, tolerance) -> BatchSolution:
+def _solve_call(where, members, z0, chunks, max_steps) -> BatchSolution:
     """Solve the first `chunks` of the chunks that there is room for."""
 
     def chunk(k):
         mine, start = jax.tree.map(
             lambda x: jax.lax.dynamic_index_in_dim(x, k, keepdims=False), (members, z0)
         )
-        return _descend(normal_equations_of(where, mine), start, max_steps, tolerance)
+        return _descend(normal_equations_of(where, mine), start, max_steps)
 
     def add(k, total):
         return jax.tree.map(lambda out, x: out.at[k].set(x), total, chunk(k))
@@ -400,7 +361,7 @@ def _solve_call(where, members, z0, chunks, max_steps, tolerance) -> BatchSoluti
     return BatchSolution(z, jax.vmap(where.parameters.values)(z), *facts)
 
 
-def _descend(evaluate: Evaluate, z0: Array, max_steps: Array, tolerance: float) -> tuple:
+def _descend(evaluate: Evaluate, z0: Array, max_steps: Array) -> tuple:
     """Where members stop, with the cost, what is left to save, steps, and whether they converged.
 
     As `minimise` does, and with one evaluation at the end, in the same loop: it compiles once.
@@ -412,7 +373,7 @@ def _descend(evaluate: Evaluate, z0: Array, max_steps: Array, tolerance: float) 
         ended = ~jnp.any(active)
         state = state._replace(change=jnp.where(ended, 0.0, state.change))
         normal = evaluate(state.z + state.change, active | ended)
-        return advance(lambda _: normal, state, max_steps, tolerance), normal, ended
+        return advance(lambda _: normal, state, max_steps, TOLERANCE), normal, ended
 
     start = begin(z0)
     walk = start, start.normal, jnp.asarray(False)
@@ -485,10 +446,6 @@ def fit_batch(
     - `frfs`: responses on the same frequencies, with the same channels.
     - `band`: (low, high) in rad/s.
 
-    **Returns:**
-
-    `jq.identify.BatchFit`.
-
     **Raises:**
 
     - `ValueError`: responses on different frequencies or channels, or without a usable frequency.
@@ -536,12 +493,15 @@ def fit_batch(
     weights, mixed = weights_at(np.ones(measured.shape)), isinstance(cost, MaximumLikelihood)
     # Without a floor on the errors, they do not depend on the weights.
     mixings = mixings_of(points, list(weights)) if mixed else ()
-    options = {"mixings": mixings, "hold": holds[0], "max_steps": max_steps}
-    solution = solve_batch(model, parameters, omega, measured, weights, **options)
-    again = weights_at(_ratios(Batch(model, parameters, holds[0], _pad(omega)), measured, solution))
+    where = Batch(model, parameters, holds[0], _pad(omega))
+    _check_pointwise(where, measured.shape[2:])
+    start = parameters.start[: parameters.count]
+    start = np.array(np.broadcast_to(start, (len(measured), parameters.count)))
+    solution = _solve(where, _members(measured, weights, mixings), start, max_steps)
+    again = weights_at(_ratios(where, measured, solution))
     if not np.allclose(weights, again, rtol=1e-4):
         weights, start = again, np.where(np.isfinite(solution.z), solution.z, 0.0)
-        solution = solve_batch(model, parameters, omega, measured, weights, start=start, **options)
+        solution = _solve(where, _members(measured, weights, mixings), start, max_steps)
     return BatchFit(
         parameters.names, *(np.asarray(part) for part in solution[1:]),
         model=model, parameters=parameters, points=tuple(points), weights=weights,

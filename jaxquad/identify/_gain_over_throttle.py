@@ -116,14 +116,10 @@ def gain_over_throttle(
     - `estimator`: as in `jq.frequency_response`; by default local polynomials, with a reference
         by the joint method and without a rational model of the whole record.
 
-    **Returns:**
+    **Returns:** A `jq.identify.GainOverThrottle`: gains, thrust curve, the firmwares' parameters.
 
-    A `jq.identify.GainOverThrottle`: gains, thrust curve, the firmwares' parameters.
-
-    **Raises:**
-
-    - `ValueError`: the records lack the channels, the throttle leaves 0 to 1, or it stayed at no
-        level with an excitation.
+    **Raises:** `ValueError`: the records lack the channels, the throttle leaves 0 to 1, or it
+    stayed at no level with an excitation.
 
     !!! example
 
@@ -177,13 +173,7 @@ def throttle_levels(
 ) -> ThrottleLevels:
     """The levels of throttle with an excitation, as `gain_over_throttle` finds them.
 
-    **Arguments:** as there.
-
-    **Returns:** a `jq.identify.ThrottleLevels`.
-
-    **Raises:**
-
-    - `ValueError`: as there.
+    Arguments and errors are those; the result is a `jq.identify.ThrottleLevels`.
     """
     records = [record] if isinstance(record, Record) else list(record)
     _check(records, throttle_range, 0.0, width, shortest)

@@ -170,8 +170,6 @@ def measured_chain(
     - `reference`: a signal that moves the vehicle and that no noise of the gyro reaches.
     - `names`: of both signals, for print.
 
-    **Returns:** a `MeasuredChain`.
-
     **Raises:** ValueError for signals of other lengths, and for those that show no ratio.
     """
     size = int(round(_SECONDS / dt))

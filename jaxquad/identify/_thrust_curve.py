@@ -76,18 +76,12 @@ def _cubic(curve: float) -> float:
 def curve_of_parameter(firmware: CurveFirmware, value: float | int) -> float:
     """f of the thrust curve that a firmware inverts with this value of its parameter.
 
-    It is the inverse of `GainOverThrottle.firmware_value`.
-
-    **Arguments:**
-
-    - `firmware`: as there.
-    - `value`: of THR_MDL_FAC, MOT_THST_EXPO or thrust_linear.
+    It is the inverse of `GainOverThrottle.firmware_value`: `value` is that of THR_MDL_FAC,
+    MOT_THST_EXPO or thrust_linear.
 
     **Returns:** -1 to 1; for thrust_linear beyond what a curve of this family can be, the nearest.
 
-    **Raises:**
-
-    - `ValueError`: for another firmware.
+    **Raises:** ValueError for another firmware.
     """
     share = float(value) / _parameter(firmware)[1]
     if firmware == "betaflight 2025.12":
@@ -101,19 +95,12 @@ B0_POWERS: Mapping[B0Law, float] = {"FIXED": 0.0, "SQRT": 0.5, "LINEAR": 1.0, "Q
 
 
 class B0Schedule(NamedTuple):
-    """How Betaflight's proposed ADRC scales b0 over the throttle.
+    """How Betaflight's proposed ADRC scales b0 over the throttle."""
 
-    **Arguments:**
-
-    - `law`: adrc_b0_law.
-    - `hover`: adrc_hover_throttle, 0 to 1, where the scale is 1.
-    - `low`, `high`: adrc_b0_scale_min and adrc_b0_scale_max, as factors.
-    """
-
-    law: B0Law
-    hover: float
-    low: float = 1.0
-    high: float = 3.0
+    law: B0Law  # adrc_b0_law
+    hover: float  # adrc_hover_throttle, 0 to 1, where the scale is 1
+    low: float = 1.0  # adrc_b0_scale_min, as a factor
+    high: float = 3.0  # adrc_b0_scale_max
 
     def scale(self, throttle: Float[ArrayLike, "..."]) -> Float[np.ndarray, "..."]:
         """The factor on b0 at a throttle of 0 to 1."""
@@ -159,18 +146,12 @@ class GainBand(NamedTuple):
 
 
 class ThrottleLevels(NamedTuple):
-    """Levels of throttle at which records hold an excitation, the lowest first.
+    """Levels of throttle at which records hold an excitation, the lowest first."""
 
-    **Attributes:**
-
-    - `throttle`: mean of each level, 0 to 1; `low`, `high`: of the throttle within it.
-    - `seconds`: flown at each.
-    """
-
-    throttle: Levels
-    low: Levels
+    throttle: Levels  # mean of each level, 0 to 1
+    low: Levels  # of the throttle within it
     high: Levels
-    seconds: Levels
+    seconds: Levels  # flown at each
 
     def what_to_fly(self) -> str:
         """In words, for gains at other throttles; empty where there are several levels."""
@@ -236,9 +217,7 @@ class GainOverThrottle(eqx.Module):
     def b0(self, level: int) -> Combination:
         """gain / lag at one level, in the output's unit per s^2 and unit of input.
 
-        **Raises:**
-
-        - `UndeterminedError`: the record does not tell the lag from the delay.
+        **Raises:** UndeterminedError if the record does not tell the lag from the delay.
         """
         self._require_lag()
         name = f"b0 at {self.throttle[level]:.2f}"
@@ -266,41 +245,25 @@ class GainOverThrottle(eqx.Module):
     def over(self, throttle: Float[ArrayLike, " points"]) -> GainBand:
         """The gain by the thrust curve, at any throttle.
 
-        **Raises:**
-
-        - `UndeterminedError`: fewer than two levels were flown.
+        **Raises:** UndeterminedError for fewer than two levels.
         """
         return self._band(throttle, over_lag=False)
 
     def b0_over(self, throttle: Float[ArrayLike, " points"]) -> GainBand:
-        """gain / lag by the thrust curve, at any throttle; as `b0`.
-
-        **Raises:**
-
-        - `UndeterminedError`: as `over`, and as `b0`.
-        """
+        """gain / lag by the thrust curve, at any throttle; raises as `over` and `b0`."""
         self._require_lag()
         return self._band(throttle, over_lag=True)
 
     def draw(
         self, throttle: Float[ArrayLike, " throttles"], plants: int, *, seed: int = 0
     ) -> PlantsOverThrottle:
-        """Draw plants from what the record leaves uncertain; each follows a thrust curve.
+        """Draw so many plants from what the record leaves uncertain, at a throttle of 0 to 1.
 
-        **Arguments:**
-
-        - `throttle`: 0 to 1.
-        - `plants`: how many.
-
-        **Returns:**
-
-        A `PlantsOverThrottle`.
-
-        **Raises:**
-
-        - `UndeterminedError`: as `over`, and as `b0`.
+        Each follows a thrust curve. Raises as `over` and `b0`.
         """
-        line = self._require_line()
+        line = self._line()
+        if line is None:
+            raise UndeterminedError(self.what_to_fly())
         self._require_lag()
         scores = np.random.default_rng(seed).standard_normal((len(self.fit.names), plants))
         models = draw_models(self.fit, jnp.asarray(scores))
@@ -313,11 +276,9 @@ class GainOverThrottle(eqx.Module):
     def firmware_value(self, firmware: CurveFirmware) -> FirmwareValue:
         """The parameter with which a firmware makes the gain the same at every throttle.
 
-        **Arguments:**
-
-        - `firmware`: `"px4"` (THR_MDL_FAC), `"ardupilot"` (MOT_THST_EXPO), `"betaflight"`
-            (thrust_linear from 2026.6 on) or `"betaflight 2025.12"`, whose thrust_linear
-            t (1 + e (1 - t)^2) is fitted to the inverse curve by least squares over 0 to 1.
+        **Arguments:** `firmware`: `"px4"` (THR_MDL_FAC), `"ardupilot"` (MOT_THST_EXPO),
+        `"betaflight"` (thrust_linear from 2026.6 on) or `"betaflight 2025.12"`, whose thrust_linear
+        t (1 + e (1 - t)^2) is fitted to the inverse curve by least squares over 0 to 1.
 
         **Raises:**
 
@@ -484,12 +445,6 @@ class GainOverThrottle(eqx.Module):
         probability = float(chdtrc(n - 2, misfit)) if n > 2 else 1.0
         return _Line(ends, gather * scale, misfit, probability)
 
-    def _require_line(self) -> _Line:
-        line = self._line()
-        if line is None:
-            raise UndeterminedError(self.what_to_fly())
-        return line
-
     def _rows(self, throttle: Float[ArrayLike, "..."]) -> Float[np.ndarray, "... 2"]:
         """The gain at a throttle is this times the line's ends."""
         x = actuator(throttle, self.flown)
@@ -506,7 +461,9 @@ class GainOverThrottle(eqx.Module):
 
     def _by_curve(self, throttle: float, *, over_lag: bool) -> Combination:
         """The gain at a throttle, or gain / lag."""
-        line, lag = self._require_line(), self.fit["lag"] if over_lag else 1.0
+        line, lag = self._line(), self.fit["lag"] if over_lag else 1.0
+        if line is None:
+            raise UndeterminedError(self.what_to_fly())
         row = self._rows(throttle)
         value, by_gain = float(row @ line.ends) / lag, row @ line.weights / lag
         by_lag = -float(row @ line.ends) / lag**2 if over_lag else 0.0
@@ -530,14 +487,14 @@ class GainOverThrottle(eqx.Module):
             )
 
 
+_AS_WELL = "{:.2f} and {:.2f} as well"
+
+
 def _advise_flight(middle: float, span: float, seconds: float, words: str) -> str:
     lower = float(np.clip(middle - span / 2, 0.15, 0.85 - min(span, 0.7)))
     turns = ", in turns of about 8 s, as the vehicle sinks or climbs" if seconds > 10 else ""
     levels = words.format(lower, min(lower + span, 0.85))
     return f"fly {levels}, with the same excitation for {seconds:.0f} s at each{turns}"
-
-
-_AS_WELL = "{:.2f} and {:.2f} as well"
 
 
 def _reach(number: Combination) -> float:

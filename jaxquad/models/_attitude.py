@@ -143,9 +143,7 @@ class Attitude(eqx.Module):
     - `coulomb`: the dry friction of the bearings in N m, coulomb * tanh(rate / 0.01 rad/s); None
         leaves it out.
 
-    **Raises:**
-
-    - `ValueError`: an inertia is not positive, or a value is not finite.
+    **Raises:** `ValueError`: an inertia is not positive, or a value is not finite.
     """
 
     inertia: PerAxis = per_member(rank=1, converter=as_float)
@@ -243,10 +241,8 @@ class DecoupledAxes(eqx.Module):
     - `lag`: of the motors in s; None leaves it out.
     - `damping`: in N m s/rad; `stiffness`: in N m/rad; `coulomb`: in N m, None leaves it out.
 
-    **Raises:**
-
-    - `ValueError`: an inertia, torque gain or lag is not positive, friction is not finite, or the
-        shapes do not match.
+    **Raises:** `ValueError`: an inertia, torque gain or lag is not positive, friction is not
+    finite, or the shapes do not match.
     """
 
     torque_gain: Axes = per_member(rank=1, converter=_per_axis)

@@ -56,9 +56,7 @@ def state_space(model: TransferFunction) -> StateSpace:
     The states are those of `realise`. A direct passage from input to output, which H0 x + H1 x'
     does not have, becomes a share of x'.
 
-    **Raises:**
-
-    - `ValueError`: the model is a pure gain, which has no states.
+    **Raises:** `ValueError`: the model is a pure gain, which has no states.
     """
     A, B, C, D = realise(model)
     if not len(A):
@@ -77,14 +75,10 @@ def state_space(model: TransferFunction) -> StateSpace:
 def series(first: StateSpace, second: StateSpace) -> StateSpace:
     """Two models in series: the outputs of `first` drive the inputs of `second`.
 
-    **Returns:**
+    **Returns:** The model whose response is that of `second` times that of `first`.
 
-    The model whose response is that of `second` times that of `first`.
-
-    **Raises:**
-
-    - `ValueError`: the numbers of outputs and inputs differ, or several signals between the two
-        models have different delays, which no delay of an input or output can replace.
+    **Raises:** `ValueError`: the numbers of outputs and inputs differ, or several signals between
+    the two models have different delays, which no delay of an input or output can replace.
     """
     produced, taken = first.H0.shape[0], second.G.shape[1]
     if produced != taken:
@@ -167,19 +161,13 @@ def from_control(system: HasCoefficients | HasMatrices) -> TransferFunction | St
         model = jq.models.from_control(control.tf([10.0], [1.0, 4.0, 0.0]))
         ```
 
-    **Arguments:**
+    **Arguments:** `system`: a `TransferFunction` or a `StateSpace` of python-control or
+    scipy.signal. Neither has delays: put them in with `dataclasses.replace`.
 
-    - `system`: a `TransferFunction` or a `StateSpace` of python-control or scipy.signal. Neither
-        has delays: put them in with `dataclasses.replace`.
+    **Returns:** A `jq.TransferFunction` for a ratio of polynomials with one input and one output,
+    otherwise a `jq.StateSpace`.
 
-    **Returns:**
-
-    A `jq.TransferFunction` for a ratio of polynomials with one input and one output, otherwise a
-    `jq.StateSpace`.
-
-    **Raises:**
-
-    - `ValueError`: the system is sampled, improper, or of another kind.
+    **Raises:** `ValueError`: the system is sampled, improper, or of another kind.
     """
     if isinstance(system, HasMatrices):
         require_continuous(system.dt)

@@ -65,9 +65,7 @@ class Allocation(eqx.Module):
         "crazyflie", an "x": forward, left, up; front right, back right, back left, front left.
     - `input`: the "voltage" of a motor, or its squared speed "omega2".
 
-    **Raises:**
-
-    - `ValueError`: convention or input is unknown, or a value is not positive.
+    **Raises:** `ValueError`: convention or input is unknown, or a value is not positive.
     """
 
     arm: Float[Array, "..."] = per_member(rank=0, converter=as_float)  # L
@@ -152,13 +150,9 @@ def _product(matrix: np.ndarray, vectors: Float[Array, " n *ensemble"]) -> Array
 class MotorLag(eqx.Module):
     """Motor and propeller as a first-order lag from the commanded to the effective input.
 
-    **Arguments:**
+    **Arguments:** `time_constant`: in s, one value or `[*ensemble]`.
 
-    - `time_constant`: in s, one value or `[*ensemble]`.
-
-    **Raises:**
-
-    - `ValueError`: the time constant is not positive. A motor without lag has no state.
+    **Raises:** `ValueError`: the time constant is not positive. A motor without lag has no state.
     """
 
     time_constant: Float[Array, "*ensemble"] = per_member(rank=0, converter=as_float)  # s
@@ -202,10 +196,8 @@ class Multirotor(eqx.Module):
     - `attitude`: the rigid body; `allocation`: from inputs to torques.
     - `motor`: the lag of the motors, or None for none.
 
-    **Raises:**
-
-    - `ValueError`: the attitude has a rotor inertia, but the inputs are voltages, which do not
-        determine the rotor speeds.
+    **Raises:** `ValueError`: the attitude has a rotor inertia, but the inputs are voltages, which
+    do not determine the rotor speeds.
     """
 
     attitude: Attitude
@@ -338,10 +330,6 @@ def quanser_hover(
     - `lag`: of the propellers in s; 0.02 s is an assumption. None leaves it out.
     - `damping`: in N m s/rad; `stiffness`: in N m/rad; `coulomb`: dry friction in N m; per axis.
     - `convention`: of `Allocation`.
-
-    **Returns:**
-
-    A `Multirotor`.
     """
     sheet = QUANSER_HOVER
     return Multirotor(
@@ -393,10 +381,6 @@ def crazyflie(
 
     - `lag`: of the thrust in s; None leaves it out.
     - `damping`: in N m s/rad per axis, which the data sheet does not give.
-
-    **Returns:**
-
-    A `Multirotor`.
     """
     sheet = CRAZYFLIE
     return Multirotor(

@@ -208,13 +208,9 @@ def simulate_linear(
     - `dt`: the sample interval in s.
     - `hold`: between samples the input stays at the last one ("zero") or is straight ("first").
 
-    **Returns:**
+    **Returns:** The outputs, (samples,) or (samples, outputs).
 
-    The outputs, (samples,) or (samples, outputs).
-
-    **Raises:**
-
-    - `ValueError`: `hold` is unknown, `dt` is not positive, or `u` has another shape.
+    **Raises:** `ValueError`: `hold` is unknown, `dt` is not positive, or `u` has another shape.
     """
     require_all_positive(dt=dt)
     if hold not in _HOLDS:
@@ -244,9 +240,7 @@ def free_responses(
     - `model`: a `TransferFunction`, or a `StateSpace`.
     - `samples`: how many, `dt` seconds apart.
 
-    **Returns:**
-
-    Two arrays, (samples, outputs, states) of a `StateSpace`, (samples, states) of a
+    **Returns:** Two arrays, (samples, outputs, states) of a `StateSpace`, (samples, states) of a
     `TransferFunction`. The states of the latter are those of `realise`, so that only the span of
     the columns has a meaning.
     """
@@ -275,9 +269,8 @@ def sample_rational(model: TransferFunction, dt: Number, hold: str) -> SampledRa
     - `dt`: the sample interval in s.
     - `hold`: as in `simulate_linear`.
 
-    **Returns:**
-
-    A `SampledRational`, differentiable by all of the model but whole samples of its delay.
+    **Returns:** A `SampledRational`, differentiable by all of the model but whole samples of its
+    delay.
 
     Source: Faddeev and LeVerrier's recursion for C adj(qI - A); Astrom & Wittenmark,
     Computer-Controlled Systems, sec. 2.3.

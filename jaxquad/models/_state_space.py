@@ -34,10 +34,8 @@ class StateSpace(Convertible):
     - `input_delay`: (inputs,) in s; `output_delay`: (outputs,) in s; None for none.
     - `names`: of entries, as `{"Lp": "F[1][1]", "Lda": "G[1][0]"}`.
 
-    **Raises:**
-
-    - `ValueError`: the shapes do not fit together, a value is not finite, a delay is negative, M is
-        singular, or a name stands for no entry.
+    **Raises:** `ValueError`: the shapes do not fit together, a value is not finite, a delay is
+    negative, M is singular, or a name stands for no entry.
     """
 
     F: Float[Array, "states states"] = eqx.field(converter=as_float)
@@ -283,13 +281,9 @@ class Mode(NamedTuple):
 def modes(model: HasPoles) -> tuple[Mode, ...]:
     """Frequency, damping and time constant of each mode of a linear model, slowest first.
 
-    **Arguments:**
+    **Arguments:** `model`: has `poles` in rad/s. They are computed by NumPy, so not under jit.
 
-    - `model`: has `poles` in rad/s. They are computed by NumPy, so not under jit.
-
-    **Returns:**
-
-    One `Mode` for each real pole and each pair of complex ones.
+    **Returns:** One `Mode` for each real pole and each pair of complex ones.
     """
     poles = [complex(pole) for pole in np.asarray(model.poles)]
     upper = [pole for pole in poles if pole.imag >= 0]

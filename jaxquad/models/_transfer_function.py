@@ -57,9 +57,7 @@ def evaluate_response(
 ) -> Complex[Array, "frequencies outputs inputs"]:
     """`model.frequency_response(omega)` with axes for outputs and inputs, also where it has none.
 
-    **Raises:**
-
-    - `ValueError`: the result has neither one axis nor three.
+    **Raises:** `ValueError`: the result has neither one axis nor three.
     """
     response = jnp.asarray(model.frequency_response(omega))
     if response.ndim not in (1, 3):
@@ -138,9 +136,7 @@ class Convertible(eqx.Module):
     def to_scipy(self, *, pade: int | None = None) -> Any:
         """The same model for scipy.signal, whose `lsim`, `step` and `bode` take it.
 
-        **Raises:**
-
-        - `ValueError`: there is a delay, but no order.
+        **Raises:** `ValueError`: there is a delay, but no order.
         """
         from ._convert import convert
 
@@ -272,10 +268,8 @@ class TransferFunction(Convertible):
         one output.
     - `delay`: in s.
 
-    **Raises:**
-
-    - `ValueError`: the numerator has the higher degree, the denominator starts with 0, the delay is
-        negative, or the system that is given is sampled or has several inputs or outputs.
+    **Raises:** `ValueError`: the numerator has the higher degree, the denominator starts with 0,
+    the delay is negative, or the system that is given is sampled or has several inputs or outputs.
     """
 
     numerator: Float[Array, " zeros"] = eqx.field(
@@ -375,9 +369,8 @@ class LaggedIntegrator(Convertible):
     - `damping`: in 1/s, of the rate; it takes at least one integrator. A fit leaves one of 0 as it
         is, unless `free` names it, which takes a start above 0.
 
-    **Raises:**
-
-    - `ValueError`: lag, delay or damping is negative, or there is damping without an integrator.
+    **Raises:** `ValueError`: lag, delay or damping is negative, or there is damping without an
+    integrator.
     """
 
     gain: Float[Array, ""] = eqx.field(
@@ -438,9 +431,7 @@ class AttitudeAxis(Convertible):
     - `L`: the arm in m; `K_t`: the thrust in N/V; `J_x`: the inertia in kg m^2.
     - `lag`: of motor and propeller in s; `delay`: in s; `K_af`: the damping in N m s/rad.
 
-    **Raises:**
-
-    - `ValueError`: a value is outside its physical range.
+    **Raises:** `ValueError`: a value is outside its physical range.
     """
 
     L: Float[Array, ""] = eqx.field(converter=as_float, metadata=unit("m"))  # arm

@@ -17,6 +17,7 @@ from ._flights import (
     ThrottleCurve as ThrottleCurve,
 )
 from ._panels import (
+    add_hertz as add_hertz,
     COHERENT as COHERENT,
     headless as headless,
     Panels as Panels,

@@ -200,8 +200,7 @@ def spectrogram(
             level[:, k] = 10 * np.log10(power[:, place == k].mean(axis=1))
         other, text = lay.unit_label(lay.visible(record.unit(over))[:12])
         edges, label = other * edges, f"{lay.short_names([over])[0]}{text}"
-    panels = lay.stacked(1, ax)
-    [panel] = panels
+    [panel] = panels = lay.stacked(1, ax)
     finite = level[np.isfinite(level)]
     top = float(np.percentile(finite, 99.8)) if finite.size else 0.0
     low = max(top - _RANGE, float(np.percentile(finite, 2)) if finite.size else -_RANGE)
@@ -282,15 +281,10 @@ class Filters(Protocol):
 def filters_figure(
     chains: Mapping[str, Sequence[Filters]], *, ax: AxesLike = None, title: str = ""
 ) -> Panels:
-    """Draw magnitude and delay of filters over the frequency.
-
-    **Arguments:**
-
-    - `chains`: by the text of the legend, those that a signal passes one after the other.
-    - `ax`: two axes to draw into.
+    """Draw magnitude and delay of filters over the frequency, in two panels: by the text of the
+    legend, of those that a signal passes one after the other.
     """
-    panels = lay.stacked(2, ax)
-    level, delay = panels
+    level, delay = panels = lay.stacked(2, ax)
     highest = min(chain.rate_hz for group in chains.values() for chain in group) / 2
     hertz = np.geomspace(_LOWEST, 0.98 * highest, _POINTS)
     for k, (name, group) in enumerate(chains.items()):
@@ -346,15 +340,11 @@ def steps_figure(
     steps: Mapping[str, StepBand], *, label: str = "rate after a step of 1", ax: AxesLike = None,
     title: str = "",
 ) -> Panels:  # fmt: skip
-    """Draw step responses with the band of the plants that are possible.
+    """Draw step responses by the text of the legend, with the band of the plants that are possible.
 
-    **Arguments:**
-
-    - `steps`: by the text of the legend.
-    - `label`: of the vertical axis.
+    `label` is that of the vertical axis.
     """
-    panels = lay.stacked(1, ax)
-    [panel] = panels
+    [panel] = panels = lay.stacked(1, ax)
     for k, (name, band) in enumerate(steps.items()):
         look = look_of(k, name)
         panel.fill_between(
@@ -369,13 +359,7 @@ def steps_figure(
 
 
 def again_figure(flight: FlownAgain, *, ax: AxesLike = None, title: str = "") -> Panels:
-    """Draw a part of a flight, logged and simulated, and what is between them.
-
-    **Arguments:**
-
-    - `flight`: in rad/s, drawn in deg/s.
-    - `ax`: two axes to draw into.
-    """
+    """Draw a part of a flight in deg/s, logged and simulated, and below what is between them."""
     panels = lay.stacked(2, ax)
     setpoint, rate, again = (np.degrees(x) for x in flight[1:])
     panels[0].plot(flight.time, setpoint, color="0.6", lw=1.0, label="set-point")
@@ -401,8 +385,7 @@ def b0_figure(
     - `taken`: by the text of the legend, what the ADRC takes for b0.
     - `curve`: gain / lag by the thrust curve; None where the log does not show it.
     """
-    panels = lay.stacked(1, ax)
-    [panel] = panels
+    [panel] = panels = lay.stacked(1, ax)
     if curve is not None:
         look = look_of(0, "gain / lag of the log")
         panel.fill_between(
@@ -423,15 +406,8 @@ def b0_figure(
 def balance_figure(
     terms: Mapping[str, float], *, unit: str = "", ax: AxesLike = None, title: str = ""
 ) -> Panels:
-    """Draw how large P, I, D and F were, as bars of their root mean squares.
-
-    **Arguments:**
-
-    - `terms`: root mean squares by name.
-    - `unit`: of the command.
-    """
-    panels = lay.stacked(1, ax)
-    [panel] = panels
+    """Draw how large P, I, D and F were: bars of root mean squares in the unit of the command."""
+    [panel] = panels = lay.stacked(1, ax)
     names, total = list(terms), sum(terms.values()) or 1.0
     places = np.arange(len(names))[::-1]
     panel.barh(places, [terms[name] for name in names], color="0.55", edgecolor="black", height=0.6)

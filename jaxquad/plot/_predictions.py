@@ -17,7 +17,7 @@ from jaxquad.spectra import estimate_step, FrequencyResponse, StepResponse
 from . import _panels as lay
 from ._flights import extremes
 from ._panels import AxesLike, COHERENT, Panels, Style
-from ._shown import analysed, Channels, channels_shown, Measured, named, named_models, Thing
+from ._shown import analysed, Channels, Measured, named, named_models, Shown, Thing
 
 
 Samples = Float[np.ndarray, " samples"]
@@ -162,7 +162,7 @@ def step(
     origins = [x.origin for x in things.values() if isinstance(x, Fit) and x.origin is not None]
     flown = [thing.names for thing in things.values() if isinstance(thing, StepResponse)]
     if origins:  # names and units of the first fit or record that has them; else numbers
-        channels = channels_shown([Measured("", origins[0].frfs[0])], [])
+        channels = Shown([Measured("", origins[0].frfs[0])], []).channels
     elif flown:
         reference, output = flown[0]
         units = [records[0].unit(name) for name in (output, reference)] if records else ["", ""]
@@ -326,7 +326,7 @@ def resid(
         raise ValueError(
             "resid needs what was measured: give a response or a record as the second argument"
         )
-    [(o, i), *_] = channels_shown([Measured("", data)], []).places(pair)
+    [(o, i), *_] = Shown([Measured("", data)], []).channels.places(pair)
     return _over_frequency(residuals_of(data, fitted, o, i), ax, title)
 
 

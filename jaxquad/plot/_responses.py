@@ -13,18 +13,7 @@ from jaxquad.models import Model
 
 from . import _panels as lay
 from ._panels import AxesLike, COHERENT, Panels, Style
-from ._shown import (
-    analysed,
-    Channels,
-    channels_shown,
-    frequencies_of,
-    Measured,
-    measured_and_modelled,
-    Modelled,
-    named_models,
-    response_as_sampled,
-    Thing,
-)
+from ._shown import analysed, Channels, Measured, Modelled, named_models, Shown, Thing
 
 
 _MARKS = ["x", "+", "^", "s"]
@@ -77,12 +66,11 @@ def bode(
     **Raises:** ValueError for an unknown `pair`, for things without a frequency response, and for
     more than there are lines or marks.
     """
-    measured, modelled = measured_and_modelled(shown, "bode")
-    channels = channels_shown(measured, modelled)
+    measured, modelled = responses = Shown.of(shown, "bode")
+    channels = responses.channels
     places = channels.places(pair)
-    columns = len({i for _, i in places})
-    grid = frequencies_of(measured, modelled, None if omega is None else np.asarray(omega, float))
-    responses = [response_as_sampled(entry, grid, measured) for entry in modelled]
+    columns, grid = len({i for _, i in places}), responses.frequencies(omega)
+    of_models = [responses.response(entry.model, grid) for entry in modelled]
     rows = 3 if measured else 2
     panels = lay.stacked(rows * len(places), ax, columns=columns)
     for place, (o, i) in enumerate(places):
@@ -91,7 +79,7 @@ def bode(
         curves = [_measured_curve(response, o, i) for response in measured]
         curves += [
             _model_curve(entry, grid, response[:, o, i], o, i)
-            for entry, response in zip(modelled, responses, strict=True)
+            for entry, response in zip(modelled, of_models, strict=True)
         ]
         _draw_pair(axes, measured, modelled, curves)
         _label(axes, channels, o, i, top=place < columns, bottom=place >= len(places) - columns)
@@ -242,11 +230,11 @@ def coherence(
 
     **Raises:** ValueError for what was not measured, and for an unknown `pair`.
     """
-    measured, modelled = measured_and_modelled(shown, "coherence")
+    measured, modelled = responses = Shown.of(shown, "coherence")
     if not measured:
         names = ", ".join(entry.name for entry in modelled)
         raise ValueError(f"{names}: a model has no coherence; give a measured response or a record")
-    channels = channels_shown(measured, modelled)
+    channels = responses.channels
     places = channels.places(pair)
     panels = lay.stacked(len(places), ax)
     for panel, (o, i) in zip(panels, places, strict=True):
@@ -286,8 +274,7 @@ def pzmap(*shown: Thing, ax: AxesLike = None, title: str = "") -> Panels:
     there are marks.
     """
     things = named_models(shown, "pzmap")
-    panels = lay.stacked(1, ax)
-    [panel] = panels
+    [panel] = panels = lay.stacked(1, ax)
     for k, (name, thing) in enumerate(things.items()):
         if not isinstance(thing, Fit | Model):
             poles, zeros = analysed(name, thing, "pzmap").poles, np.empty(0)
@@ -345,12 +332,10 @@ def nyquist(
 
     **Raises:** as `jq.plot.bode`.
     """
-    measured, modelled = measured_and_modelled(shown, "nyquist")
-    channels = channels_shown(measured, modelled)
+    measured, modelled = responses = Shown.of(shown, "nyquist")
+    channels, grid = responses.channels, responses.frequencies(omega)
     o, i = channels.places(pair)[0]
-    grid = frequencies_of(measured, modelled, None if omega is None else np.asarray(omega, float))
-    panels = lay.stacked(1, ax)
-    [panel] = panels
+    [panel] = panels = lay.stacked(1, ax)
     sizes = []
     for k, response in enumerate(measured):
         frf = response.frf
@@ -362,7 +347,7 @@ def nyquist(
         panel.plot(np.real(values), np.imag(values), "o", label=response.name, **mark)
         sizes.append(np.abs(values))
     for k, entry in enumerate(modelled):
-        values = response_as_sampled(entry, grid, measured)[:, o, i]
+        values = responses.response(entry.model, grid)[:, o, i]
         look = lay.look_of(k, entry.name)
         panel.plot(np.real(values), np.imag(values), **look)
         thin: Style = look | {"lw": 0.6, "label": "_nolegend_"}

@@ -4,7 +4,7 @@ from collections.abc import Iterable, Mapping
 from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Bool, Float, PyTree
+from jaxtyping import ArrayLike, Bool, Float, PyTree
 
 from jaxquad.identify import as_sampled, Fit, linear_model, model_response
 from jaxquad.models import Model
@@ -47,10 +47,7 @@ def named(shown: Iterable[Thing]) -> dict[str, Thing]:
 
 
 def named_models(shown: Iterable[Thing] | Mapping[str, Thing], what: str) -> dict[str, Thing]:
-    """Models, fits and loops by name, for `what` draws them.
-
-    Raises ValueError for nothing, and for what was measured.
-    """
+    """Models, fits and loops by name, for `what` draws them, which was not measured."""
     things = dict(shown) if isinstance(shown, Mapping) else named(shown)
     if not things:
         raise ValueError(f"{what} has nothing to draw: give a model, a fit of jq.fit or a jq.Loop")
@@ -79,41 +76,6 @@ class Modelled(NamedTuple):
     fit: Fit | None = None
 
 
-def measured_and_modelled(
-    shown: Iterable[Thing], what: str
-) -> tuple[list[Measured], list[Modelled]]:
-    """What is measured and what is a model among all things; `what` draws them.
-
-    The response that a fit was made from belongs to it, unless other ones are given. Raises
-    ValueError for nothing, and for things that have no frequency response.
-    """
-    things = named(shown)
-    if not things:
-        raise ValueError(f"{what} has nothing to draw: give {_KINDS}")
-    measured, modelled, fits = [], [], []
-    for name, thing in things.items():
-        if isinstance(thing, FrequencyResponse | Record):
-            frf = frequency_response(thing) if isinstance(thing, Record) else thing
-            measured.append(Measured(name, frf))
-        elif isinstance(thing, Fit):
-            fits.append(thing)
-            modelled += [Modelled(name, thing.model, thing)] if thing.verdict.fitted else []
-        else:
-            model = thing if isinstance(thing, Model) else analysed(name, thing, what).loop
-            modelled.append(Modelled(name, model))
-    origins = [fit.origin for fit in fits if fit.origin is not None]
-    for points in (points for origin in origins for points in origin.points):
-        if not measured:
-            measured = [Measured(f"{points.frf.method} estimate", points.frf)]
-        measured = [
-            response._replace(used=points.used)
-            if response.frf is points.frf and response.used is None
-            else response
-            for response in measured
-        ]
-    return measured, modelled
-
-
 def analysed(name: str, thing: Thing, what: str) -> PyTree:
     """The `LoopAnalysis` of a loop's first axis, or the one that is given.
 
@@ -130,51 +92,6 @@ def analysed(name: str, thing: Thing, what: str) -> PyTree:
             "jq.analyse(loop, member=0)"
         )
     return analysis
-
-
-@runtime_checkable
-class _IsSampled(Protocol):
-    """A response that ends at pi / dt."""
-
-    dt: float
-
-
-_DECADES = (-1.0, 2.0)  # of rad/s, for models that do not say where they change
-_POINTS = 300
-
-
-def frequencies_of(
-    measured: list[Measured], modelled: list[Modelled], omega: Float[np.ndarray, "..."] | None
-) -> Float[np.ndarray, " frequencies"]:
-    """Where models are drawn, in rad/s: as given, over what was measured, or about their poles."""
-    if omega is not None:
-        return np.atleast_1d(omega)
-    spans = [np.asarray(response.frf.omega)[[0, -1]] for response in measured]
-    for model in () if measured else (entry.model for entry in modelled):
-        if isinstance(model, _IsSampled):
-            end = np.pi / model.dt
-            spans.append(np.array([1e-3 * end, 0.999 * end]))
-            continue
-        try:
-            plant = linear_model(model)
-            sizes = np.abs(np.concatenate([plant.poles, plant.zeros]))
-            sizes = sizes[(sizes > 1e-6) & np.isfinite(sizes)]
-        except ValueError:
-            sizes = np.empty(0)
-        low, high = _DECADES
-        if sizes.size:
-            low = np.floor(np.log10(sizes.min()) - 1 + 0.3)
-            high = np.ceil(np.log10(sizes.max()) + 1 - 0.3)
-        spans.append(np.array([10.0**low, 10.0**high]))
-    return np.geomspace(min(x[0] for x in spans), max(x[1] for x in spans), _POINTS)
-
-
-def response_as_sampled(
-    entry: Modelled, omega: Float[np.ndarray, " frequencies"], measured: list[Measured]
-) -> np.ndarray:
-    """A model's response; where one was measured, as the samples of that record show it."""
-    model = as_sampled(entry.model, measured[0].frf) if measured else entry.model
-    return model_response(model, omega)
 
 
 class Channels(NamedTuple):
@@ -216,17 +133,96 @@ class Channels(NamedTuple):
         return f"{output} per {source}" if output and source else ""
 
 
-def channels_shown(measured: list[Measured], modelled: list[Modelled]) -> Channels:
-    """Those of the measured response, else of the first model, by number."""
-    if measured:
-        frf = measured[0].frf
-        units = frf.output_units or ("",) * len(frf.output_names)
-        sources = frf.input_units or ("",) * len(frf.input_names)
-        return Channels(frf.output_names, frf.input_names, units, sources, True)
-    one = np.ones(1)
-    shapes = {entry.name: model_response(entry.model, one).shape[1:] for entry in modelled}
-    if len(set(shapes.values())) > 1:
-        raise ValueError(
-            f"models of different channels (outputs, inputs): {shapes}; draw them one by one"
+@runtime_checkable
+class _IsSampled(Protocol):
+    """A response that ends at pi / dt."""
+
+    dt: float
+
+
+_DECADES = (-1.0, 2.0)  # of rad/s, for models that do not say where they change
+_POINTS = 300
+
+
+class Shown(NamedTuple):
+    """Responses, what is measured before what is a model."""
+
+    measured: list[Measured]
+    modelled: list[Modelled]
+
+    @classmethod
+    def of(cls, shown: Iterable[Thing], what: str) -> "Shown":
+        """Of all things, for `what` draws them. Raises ValueError for those without a response.
+
+        The response that a fit was made from belongs to it, unless other ones are given.
+        """
+        things = named(shown)
+        if not things:
+            raise ValueError(f"{what} has nothing to draw: give {_KINDS}")
+        measured, modelled, fits = [], [], []
+        for name, thing in things.items():
+            if isinstance(thing, FrequencyResponse | Record):
+                frf = frequency_response(thing) if isinstance(thing, Record) else thing
+                measured.append(Measured(name, frf))
+            elif isinstance(thing, Fit):
+                fits.append(thing)
+                modelled += [Modelled(name, thing.model, thing)] if thing.verdict.fitted else []
+            else:
+                model = thing if isinstance(thing, Model) else analysed(name, thing, what).loop
+                modelled.append(Modelled(name, model))
+        origins = [fit.origin for fit in fits if fit.origin is not None]
+        for points in (points for origin in origins for points in origin.points):
+            if not measured:
+                measured = [Measured(f"{points.frf.method} estimate", points.frf)]
+            measured = [
+                x._replace(used=points.used) if x.frf is points.frf and x.used is None else x
+                for x in measured
+            ]
+        return cls(measured, modelled)
+
+    def frequencies(
+        self, omega: Float[ArrayLike, " frequencies"] | None
+    ) -> Float[np.ndarray, " frequencies"]:
+        """Where models are drawn, in rad/s: as given, over what was measured, or about poles."""
+        if omega is not None:
+            return np.atleast_1d(np.asarray(omega, float))
+        spans = [np.asarray(response.frf.omega)[[0, -1]] for response in self.measured]
+        for model in () if spans else (entry.model for entry in self.modelled):
+            if isinstance(model, _IsSampled):
+                end = np.pi / model.dt
+                spans.append(np.array([1e-3 * end, 0.999 * end]))
+                continue
+            try:
+                plant = linear_model(model)
+                sizes = np.abs(np.concatenate([plant.poles, plant.zeros]))
+                sizes = sizes[(sizes > 1e-6) & np.isfinite(sizes)]
+            except ValueError:
+                sizes = np.empty(0)
+            low, high = _DECADES
+            if sizes.size:
+                low = np.floor(np.log10(sizes.min()) - 1 + 0.3)
+                high = np.ceil(np.log10(sizes.max()) + 1 - 0.3)
+            spans.append(np.array([10.0**low, 10.0**high]))
+        return np.geomspace(min(x[0] for x in spans), max(x[1] for x in spans), _POINTS)
+
+    def response(self, model: Model, omega: Float[np.ndarray, " frequencies"]) -> np.ndarray:
+        """A model's; where one was measured, as the samples of that record show it."""
+        return model_response(
+            as_sampled(model, self.measured[0].frf) if self.measured else model, omega
         )
-    return Channels.numbered(*next(iter(shapes.values())))
+
+    @property
+    def channels(self) -> Channels:
+        """Those of the measured response, else of the first model, by number."""
+        if self.measured:
+            frf = self.measured[0].frf
+            units = frf.output_units or ("",) * len(frf.output_names)
+            sources = frf.input_units or ("",) * len(frf.input_names)
+            return Channels(frf.output_names, frf.input_names, units, sources, True)
+        one = np.ones(1)
+        shapes = {x.name: model_response(x.model, one).shape[1:] for x in self.modelled}
+        if len(set(shapes.values())) > 1:
+            raise ValueError(
+                f"models of different channels (outputs, inputs): {shapes}; draw them one by one"
+            )
+        return Channels.numbered(*next(iter(shapes.values())))

@@ -5,7 +5,6 @@ from textwrap import wrap
 
 import numpy as np
 from jaxtyping import PyTree
-from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
 from jaxquad.ensembles import Ensemble, Members
@@ -52,8 +51,7 @@ def convergence_figure(
     flying = np.array([one.phase == "optimise" for one in history])
     cost = np.where(flying[:, None], [np.atleast_1d(one.cost) for one in history], np.nan)
     stable = np.array([np.atleast_1d(one.stable) for one in history])
-    panels = lay.stacked(2, ax)
-    top, bottom = panels
+    top, bottom = panels = lay.stacked(2, ax)
     best = np.nanmin(cost) if np.isfinite(cost).any() else 0.0
     above, starts = np.maximum(cost - best, _LEAST), cost.shape[1]
     for k in range(starts):
@@ -99,8 +97,7 @@ def front_figure(pareto: Pareto, *, ax: AxesLike = None, title: str = "") -> Pan
     - `pareto`: see `jaxquad.tuning`.
     - `title`: by default what is shown.
     """
-    panels = lay.stacked(1, ax)
-    [panel] = panels
+    [panel] = panels = lay.stacked(1, ax)
     degrees, on = QUANTITIES["itae"].factor, pareto.front
     order = np.argsort(pareto.effort)
     front = order[on[order]]
@@ -196,7 +193,27 @@ def certificate_figure(
     panels[0].set_ylim(len(names) - 0.5, -0.5)
     panels[0].tick_params(axis="y", length=0)
     for panel, quantity in zip(panels[1:], quantities, strict=True):
-        _draw_members(panel, certificate, quantity, names, place)
+        shown, top = QUANTITIES[quantity], _TOPS.get(quantity, np.inf)
+        lowest = []
+        for name, style in reversed(lay.marks(names).items()):
+            design = certificate.designs[name]
+            values = np.array([shown.number(x) for x in design.of(quantity)])
+            finite = np.isfinite(values)
+            height = np.minimum(values, top)
+            above = 3 if name == names[0] else 2
+            panel.plot(place[finite], height[finite], ls="none", label=name, zorder=above, **style)
+            if design.unstable is not None and (cross := finite & design.unstable).any():
+                panel.plot(place[cross], height[cross], "x", ms=5, mew=0.8, color="black", zorder=4,
+                           label="linearly unstable")  # fmt: skip
+            lowest.append(np.min(height[finite], initial=np.inf))
+        for distance in certificate.distances:
+            if distance.quantity == quantity:
+                text = f"{distance.over} {distance.sense} {shown.text(distance.bound)}"
+                lay.draw_limit(panel, shown.number(distance.bound), lay.raise_powers(text))
+        panel.set_yscale("log" if min(lowest) > 0 and not shown.decibels else "linear")
+        unit = f", {lay.raise_powers(shown.unit)}" if shown.unit else ""
+        cut = f" (above {top:g} drawn at {top:g})" if np.isfinite(top) else ""
+        panel.set_ylabel(f"{shown.title}{unit}{cut}")
     panels[-1].set(xscale="log", xlabel=lay.raise_powers(label))
     for panel in panels[1:]:
         panel.grid(True, color="0.9", lw=0.5)
@@ -212,32 +229,6 @@ def certificate_figure(
     left = max(0.9, 0.2 + _LETTER * max(map(len, labels)))
     return lay.arrange(panels, heights, width=6.4 + left, left=left, title=title,
                    legend={name: handles[name] for name in order})  # fmt: skip
-
-
-def _draw_members(
-    panel: Axes, certificate: Certificate, quantity: str, names: Sequence[str], place: np.ndarray
-) -> None:
-    shown, top = QUANTITIES[quantity], _TOPS.get(quantity, np.inf)
-    lowest = []
-    for name, style in reversed(lay.marks(names).items()):
-        design = certificate.designs[name]
-        values = np.array([shown.number(x) for x in design.of(quantity)])
-        finite = np.isfinite(values)
-        height = np.minimum(values, top)
-        order = 3 if name == names[0] else 2
-        panel.plot(place[finite], height[finite], ls="none", label=name, zorder=order, **style)
-        if design.unstable is not None and (cross := finite & design.unstable).any():
-            panel.plot(place[cross], height[cross], "x", ms=5, mew=0.8, color="black", zorder=4,
-                       label="linearly unstable")  # fmt: skip
-        lowest.append(np.min(height[finite], initial=np.inf))
-    for distance in certificate.distances:
-        if distance.quantity == quantity:
-            text = f"{distance.over} {distance.sense} {shown.text(distance.bound)}"
-            lay.draw_limit(panel, shown.number(distance.bound), lay.raise_powers(text))
-    panel.set_yscale("log" if min(lowest) > 0 and not shown.decibels else "linear")
-    unit = f", {lay.raise_powers(shown.unit)}" if shown.unit else ""
-    cut = f" (above {top:g} drawn at {top:g})" if np.isfinite(top) else ""
-    panel.set_ylabel(f"{shown.title}{unit}{cut}")
 
 
 def flight(

@@ -2,10 +2,10 @@
 
 import dataclasses
 from collections.abc import Iterable, Mapping
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from ._errors import RecordError, unknown_name
@@ -38,11 +38,6 @@ def show_times(*times: float, start: float = 0.0) -> str:
     """Times in s as text: `3.2 .. 30 s`, counted from a `start` that `clock_start` gives."""
     text = " .. ".join(f"{time - start:.6g}" for time in times)
     return f"{text} s after {start:.3f} s" if start else f"{text} s"
-
-
-def in_file_time(time: Number | None, start: float) -> Number | None:
-    """A time that a user named, which may count from the `start` that is shown (s)."""
-    return start + time if time is not None and start and time < _DATES else time
 
 
 def check_unit(unit: TimeUnit | None) -> None:
@@ -123,28 +118,39 @@ def nonuniformity(time: Times) -> float:
     return float(np.abs(time - grid).max() * (time.size - 1) / (time[-1] - time[0]))
 
 
-def window(time: Times, start: Number | None, stop: Number | None) -> slice:
-    """The samples from `start` to `stop` (s, both included; None is the end of the record).
+def chosen_span(
+    first: float, last: float, start: Number | None, stop: Number | None, origin: float,
+    slack: float, extent: str,
+) -> tuple[float, float]:  # fmt: skip
+    """From `start` to `stop` within `first` .. `last` (s), where None is the end.
 
-    Where the time stamps are dates, both may count from the first of them.
+    Both may count from the `origin` that is shown; the `extent` is what errors say there is.
     """
-    slack = 1e-6 * (time[-1] - time[0]) / (time.size - 1)
-    origin = clock_start(time)
-    start, stop = in_file_time(start, origin), in_file_time(stop, origin)
-    begin = time[0] if start is None else start
-    end = time[-1] if stop is None else stop
+    start, stop = (
+        origin + time if time is not None and origin and time < _DATES else time
+        for time in (start, stop)
+    )
+    begin = first if start is None else float(start)
+    end = last if stop is None else float(stop)
     shown = lambda *times: show_times(*times, start=origin)
-    extent = f"the record covers {shown(time[0], time[-1])}"
     if not begin < end:
         raise RecordError(f"start {shown(begin)} is not before stop {shown(end)}; {extent}.")
-    if begin < time[0] - slack or end > time[-1] + slack:
+    if begin < first - slack or end > last + slack:
         raise RecordError(f"{shown(begin, end)} is out of range; {extent}.")
+    return begin, end
+
+
+def window(time: Times, start: Number | None, stop: Number | None) -> slice:
+    """The samples from `start` to `stop` (s, both included), which may count from a first date."""
+    slack, origin = 1e-6 * (time[-1] - time[0]) / (time.size - 1), clock_start(time)
+    extent = f"the record covers {show_times(time[0], time[-1], start=origin)}"
+    begin, end = chosen_span(float(time[0]), float(time[-1]), start, stop, origin, slack, extent)
     first = int(np.searchsorted(time, begin - slack))
     last = int(np.searchsorted(time, end + slack, side="right"))
     if last - first < FEWEST:
         raise RecordError(
-            f"{shown(begin, end)} holds {last - first} samples: at least {FEWEST} are "
-            f"needed; {extent}."
+            f"{show_times(begin, end, start=origin)} holds {last - first} samples: at least "
+            f"{FEWEST} are needed; {extent}."
         )
     return slice(first, last)
 
@@ -152,20 +158,8 @@ def window(time: Times, start: Number | None, stop: Number | None) -> slice:
 _MOST_DROPPED = 0.01  # of the time stamps; more is not a glitch, and the record is refused
 
 
-class RepairedTime(NamedTuple):
-    """Increasing time stamps, the rows that they belong to, and what was repaired."""
-
-    time: np.ndarray
-    kept: Bool[np.ndarray, " samples"] | None  # None: all
-    remark: str
-
-
 def unwrap(counter: np.ndarray) -> tuple[np.ndarray, int]:
-    """A counter with its overflows undone, and how many there were.
-
-    A 32-bit counter is recognised by its dtype, or by a step from the last hundredth of its range
-    to the first; an int16 or uint16 by its dtype alone.
-    """
+    """A counter with its overflows undone, and how many; seen by its dtype or a step of 32 bits."""
     if counter.dtype.kind in "iu" and counter.dtype.itemsize <= 4:
         span = float(2 ** (8 * counter.dtype.itemsize))
         wraps = np.diff(counter.astype(np.int64)) < -span / 2
@@ -179,14 +173,14 @@ def unwrap(counter: np.ndarray) -> tuple[np.ndarray, int]:
     return counter.astype(np.float64) + span * turns, int(wraps.sum())
 
 
-def repair_time(time: Times) -> RepairedTime:
-    """Drop time stamps that repeat, go back, jump ahead or are not finite, if they are few.
+RepairedTime = tuple[Times, np.ndarray | None, str]  # stamps, which rows (None: all), a remark
 
-    Where more than 1 % would have to go, nothing is dropped: `Channel` then refuses the record.
-    """
+
+def repair_time(time: Times) -> RepairedTime:
+    """Drop stamps that repeat, go back, jump ahead or are not finite; none if over 1 % would."""
     good = np.isfinite(time)
     if time.size < FEWEST or (good.all() and (np.diff(time) > 0).all()):
-        return RepairedTime(time, None, "")
+        return time, None, ""
     kept = np.flatnonzero(good)
     if kept.size > 2:  # what jumps ahead although its neighbours are in order goes alone
         a, b, c = time[kept][:-2], time[kept][1:-1], time[kept][2:]
@@ -195,7 +189,7 @@ def repair_time(time: Times) -> RepairedTime:
     kept = kept[np.concatenate([[True], time[kept][1:] > highest[:-1]])] if kept.size else kept
     dropped = time.size - kept.size
     if dropped > _MOST_DROPPED * time.size:
-        return RepairedTime(time, None, "")
+        return time, None, ""
     mask = np.zeros(time.size, dtype=bool)
     mask[kept] = True
     first = int(np.flatnonzero(~mask)[0])
@@ -203,7 +197,7 @@ def repair_time(time: Times) -> RepairedTime:
         f"{dropped} of {time.size} time stamps repeat or go back; these rows were dropped, the "
         f"first of them row {first} ({time[first]:.9g} s)"
     )
-    return RepairedTime(time[mask], mask, remark)
+    return time[mask], mask, remark
 
 
 _GENERIC = 10  # nominal samples of a gap that is bridged where nobody says how long it may be
@@ -222,9 +216,8 @@ def repair_values(
 ) -> tuple[Values, Float[np.ndarray, " repaired"]]:
     """Values without what is missing or out of range, and the times (s) at which they are new.
 
-    Nothing is repaired unless `valid` or `max_gap` asks for it. The interpolation is monotone
-    between neighbours at most `max_gap` (s) apart (Fritsch and Butland 1984). What lies at an end,
-    or in a longer gap, is NaN.
+    Monotone between neighbours at most `max_gap` (s) apart (Fritsch and Butland 1984), else NaN; as
+    they are where neither `valid` nor `max_gap` asks for it.
     """
     good = np.isfinite(values)
     if valid is not None:

@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools as ft
-import warnings
 from collections.abc import Callable, Mapping, Sequence
 from typing import Literal
 
@@ -11,9 +10,9 @@ from jaxtyping import Float
 
 from ._channel import (
     Channel,
+    chosen_span,
     clock_start,
     FEWEST,
-    in_file_time,
     longest_gap,
     longest_step,
     nonuniformity,
@@ -24,7 +23,7 @@ from ._channel import (
     window,
     within,
 )
-from ._errors import choose_range, GapError, mend_holes, RecordError, RecordWarning
+from ._errors import choose_range, GapError, mend_holes, RecordError, warn
 from ._record import as_tuple, assemble, Record
 
 
@@ -76,7 +75,21 @@ def resample(
     """
     from scipy.interpolate import CubicSpline, make_interp_spline
 
-    begin, end = _common_extent(channels, start, stop)
+    if not channels:
+        raise RecordError("there are no channels to resample: give at least one.")
+    latest = max(channels, key=lambda channel: channel.time[0])
+    earliest = min(channels, key=lambda channel: channel.time[-1])
+    first, last = float(latest.time[0]), float(earliest.time[-1])
+    origin = min(clock_start(channel.time) for channel in channels)
+    overlap = (
+        f"the channels overlap from {first - origin:.6g} s ({latest.name!r} begins) "
+        f"to {show_times(last, start=origin)} ({earliest.name!r} ends)"
+    )
+    if not first < last:
+        raise RecordError(f"the channels have no common time: {overlap}.")
+    slack = 1e-9 * (1 + abs(last))
+    begin, end = chosen_span(first, last, start, stop, origin, slack, overlap)
+    begin, end = max(begin, first), min(end, last)
     if not (np.isfinite(sample_rate) and sample_rate > 0):
         raise RecordError(f"the sample rate is {sample_rate} Hz: it must be positive.")
     steps = (end - begin) * sample_rate
@@ -92,11 +105,9 @@ def resample(
     pieces = [_contiguous_part(c, begin, end, margin=margin, max_gap=max_gap) for c in channels]
     _warn_of_clocks(pieces, begin, end)
     if slow := [f"{c.name!r} {c.rate:.6g} Hz" for c in channels if sample_rate > _SAME * c.rate]:
-        warnings.warn(
+        warn(
             f"resampled to {sample_rate:.6g} Hz, faster than {', '.join(slow)}: such a channel "
-            f"holds no information above half its own rate. Keep the frequency band below that.",
-            RecordWarning,
-            stacklevel=2,
+            f"holds no information above half its own rate. Keep the frequency band below that."
         )
     # The low-pass against aliasing runs on a grid twice as fine as the fastest channel's.
     fastest = max(channel.rate for channel in channels)
@@ -131,41 +142,12 @@ def resample(
     return time, np.stack(columns, axis=1)
 
 
-def _common_extent(
-    channels: Sequence[Channel], start: Number | None, stop: Number | None
-) -> tuple[float, float]:
-    """First and last time (s) of the grid, within the time that all channels share."""
-    if not channels:
-        raise RecordError("there are no channels to resample: give at least one.")
-    latest = max(channels, key=lambda channel: channel.time[0])
-    earliest = min(channels, key=lambda channel: channel.time[-1])
-    first, last = float(latest.time[0]), float(earliest.time[-1])
-    origin = min(clock_start(channel.time) for channel in channels)
-    start, stop = in_file_time(start, origin), in_file_time(stop, origin)
-    begin = first if start is None else float(start)
-    end = last if stop is None else float(stop)
-    shown = lambda *times: show_times(*times, start=origin)
-    overlap = (
-        f"the channels overlap from {first - origin:.6g} s ({latest.name!r} begins) "
-        f"to {shown(last)} ({earliest.name!r} ends)"
-    )
-    if not first < last:
-        raise RecordError(f"the channels have no common time: {overlap}.")
-    if not begin < end:
-        raise RecordError(f"start {shown(begin)} is not before stop {shown(end)}; {overlap}.")
-    slack = 1e-9 * (1 + abs(last))
-    if begin < first - slack or end > last + slack:
-        raise RecordError(f"{shown(begin, end)} is out of range; {overlap}.")
-    return max(begin, first), min(end, last)
-
-
 def _contiguous_part(
     channel: Channel, begin: float, end: float, *, margin: float, max_gap: Number | None
 ) -> Channel:
     """The samples from `begin` to `end` (s), and up to `margin` (s) beyond, without a break.
 
-    A break is a gap longer than `max_gap` (s) or a value that is not finite. Outside of
-    `begin` .. `end` it ends the part; inside it raises RecordError, a GapError where all are gaps.
+    A break is a gap longer than `max_gap` (s) or a value that is not finite: inside it raises.
     """
     time, longest = channel.time, longest_gap(channel.time, max_gap)
     bad = ~np.isfinite(channel.values)
@@ -218,19 +200,17 @@ def _warn_of_clocks(pieces: Sequence[Channel], begin: float, end: float) -> None
             gaps.append(f"{piece.name!r} {holes.size}, {longest}")
     if gaps:
         remark = f"gaps filled by interpolation: {'; '.join(gaps)}."
-        warnings.warn(remark, RecordWarning, stacklevel=3)
+        warn(remark)
     scattered = [piece for piece in pieces if scatters(piece.time)]
     if scattered:
         off = max(nonuniformity(piece.time) for piece in scattered)
         rate = min(piece.rate for piece in scattered)
-        warnings.warn(
+        warn(
             f"the time stamps of {', '.join(repr(piece.name) for piece in scattered)} lie up to "
             f"{off:.2g} samples off a clock of "
             f"{rate:.5g} Hz, and steps shorter than half a sample are as frequent as long ones: "
             f"values were interpolated at these times. If the samples were equally spaced, give "
-            f"their interval instead: {1 / rate:.4g} s («dt=»).",
-            RecordWarning,
-            stacklevel=3,
+            f"their interval instead: {1 / rate:.4g} s («dt=»)."
         )
 
 
@@ -377,11 +357,7 @@ def mix(
     )
 
 
-def combine(
-    name: str,
-    weights: Mapping[str, Number],
-    values: Callable[[str], Times],
-) -> Times:
+def combine(name: str, weights: Mapping[str, Number], values: Callable[[str], Times]) -> Times:
     """The weighted sum that makes the channel `name`; a single weight of 1 changes no bit."""
     if not weights:
         raise RecordError(f"the sum {name!r} is empty: give it channels and their weights.")

@@ -1,4 +1,5 @@
 import difflib
+import warnings
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
@@ -13,13 +14,7 @@ class RecordError(ValueError):
 
 
 class ReadError(RecordError):
-    """A file that cannot be read.
-
-    **Arguments:**
-
-    - `reason`: what is wrong, and what to do.
-    - `offset`: the byte of the file where the fault shows, if known.
-    """
+    """A file that cannot be read, and the byte `offset` where the fault shows, if known."""
 
     def __init__(self, reason: str, *, offset: int | None = None):
         self.reason, self.offset = marked_text(reason), offset
@@ -28,13 +23,7 @@ class ReadError(RecordError):
 
 
 class GapError(RecordError):
-    """Samples are missing for too long.
-
-    **Arguments:**
-
-    - `reason`: what is wrong, and what to do.
-    - `gaps`: first and last time in s of each, in order.
-    """
+    """Samples are missing for too long; `gaps` are first and last time in s of each, in order."""
 
     def __init__(self, reason: str, gaps: Sequence[tuple[float, float]] = ()):
         super().__init__(reason)
@@ -46,6 +35,11 @@ class RecordWarning(UserWarning):
 
     def __init__(self, reason: str):
         super().__init__(Message(reason))
+
+
+def warn(reason: str) -> None:
+    """Warn whoever called the function that says this."""
+    warnings.warn(reason, RecordWarning, stacklevel=3)
 
 
 def located(error: ReadError, path: Path | str) -> ReadError:

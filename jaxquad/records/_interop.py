@@ -8,7 +8,7 @@ import numpy as np
 
 from ._channel import dates_in_seconds, doubt_of_seconds, PER_SECOND, Times, TimeUnit
 from ._errors import ReadError, RecordError, unknown_name
-from ._record import as_tuple, Names, Record
+from ._record import as_tuple, assemble, Names, Record
 from .formats import load_log
 
 
@@ -83,8 +83,34 @@ _SAVE = "s = get(z); save('z.mat', 's', '-v7')"
 
 
 def from_iddata(path: str | Path, variable: str | None, references: Names) -> Record:
-    """`Record.from_iddata`, where the arguments are described."""
-    fields = _fields(path, variable)
+    """`Record.from_iddata`, from the variable of that name, the only struct, or the file itself."""
+    load_log(path)  # which refuses what is damaged, before scipy reads it
+    from scipy.io import loadmat
+
+    try:
+        content = loadmat(path, simplify_cells=True)
+    except Exception as error:  # of damaged and of HDF5 files scipy raises almost anything
+        raise ReadError(
+            f"{path}: cannot be read as a MAT file of version 5 to 7 ({type(error).__name__}): "
+            f"save it in MATLAB with {_SAVE}"
+        ) from error
+    is_iddata = lambda value: (
+        isinstance(value, Mapping)
+        and any(names <= set(value) for names in ({"y", "u"}, {"OutputData", "InputData"}))
+    )
+    structs = {name: value for name, value in content.items() if is_iddata(value)}
+    if variable is None and is_iddata(content):
+        fields = content
+    elif variable is None and len(structs) == 1:
+        fields = next(iter(structs.values()))
+    elif variable in structs:
+        fields = structs[variable]
+    else:
+        which = "which of them (variable=) is not said" if variable is None else f"not {variable!r}"
+        raise ReadError(
+            f"{path}: structs with y and u: {', '.join(structs) or 'none'}; {which}. An iddata "
+            f"object cannot be read outside of MATLAB: make a struct of it, {_SAVE}"
+        )
     y = _matrix(path, fields, "y", "OutputData")
     u = _matrix(path, fields, "u", "InputData")
     unit = str(fields.get("TimeUnit", "seconds"))
@@ -102,61 +128,22 @@ def from_iddata(path: str | Path, variable: str | None, references: Names) -> Re
         dt = float(_UNITS[unit] * interval[0])
     else:
         raise ReadError(f"{path}: Ts is {interval.tolist()}: give the sample interval, in {unit}")
-    inputs = _labels(fields, "InputName", u, "u")
-    input_units = _labels(fields, "InputUnit", u, "")
+    inputs, outputs = _labels(fields, "InputName", u, "u"), _labels(fields, "OutputName", y, "y")
+    names, columns = [*inputs, *outputs], [*u.T, *y.T]
+    labels = [*_labels(fields, "InputUnit", u, ""), *_labels(fields, "OutputUnit", y, "")]
     outer = as_tuple(references or ())
     for name in outer:
         if name not in inputs:
             raise RecordError(f"{path}: there is no input {name!r}; it has {', '.join(inputs)}.")
-    is_outer = np.array([name in outer for name in inputs], bool)
-    pick = lambda texts, chosen: [t for t, c in zip(texts, chosen, strict=True) if c]
     kinds = set(_texts(fields, "InterSample"))
-    # Held, or measured within the band.
-    hold = {"zoh": dt, "bl": 0.0}.get(kinds.pop()) if len(kinds) == 1 else None
-    return Record(
+    return assemble(
         time,
-        u[:, ~is_outer],
-        y,
-        u[:, is_outer] if outer else None,
-        input_names=pick(inputs, ~is_outer),
-        output_names=_labels(fields, "OutputName", y, "y"),
-        reference_names=pick(inputs, is_outer),
-        input_units=pick(input_units, ~is_outer),
-        output_units=_labels(fields, "OutputUnit", y, ""),
-        reference_units=pick(input_units, is_outer),
+        ([x for x in inputs if x not in outer], outputs, [x for x in inputs if x in outer]),
+        dict(zip(names, columns, strict=True)).__getitem__,
+        dict(zip(names, labels, strict=True)).__getitem__,
         source=str(path),
-        hold=hold,
-        time_unit="s",
-    )
-
-
-def _fields(path: str | Path, variable: str | None) -> Mapping:
-    """The struct with y and u: the variable of that name, the only one, or the file itself."""
-    load_log(path)  # which refuses what is damaged, before scipy reads it
-    from scipy.io import loadmat
-
-    try:
-        content = loadmat(path, simplify_cells=True)
-    except Exception as error:  # of damaged and of HDF5 files scipy raises almost anything
-        raise ReadError(
-            f"{path}: cannot be read as a MAT file of version 5 to 7 ({type(error).__name__}): "
-            f"save it in MATLAB with {_SAVE}"
-        ) from error
-    is_iddata = lambda value: (
-        isinstance(value, Mapping)
-        and any(names <= set(value) for names in ({"y", "u"}, {"OutputData", "InputData"}))
-    )
-    structs = {name: value for name, value in content.items() if is_iddata(value)}
-    if variable is None and is_iddata(content):
-        return content
-    if variable is None and len(structs) == 1:
-        return next(iter(structs.values()))
-    if variable in structs:
-        return structs[variable]
-    which = "which of them (variable=) is not said" if variable is None else f"not {variable!r}"
-    raise ReadError(
-        f"{path}: structs with y and u: {', '.join(structs) or 'none'}; {which}. An iddata object "
-        f"cannot be read outside of MATLAB: make a struct of it, {_SAVE}"
+        # Held, or measured within the band.
+        hold={"zoh": dt, "bl": 0.0}.get(kinds.pop()) if len(kinds) == 1 else None,
     )
 
 

@@ -45,10 +45,7 @@ class SettingChange(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Log:
-    """The tables of a file by name; the channels of the table `""` have no prefix.
-
-    Each of the `remarks` says what was skipped or repaired, and becomes a RecordWarning.
-    """
+    """The tables of a file by name; the channels of the table `""` have no prefix."""
 
     tables: Mapping[str, Table]
     remarks: tuple[str, ...] = ()
@@ -85,10 +82,7 @@ Stamp = TypeVar("Stamp")
 def changes_of(
     logged: Iterable[tuple[Stamp, str, str]], time_of: Callable[[Stamp], float | None]
 ) -> tuple[SettingChange, ...]:
-    """The changes among settings as they were logged: a stamp, name, value.
-
-    `time_of` a stamp is in s, None where it has none.
-    """
+    """The changes among settings as they were logged, with stamps of which `time_of` gives s."""
     values: dict[str, str] = {}
     changes: list[SettingChange] = []
     for stamp, name, value in logged:
@@ -212,23 +206,15 @@ def known_unit(text: str) -> str:
     return plain if plain in _UNITS else _SAME.get(plain, "")
 
 
-class Column(NamedTuple):
-    """What the cell of a header names, and its unit: empty where it has none."""
+def columns_of(titles: Sequence[str]) -> dict[str, tuple[str, str]]:
+    """The cells of a header, such as `q [deg/s]`, as names and units.
 
-    name: str
-    unit: str
-
-
-def columns_of(titles: Sequence[str]) -> dict[str, Column]:
-    """The cells of a header, such as `q [deg/s]` and `time (us)`, as names and units.
-
-    A cell keeps its whole text as a name where it ends in no known unit, and where the name alone
-    would be that of another cell.
+    A cell keeps its whole text where the name alone would be that of another cell.
     """
     parts = {}
     for title in titles:
         match = _TITLE.fullmatch(title)
         unit = known_unit(match[2] or match[3]) if match else ""
-        parts[title] = Column(match[1], unit) if match and unit else Column(title, "")
+        parts[title] = (match[1], unit) if match and unit else (title, "")
     names = [name for name, _ in parts.values()]
-    return {t: p if names.count(p.name) == 1 else Column(t, p.unit) for t, p in parts.items()}
+    return {t: (n if names.count(n) == 1 else t, unit) for t, (n, unit) in parts.items()}

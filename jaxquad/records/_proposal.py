@@ -263,10 +263,7 @@ def propose(
 
 
 def _choose_flight(log: Log, axis: str | None, number: int | None) -> tuple[Log, tuple[str, ...]]:
-    """The log of one flight, and a remark on the choice where the file holds several.
-
-    Channels keep their names in the file; settings have the names of a single log.
-    """
+    """The log of one flight, with the names of a single log, and a remark on the choice."""
     every = _flights_of(log)
     if not every and number is None:
         return log, ()
@@ -348,10 +345,7 @@ _LOST = 300.0  # deg/s RMS between set-point and rate: more than any manoeuvre t
 
 
 def _in_flight(log: Log, setup: Setup, start: float | None, stop: float | None) -> Setup:
-    """The set-up from take-off to landing, or to crash; what was injected stays as it is.
-
-    A `start` and `stop` (s) that are given take the place of these ends, and cut what was injected.
-    """
+    """From take-off to landing or crash, or `start` to `stop` (s), which cut what was injected."""
     spans = setup.segments or ((setup.start, setup.stop),)
     if setup.start is not None and setup.stop is not None:
         low, high = (-np.inf if start is None else start), (np.inf if stop is None else stop)
@@ -392,9 +386,7 @@ def _flown_span(log: Log) -> _FlownSpan:
     """The time from take-off to landing or crash, as far as the log shows it.
 
     Flight is a window of 0.25 s with the throttle above 5 % in which the gyro moves twice as much
-    as at its quietest with the throttle below, before and after all that. Only the ends of a log
-    are cut: a dive without throttle is flight. Two windows and more at the end in which rates are
-    300 deg/s RMS off their set-points are a crash.
+    as at its quietest without. Only the ends of a log are cut: a dive without throttle is flight.
     """
     signals, firmware = flattened(log), firmware_log(log.vehicle)
     if firmware is None:

@@ -26,7 +26,7 @@ from ._channel import (
     without_turns,
 )
 from ._edit import combine, resample
-from ._errors import GapError, located, ReadError, RecordError, RecordWarning, unknown_name
+from ._errors import GapError, located, ReadError, RecordError, unknown_name, warn
 from ._log import known_unit
 from ._record import as_tuple, assemble, check_distinct, Hold, Record
 from ._timebase import Timebases
@@ -220,11 +220,9 @@ def _read_channels(
         if jumps:
             turn = "360" if period == 360 else "2 pi"
             count = "once" if jumps == 1 else f"{jumps} times"
-            warnings.warn(
+            warn(
                 f"channel {name!r} jumps by {turn} {count}, as an angle does at the end of "
-                f"its range: it is taken as one that goes on.",
-                RecordWarning,
-                stacklevel=3,
+                f"its range: it is taken as one that goes on."
             )
         channels.append(Channel(name, channel.time, values, channel.unit))
         repaired[name] = times
@@ -424,13 +422,11 @@ def _without_gaps(
     *others, last = [(float(record.time[0]), float(record.time[-1])) for record in records]
     texts = [f"{a - origin:.6g} .. {b - origin:.6g}" for a, b in others]
     (left, right) = max(gaps, key=lambda gap: gap[1] - gap[0])
-    warnings.warn(
+    warn(
         f"samples are missing in {'one place' if len(gaps) == 1 else f'{len(gaps)} places'}, for "
         f"up to {1e3 * (right - left):.4g} ms at t = {show_times(left, start=origin)}: the record "
         f"is cut there into {len(parts)} segments, t = "
         f"{', '.join([*texts, show_times(*last, start=origin)])}. "
-        f"A gap up to a length in s is bridged instead where that is allowed («max_gap=»).",
-        RecordWarning,
-        stacklevel=4,
+        f"A gap up to a length in s is bridged instead where that is allowed («max_gap=»)."
     )
     return parts

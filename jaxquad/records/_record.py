@@ -1,5 +1,4 @@
 import dataclasses
-import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Literal, TYPE_CHECKING
@@ -21,7 +20,7 @@ from ._channel import (
     uniform_stamps,
     Valid,
 )
-from ._errors import mend_holes, RecordError, RecordWarning, unknown_name
+from ._errors import mend_holes, RecordError, unknown_name, warn
 
 
 if TYPE_CHECKING:
@@ -170,12 +169,10 @@ class Record:
                 earlier[name] = times
         for name, times in earlier.items():
             if times.size > _MOST_REPAIRED * rows:
-                warnings.warn(
+                warn(
                     f"channel {name!r}: {times.size} of {rows} samples are interpolated, the first "
                     f"at t = {show_times(times.min(), start=start)}. Check «valid=» and the "
-                    "sensor.",
-                    RecordWarning,
-                    stacklevel=3,
+                    "sensor."
                 )
         for name, values in channels.items():
             bad = np.flatnonzero(~np.isfinite(values))
@@ -203,11 +200,9 @@ class Record:
                     f"{1 / _SMALLEST:g}."
                 )
             if np.ptp(values) == 0:
-                warnings.warn(
+                warn(
                     f"channel {name!r} is constant at {values[0]:.6g}: nothing can be identified "
-                    f"from it. Check that it was excited and logged.",
-                    RecordWarning,
-                    stacklevel=3,
+                    f"from it. Check that it was excited and logged."
                 )
         if self.hold is not None and self.hold > _CHANGES * self.dt:
             # A hold during which an input changes all the time.

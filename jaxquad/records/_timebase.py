@@ -1,7 +1,6 @@
 """The channels of a file, and the time stamps of each."""
 
 import re
-import warnings
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -23,7 +22,7 @@ from ._channel import (
     TimeUnit,
     unwrap,
 )
-from ._errors import listed, located, ReadError, RecordError, RecordWarning, unknown_name
+from ._errors import listed, located, ReadError, RecordError, unknown_name, warn
 from ._log import Signal, Signals
 from .formats import load_signals
 
@@ -43,28 +42,16 @@ _COUNTED = "rows"  # the time base where dt says how far apart they are
 
 
 class ChannelSummary(NamedTuple):
-    """One channel of a file: NaN for its rate and times where it has no usable time base.
-
-    **Arguments:**
-
-    - `name`: of the channel.
-    - `samples`: their number.
-    - `rate`: Hz, without gaps.
-    - `start`: s.
-    - `stop`: s.
-    - `minimum`: of the finite values.
-    - `maximum`: likewise.
-    - `unit`: empty where unknown.
-    """
+    """One channel of a file: NaN for its rate and times where it has no usable time base."""
 
     name: str
     samples: int
-    rate: float
-    start: float
-    stop: float
-    minimum: float
+    rate: float  # Hz, without gaps
+    start: float  # s
+    stop: float  # s
+    minimum: float  # of the finite values
     maximum: float
-    unit: str
+    unit: str  # empty where unknown
 
     def __str__(self) -> str:
         start = clock_start(np.array([self.start]))
@@ -118,11 +105,7 @@ Place = tuple[str, int | None]  # an array, and its column
 class Timebases:
     """The channels of a log, `names`, and their time bases, each repaired once.
 
-    The columns of a matrix `x` are `x[0]`, `x[1]`, ... The time base of an array is the first that
-    exists of: its own, `t_<array>`; the one named `time`; t, time, time_s, timestamp, ... or
-    seconds and nanoseconds in the same struct, in those around it, in the whole file; those of its
-    topic (`imu_time` for `imu_x`); the first column of a matrix if that rises in steps of nearly
-    one size. Seconds and nanoseconds are `sec+nsec`.
+    `read` tells how the time base of an array is found. Seconds and nanoseconds are `sec+nsec`.
     """
 
     def __init__(
@@ -170,7 +153,20 @@ class Timebases:
         self._structs = {prefix: base for prefix, (_, base) in ranks.items()}
         self._columns: dict[str, Place] = {}  # of all arrays
         self.names: dict[str, Place] = {}  # of the channels alone
-        stamps = self._time_names()
+        arrays, stamps = self._arrays, set()  # of what holds time stamps rather than a channel
+        for name in arrays:
+            struct, dot, field = name.rpartition(".")
+            if field.startswith("t_") and f"{struct}{dot}{field.removeprefix('t_')}" in arrays:
+                stamps.add(name)
+        if self._time is not None:
+            stamps |= set(self._time.split("+"))
+        else:
+            stamps |= {name for name in arrays if _CLOCK.fullmatch(name)}
+            pairs = (base.split("+") for base in self._structs.values() if "+" in base)
+            stamps |= {part for pair in pairs for part in pair} & set(arrays)
+            if self._topics:
+                bases = {self._clock_by_name(name) for name in arrays}
+                stamps |= bases & set(self._topics.values())
         for array, signal in self._arrays.items():
             matrix = signal.values
             columns: dict[str, Place] = {array: (array, None)}
@@ -193,20 +189,17 @@ class Timebases:
         self._rates: dict[tuple[str, bytes], float] = {}
 
     def channel(self, name: str) -> Channel:
-        """The named channel with its time stamps, in s.
-
-        Warns of time stamps that had to be repaired.
-        """
-        values, stamps = self.values(name), self._repaired_time(name)[1]
-        values = values if stamps.kept is None else values[stamps.kept]
-        return Channel(name, stamps.time, values, self.unit(name))
+        """The named channel with its time stamps, in s; warns of those that were repaired."""
+        values, (stamps, kept, _) = self.values(name), self._repaired_time(name)[1]
+        values = values if kept is None else values[kept]
+        return Channel(name, stamps, values, self.unit(name))
 
     def extent(self, name: str) -> tuple[float, float, float]:
         """Rate in Hz, first and last time in s of a channel; raises as `channel` does."""
-        base, stamps = self._repaired_time(name)
+        base, (stamps, _, _) = self._repaired_time(name)
         if base not in self._rates:
             self._rates[base] = self.channel(name).rate
-        return self._rates[base], float(stamps.time[0]), float(stamps.time[-1])
+        return self._rates[base], float(stamps[0]), float(stamps[-1])
 
     def values(self, name: str) -> np.ndarray:
         """The values of a channel in its unit, without its time stamps."""
@@ -264,8 +257,8 @@ class Timebases:
         repaired = self._repaired[key] = repair_time(seconds)
         times = "once" if wraps == 1 else f"{wraps} times"
         overflow = f"the counter overflowed {times}; this was undone" if wraps else ""
-        for text in filter(None, (overflow, repaired.remark)):
-            warnings.warn(f"time base {base!r}: {text}.", RecordWarning, stacklevel=2)
+        for text in filter(None, (overflow, repaired[2])):
+            warn(f"time base {base!r}: {text}.")
         return key, repaired
 
     def _base(self, array: str) -> str:
@@ -327,14 +320,11 @@ class Timebases:
             )
         if doubt:
             said = f"the time stamps are taken from {base!r}{doubt}"
-            warnings.warn(said, RecordWarning, stacklevel=2)
+            warn(said)
         return base
 
     def _count(self, base: str) -> tuple[np.ndarray, int]:
-        """The stamps (s) of arrays that the log does not define as a clock, NaN where blank.
-
-        With them comes how many overflows were undone.
-        """
+        """Stamps (s) that the log does not define as a clock, NaN where blank; overflows undone."""
         parts = self._parts(base)
         if len(parts) == 2:
             places = [self._columns[part] for part in parts]
@@ -378,22 +368,6 @@ class Timebases:
                 return self._structs[prefix]
         topics = (self._topics.get(prefix, array) for prefix in _prefixes(array, "_"))
         return next((base for base in topics if base != array), "")
-
-    def _time_names(self) -> set[str]:
-        """The arrays that hold time stamps rather than a channel."""
-        arrays, stamps = self._arrays, set()
-        for name in arrays:
-            struct, dot, field = name.rpartition(".")
-            if field.startswith("t_") and f"{struct}{dot}{field.removeprefix('t_')}" in arrays:
-                stamps.add(name)
-        if self._time is not None:
-            return stamps | set(self._time.split("+"))
-        stamps |= {name for name in arrays if _CLOCK.fullmatch(name)}
-        pairs = (base.split("+") for base in self._structs.values() if "+" in base)
-        stamps |= {part for pair in pairs for part in pair} & set(arrays)
-        if self._topics:
-            stamps |= {self._clock_by_name(name) for name in arrays} & set(self._topics.values())
-        return stamps
 
 
 def _prefixes(name: str, separator: str) -> Iterator[str]:

@@ -29,19 +29,15 @@ Point = Literal["", "rate", "mixer", "angle"]
 
 
 class NumberedChirp(NamedTuple):
-    """One of the chirps that a log holds.
+    """One of the chirps that a log holds."""
 
-    `number` counts them in the order of time, from 1; `axis` is empty where it turns none; `place`
-    says in words what it was added to; `low` and `high` are its band, 0 where it is unknown.
-    """
-
-    number: int
-    axis: str
-    place: str
+    number: int  # in the order of time, from 1
+    axis: str  # empty where it turns none
+    place: str  # what it was added to, in words
     point: Point
     start: float  # s
     stop: float
-    low: float = 0.0  # Hz
+    low: float = 0.0  # Hz, 0 where the band is unknown
     high: float = 0.0
 
     def __str__(self) -> str:
@@ -124,11 +120,7 @@ def with_injections(setup: Setup, runs: Sequence[Injection], what: str) -> Setup
 
 
 def choose_chirps(chirps: Sequence[NumberedChirp], wanted: Selection) -> list[NumberedChirp]:
-    """The chirp of that number; else the longest within the span and on the axis that are wanted.
-
-    With it come all others on its axis at its place. One that turns no axis is taken where there is
-    no other.
-    """
+    """The chirp of that number, else the longest wanted one, and all on its axis at its place."""
     if wanted.chirp is not None:
         listed = "; ".join(map(str, chirps)) or "none"
         chirp = next((x for x in chirps if x.number == wanted.chirp), None)
@@ -213,25 +205,15 @@ Spans = Sequence[tuple[float, float]]  # s
 
 
 class Flight(NamedTuple):
-    """One flight of a file, as `flights` lists it; it prints as one line.
+    """One flight of a file, as `flights` lists it; it prints as one line."""
 
-    **Arguments:**
-
-    - `number`: in the file, from 1; what `propose` takes as `flight`.
-    - `log`: what its channels begin with, `log2` for `log2.gyroADC[0]`; empty for a single one.
-    - `start`, `stop`: s of the file's time.
-    - `throttle`: lowest and highest, 0 to 1; None where it is not logged.
-    - `chirps`: seconds of injected sweeps, by axis.
-    - `sticks`: how much each stick moves, RMS about its mean as a share of full deflection.
-    """
-
-    number: int
-    log: str
-    start: float
+    number: int  # in the file, from 1; what `propose` takes as `flight`
+    log: str  # what its channels begin with, `log2` for `log2.gyroADC[0]`; empty for a single one
+    start: float  # s of the file's time
     stop: float
-    throttle: tuple[float, float] | None
-    chirps: Mapping[str, float]
-    sticks: Mapping[str, float]
+    throttle: tuple[float, float] | None  # lowest and highest, 0 to 1; None where it is not logged
+    chirps: Mapping[str, float]  # seconds of injected sweeps, by axis
+    sticks: Mapping[str, float]  # RMS of each about its mean, as a share of full deflection
 
     @property
     def duration(self) -> float:
@@ -336,10 +318,7 @@ def number_of(log: Log, name: str, default: float = 0.0) -> float:
 
 
 def throttle_of(firmware: FirmwareLog, signals: Signals, *, wanted: bool = False) -> Mix:
-    """The collective of the vehicle, where the log of one flight has it.
-
-    It is what the motors had, where that is known; with `wanted` what they were asked for.
-    """
+    """The channel with what the motors had, else with what they were asked for (`wanted`)."""
     for name, factor in reversed(firmware.throttle) if wanted else firmware.throttle:
         logged = (x for x in signals.arrays if x == name or x.endswith(f".{name}"))
         full = next(logged, name)
@@ -349,18 +328,11 @@ def throttle_of(firmware: FirmwareLog, signals: Signals, *, wanted: bool = False
 
 
 class Settings(NamedTuple):
-    """Firmware and parameters of a log, as text.
+    """Firmware and parameters of a log, as text."""
 
-    **Arguments:**
-
-    - `vehicle`: ardupilot, px4 or betaflight.
-    - `version`: of the firmware, (4, 2, 0); empty where the log does not say.
-    - `values`: by name: a Betaflight header's lines, ArduPilot's PARM, PX4's parameters.
-    """
-
-    vehicle: str
-    version: tuple[int, ...]
-    values: Mapping[str, str]
+    vehicle: str  # ardupilot, px4 or betaflight
+    version: tuple[int, ...]  # of the firmware, (4, 2, 0); empty where the log does not say
+    values: Mapping[str, str]  # a Betaflight header's lines, ArduPilot's PARM, PX4's parameters
 
 
 def read_settings(path: str | Path, *, log: str = "", at: Number | None = None) -> Settings:

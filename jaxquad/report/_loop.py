@@ -17,7 +17,7 @@ from jaxquad.identify import (
     with_values,
 )
 from jaxquad.models import Model
-from jaxquad.plot import plain_ticks, short_names, StepBand, steps_figure, unit_label
+from jaxquad.plot import add_hertz, plain_ticks, short_names, StepBand, steps_figure, unit_label
 from jaxquad.records import Record
 from jaxquad.spectra import BrokenLoop, Entry, FrequencyResponse, StepResponse
 
@@ -222,18 +222,11 @@ _BY_LAW = (
 
 
 class LawLoop(NamedTuple):
-    """The flown loop where the law is known.
+    """The flown loop where the law is known."""
 
-    **Attributes:**
-
-    - `measured`: law times measured response of the plant; `model`: times the identified one.
-    - `step`: from set-point to rate, of plants that the fit leaves possible.
-    - `unmodelled`: what the law leaves out.
-    """
-
-    measured: BrokenLoop
-    model: BrokenLoop | None
-    step: StepBand | None
+    measured: BrokenLoop  # law times measured response of the plant
+    model: BrokenLoop | None  # law times the identified one
+    step: StepBand | None  # from set-point to rate, of plants that the fit leaves possible
     unmodelled: Sequence[str] = ()
 
     @property
@@ -262,7 +255,28 @@ def loop_section(
             return None
         model, note = None, _ASSUMED[entry]
         origin = f"from {record.reference_names[0]} as {entry}"
-    facts = _margins(loop, model)
+    # Margins that are not seen are those of the model, where there is one.
+    shown, crossover, by = loop, loop.crossover, ""
+    if model is not None and np.isnan(crossover):
+        shown, crossover, by = model, model.crossover, " by the identified model"
+    if np.isnan(crossover):
+        low, high = shown.omega[[0, -1]] / (2 * np.pi)
+        where = f"|L| does not fall through 1 from {low:.3g} to {high:.3g} Hz"
+        facts = {"crossover": f"not seen: {where}, where the loop can be estimated"}
+    else:
+        (margin, error), (gain, place), beyond = shown.phase_margin, shown.gain_margin, ""
+        if model is not None and not np.isfinite(gain):
+            (gain, place), beyond = model.gain_margin, " by the identified model"
+        sure = f" \u00b1 {np.degrees(_SIGMAS * error):.2g} deg (95 %)" if error else " deg"
+        lowest = "not seen: the phase does not pass -180 deg where the loop can be estimated"
+        if np.isfinite(gain):
+            lowest = f"{20 * np.log10(gain):.3g} dB at {place / (2 * np.pi):.3g} Hz "
+            lowest += f"({place:.3g} rad/s){beyond}; 6 dB or more is usual"
+        facts = {
+            "crossover": f"{crossover / (2 * np.pi):.3g} Hz ({crossover:.3g} rad/s){by}",
+            "phase margin": f"{np.degrees(margin):.3g}{sure}; 45 deg or more is usual",
+            "gain margin": lowest,
+        }
     image = embed_figure(
         lambda: _draw_loop(loop, model),
         alt=f"Bode diagram of the broken loop with its 95 % band; crossover {facts['crossover']}.",
@@ -281,34 +295,6 @@ def entry_of(record: Record, frf: FrequencyResponse) -> Entry | None:
         return None
     entries: dict[str, Entry] = {output: "set-point", source: "plant input"}
     return entries.get(unit)
-
-
-def _margins(loop: BrokenLoop, model: BrokenLoop | None) -> dict[str, str]:
-    """Those that are not seen are those of the model, where there is one."""
-    crossover, by = loop.crossover, ""
-    if model is not None and np.isnan(crossover):
-        loop, crossover, by = model, model.crossover, " by the identified model"
-    if np.isnan(crossover):
-        low, high = loop.omega[[0, -1]] / (2 * np.pi)
-        where = f"|L| does not fall through 1 from {low:.3g} to {high:.3g} Hz"
-        return {"crossover": f"not seen: {where}, where the loop can be estimated"}
-    margin, error = loop.phase_margin
-    gain, place = loop.gain_margin
-    beyond = ""
-    if model is not None and not np.isfinite(gain):
-        (gain, place), beyond = model.gain_margin, " by the identified model"
-    sure = f" \u00b1 {np.degrees(_SIGMAS * error):.2g} deg (95 %)" if error else " deg"
-    facts = {
-        "crossover": f"{crossover / (2 * np.pi):.3g} Hz ({crossover:.3g} rad/s){by}",
-        "phase margin": f"{np.degrees(margin):.3g}{sure}; 45 deg or more is usual",
-        "gain margin": "not seen: the phase does not pass -180 deg where the loop can be estimated",
-    }
-    if np.isfinite(gain):
-        facts["gain margin"] = (
-            f"{20 * np.log10(gain):.3g} dB at {place / (2 * np.pi):.3g} Hz ({place:.3g} rad/s)"
-            f"{beyond}; 6 dB or more is usual"
-        )
-    return facts
 
 
 def _draw_loop(loop: BrokenLoop, model: BrokenLoop | None) -> Figure:
@@ -335,11 +321,8 @@ def _draw_loop(loop: BrokenLoop, model: BrokenLoop | None) -> Figure:
     phase.axhline(-180, color="0.3", lw=0.8)
     level.set(ylabel="|L|, dB", xscale="log")
     phase.set(ylabel="phase of L, deg", xlabel="frequency, rad/s")
-    turns = (lambda omega: omega / (2 * np.pi), lambda hertz: 2 * np.pi * hertz)
-    hertz = level.secondary_xaxis("top", functions=turns)
-    hertz.set_xlabel("frequency, Hz")
-    for axis in (phase.xaxis, hertz.xaxis):
-        plain_ticks(axis)
+    plain_ticks(phase.xaxis)
+    add_hertz(level)
     return figure
 
 

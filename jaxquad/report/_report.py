@@ -332,36 +332,36 @@ def spectrum_section(frf: FrequencyResponse, record: Record) -> Section | None:
         )
         for over in overs
     ]
-    return {"images": images, "text": _describe_line(record, output, top, throttle)}
+    line, above = find_line(record, output, above=top, over=throttle), top / (2 * np.pi)
+    if line is None:
+        text = f"No narrow line stands out of the spectrum of {output} above the identified band, "
+        return {"images": images, "text": f"{text}{above:.3g} Hz."}
+    hertz = [x / (2 * np.pi) for x in (line.omega, line.low, line.high)]
+    text = (
+        f"The strongest line of {output} above the identified band, {above:.3g} Hz, is at "
+        f"{hertz[0]:.3g} Hz ({line.omega:.3g} rad/s; 90 % of the time {hertz[1]:.3g} to "
+        f"{hertz[2]:.3g} Hz): {line.height:.0f} dB above its surroundings, in "
+        f"{100 * line.share:.0f} % of the windows."
+    )
+    if line.harmonics:
+        multiples = " and ".join(f"{m} times" for m in line.harmonics)
+        text += f" It has harmonics at {multiples} its frequency, as motors and propellers make."
+    ranked = f"(rank correlation {line.follows:.2f})"
+    if throttle is None:
+        text += " Record the throttle as well to tell a motor from a resonance of the frame."
+    elif line.follows > _FOLLOWS:
+        text += f" It rises with {throttle} {ranked}: motors."
+    elif abs(line.follows) < _STAYS:
+        text += (
+            f" It does not follow {throttle} {ranked}: a resonance of the frame or of the loop, "
+        )
+        text += "or an electrical line."
+    else:
+        text += f" Its rank correlation with {throttle} is {line.follows:.2f}."
+    return {"images": images, "text": text}
 
 
 def throttle_of(record: Record) -> str | None:
     """The channel whose name is that of a throttle, if there is one that moves."""
     named = [name for name in record.names if _THROTTLE.search(name)]
     return next((name for name in named if np.ptp(record.channel(name)) > 0), None)
-
-
-def _describe_line(record: Record, output: str, top: float, throttle: str | None) -> str:
-    line = find_line(record, output, above=top, over=throttle)
-    above = f"above the identified band, {top / (2 * np.pi):.3g} Hz"
-    if line is None:
-        return f"No narrow line stands out of the spectrum of {output} {above}."
-    hertz = [x / (2 * np.pi) for x in (line.omega, line.low, line.high)]
-    text = (
-        f"The strongest line of {output} {above}, is at {hertz[0]:.3g} Hz ({line.omega:.3g} rad/s; "
-        f"90 % of the time {hertz[1]:.3g} to {hertz[2]:.3g} Hz): {line.height:.0f} dB above its "
-        f"surroundings, in {100 * line.share:.0f} % of the windows."
-    )
-    if line.harmonics:
-        multiples = " and ".join(f"{m} times" for m in line.harmonics)
-        text += f" It has harmonics at {multiples} its frequency, as motors and propellers make."
-    if throttle is None:
-        return f"{text} Record the throttle as well to tell a motor from a resonance of the frame."
-    if line.follows > _FOLLOWS:
-        return f"{text} It rises with {throttle} (rank correlation {line.follows:.2f}): motors."
-    if abs(line.follows) < _STAYS:
-        return (
-            f"{text} It does not follow {throttle} (rank correlation {line.follows:.2f}): a "
-            "resonance of the frame or of the loop, or an electrical line."
-        )
-    return f"{text} Its rank correlation with {throttle} is {line.follows:.2f}."

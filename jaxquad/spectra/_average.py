@@ -1,17 +1,46 @@
 """Responses, coherence and errors from windowed transforms of one or several window lengths."""
 
-from collections.abc import Callable
+import functools as ft
+import itertools
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Complex, Float
 
-from ._error_covariance import window_products
-from ._estimators import adjoint, diagonal, Grid, Levels, Pairs, power_of, Responses
-from ._fourier_sums import coefficients, Layout
-from ._noise import noise_root, padded, Resolved, Slopes, without_leakage
+from jaxquad._core import one_blas_thread
+from jaxquad.records import Record
+
+from ._error_covariance import ErrorCovariance, place_windows, window_products
+from ._estimators import (
+    adjoint,
+    check_excitation,
+    Composite,
+    diagonal,
+    Grid,
+    in_hertz,
+    Method,
+    Pairs,
+    power_of,
+    Remark,
+    Responses,
+    Welch,
+)
+from ._fourier_sums import coefficients
+from ._frequency_response import Estimate
+from ._noise import covariance_of_windows, noise_root, padded, Resolved, smoothed, without_leakage
+from ._welch import frequencies_for, transform_records
 
 
+_ROUNDING = 1e-14  # of a Fourier sum, relative to the largest value summed
+_CORRELATED = 0.5  # average coherence of inputs above which Tischler & Remple, ch. 9, warn
+_LOST = 0.9999
+_LEAKED = 3.0  # bias over random error, averaged over a third of an octave, that is remarked
+_AVERAGED = 0.2  # in ln(omega)
+_FEW = (
+    "only {count:.1f} independent windows: the coherence is near 1 for any signals, and the error "
+    "bars are rough. Record longer, or use a shorter window"
+)
 _TINY = 1e-300
 _COHERENCE_WEIGHT = 5.0
 _STEPS = 5  # of Gauss-Newton; each gains two digits or more
@@ -23,17 +52,6 @@ Products = Complex[np.ndarray, "groups frequencies channels channels"]
 Counts = Float[np.ndarray, " groups"]
 _Powers = Float[np.ndarray, "*groups frequencies inputs"]
 _Pairs = Float[np.ndarray, "*groups frequencies outputs inputs"]
-
-
-class Segments(NamedTuple):
-    """Transforms of windows for each length, in absolute phase, by the channels of `Record.names`.
-
-    The starts in `groups` are of the records one after the other, with gaps wider than any window.
-    """
-
-    transforms: tuple[Complex[np.ndarray, "frequencies windows channels"], ...]
-    slopes: tuple[Slopes, ...]  # empty where they are not needed, or nothing follows from them
-    groups: Layout
 
 
 class Channels(NamedTuple):
@@ -64,8 +82,7 @@ class Conditioned(NamedTuple):
 
 
 def condition(products: Products, channels: Channels, counts: Counts) -> Conditioned:
-    """`(Z* X)^-1 Z* Y` from the sums of `conj(a) b` (Bendat & Piersol, ch. 7; Tischler & Remple,
-    ch. 9)."""
+    """`(Z* X)^-1 Z* Y` from sums of `conj(a) b` (Bendat, Piersol ch. 7; Tischler, Remple ch. 9)."""
 
     def inverse(matrix: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
         """That of matrices in any units, which `rows` and `columns` are."""
@@ -97,16 +114,13 @@ def condition(products: Products, channels: Channels, counts: Counts) -> Conditi
     rest = np.maximum(total - explained, 0.0)
     answer = rest[..., None] + through
     count = counts[:, None, None]
+    share = 1 / (least * np.maximum(diagonal(moving), _TINY))
+    moved = np.minimum(diagonal(moving) / np.maximum(power[..., x], _TINY), 1.0)
+    multiple = np.clip(1 - rest / np.maximum(total, _TINY), 0.0, 1.0)
     return Conditioned(
-        response,
-        solver,
-        1 / (least * count),
-        1 / (least * np.maximum(diagonal(moving), _TINY)),
-        answer / count[..., None],
-        through / np.maximum(answer, _TINY),
-        np.minimum(diagonal(moving) / np.maximum(power[..., x], _TINY), 1.0),
-        np.clip(1 - rest / np.maximum(total, _TINY), 0.0, 1.0),
-    )
+        response, solver, 1 / (least * count), share, answer / count[..., None],
+        through / np.maximum(answer, _TINY), moved, multiple,
+    )  # fmt: skip
 
 
 class Combined(NamedTuple):
@@ -164,48 +178,55 @@ def combine(parts: Conditioned, scales: Counts, freedom: Counts, resolved: Resol
     )
 
 
-class Averaged(NamedTuple):
-    response: Responses
-    coherence: Pairs
-    random_error: Pairs
-    direct_coherence: Pairs
-    multiple_coherence: Levels
-    alone: Float[np.ndarray, "frequencies inputs"]  # share of an input's power, nan without any
-    effect: Complex[np.ndarray, "frequencies inputs windows"]
-    share: Shares
-    noise: Complex[np.ndarray, "frequencies outputs roots"]
-    freedom: Float[np.ndarray, "frequencies outputs groups"]  # complex, of each length's noise
-    # What leakage adds to the response, relative, and the standard error of that.
-    leakage: Callable[[], Float[np.ndarray, "2 frequencies outputs inputs"]]
-
-
+@one_blas_thread()
 @np.errstate(divide="ignore", invalid="ignore", over="ignore")
-def average(
-    segments: Segments,
-    sums: Products,
-    channels: Channels,
-    omega: Grid,
-    dt: float,
-    shape: str,
-    independent: Counts,
-) -> Averaged:
-    """One response from all window lengths, with the effect of noise in each window."""
-    lengths, starts = zip(*segments.groups, strict=True)
-    transforms, many = segments.transforms, tuple(map(len, starts))
-    overlap, counts = window_products(segments.groups, shape), np.array(many, float)
+def average_windows(
+    records: Sequence[Record], omega: Grid | None, spectra: Welch | Composite, method: Method
+) -> Estimate:
+    """Response by averages over tapered windows of one or several lengths."""
+    single = isinstance(spectra, Welch)
+    members = (spectra,) if single else spectra.windowed(records, omega)
+    omega, welch = frequencies_for(omega, records, members[0]), members[0]
+    segments = transform_records(records, omega, members, derivatives=2)
+    first, dt, groups = records[0], records[0].dt, segments.groups
+    instruments = len(first.reference_names) if method == "joint" else 0
+    channels = Channels(len(first.input_names), len(first.output_names), instruments)
+    lengths, starts = zip(*groups, strict=True)
+    many = tuple(map(len, starts))
+    independent = sum(record.samples for record in records) / np.array(lengths)  # n_d
+    sums = np.stack([adjoint(part) @ part for part in segments.transforms])
+    for count, windows in zip(independent, many, strict=True):
+        if windows <= channels.inputs or count < channels.inputs:
+            raise ValueError(
+                f"{count:.1f} independent windows are too few for {channels.inputs} inputs: use "
+                f"a window shorter than 1/{channels.inputs + 2} of the record, or record longer"
+            )
+    # Mean power of the inputs and of the instruments, in the longest windows.
+    power = diagonal(sums[0]) / many[0]
+    largest = check_excitation(records, method)
+    for name in first.input_names + first.reference_names[:instruments]:
+        place = first.names.index(name)
+        least = _ROUNDING * coefficients(welch.shape)[0] * welch.length(records) * largest[place]
+        lost = np.flatnonzero(~(np.sqrt(power[:, place]) > least))
+        if lost.size:
+            raise ValueError(
+                f"no excitation at {in_hertz(omega[lost[:1]])}: the spectrum of {name!r} is zero "
+                "there. Keep the frequencies within the band that was excited"
+            )
+    transforms, counts = segments.transforms, np.array(many, float)
+    overlap = window_products(groups, welch.shape)
     averages = np.maximum(independent - channels.inputs + 1, 0.5)
-    level, cosine = coefficients(shape)
+    level, cosine = coefficients(welch.shape)
     scales = 2 * dt / ((level**2 + cosine**2 / 2) * np.array(lengths))  # to one-sided densities
     resolving = np.array([np.inf, *lengths[1:]])  # the longest window is used everywhere
     resolved = (omega * dt)[None, :] * resolving[:, None] >= 2 * np.pi * _CYCLES
     parts = condition(sums, channels, counts)
     if len(many) > 1:
-        combined = combine(parts, scales, averages, resolved)
+        response, coherence, share = combine(parts, scales, averages, resolved)
     else:
-        response, coherence = parts.response[0], parts.coherence[0]
-        lesser = np.minimum(coherence, parts.instrument_share[0][:, None, :])
-        combined = Combined(response, lesser, np.ones((*response.shape, 1)))
-    alone = np.einsum("fig,gfi->fi", np.mean(combined.share, axis=1), parts.alone)
+        response, moved = parts.response[0], parts.instrument_share[0][:, None, :]
+        coherence, share = np.minimum(parts.coherence[0], moved), np.ones((*response.shape, 1))
+    alone = np.einsum("fig,gfi->fi", np.mean(share, axis=1), parts.alone)
     inseparable = ~(alone >= _DEPENDENT)
     lost = np.any(inseparable, axis=1)
     if np.any(lost):  # finite placeholders, which are marked as nan below
@@ -214,60 +235,107 @@ def average(
         multiple = np.where(lost[:, None], 0.0, multiple)
         parts = parts._replace(solver=solver, multiple=multiple)
         equal = (resolved / np.sum(resolved, axis=0)).T[:, None, None]
-        combined = Combined(
-            np.where(gone, 1e-300, combined.response),
-            np.where(gone, 0.0, combined.coherence),
-            np.where(gone[..., None], equal, combined.share),
-        )
+        response, coherence = np.where(gone, 1e-300, response), np.where(gone, 0.0, coherence)
+        share = np.where(gone[..., None], equal, share)
     instruments = [adjoint(channels.split(part)[0]) for part in transforms]
     effect = np.concatenate(list(map(np.matmul, parts.solver, instruments)), axis=2)
     # Variance of the responses under noise of unit power: pair of lengths by pair, since their
     # shares differ between outputs.
-    first, gain = np.cumsum((0, *many[:-1])), np.zeros(combined.share.shape[:3])
+    begins, gain = np.cumsum((0, *many[:-1])), np.zeros(share.shape[:3])
     rows = effect.reshape(-1, len(overlap))
     rows = np.concatenate([np.real(rows), np.imag(rows)])
-    for g, (start, end) in enumerate(zip(first, (*first[1:], len(overlap)), strict=True)):
+    for g, (start, end) in enumerate(zip(begins, (*begins[1:], len(overlap)), strict=True)):
         products = (rows[:, start:end] @ overlap[start:end, start:]) * rows[:, start:]
-        both = np.add.reduceat(products, first[g:] - start, axis=1)
+        both = np.add.reduceat(products, begins[g:] - start, axis=1)
         pairs = np.sum(both.reshape(2, *effect.shape[:2], -1), axis=0)
         pairs[..., 1:] *= 2.0  # each pair of lengths once
-        gain += combined.share[..., g] * np.einsum("fih,foih->foi", pairs, combined.share[..., g:])
+        gain += share[..., g] * np.einsum("fih,foih->foi", pairs, share[..., g:])
     windows = [channels.split(part)[1:] for part in transforms]
-    rest = without_leakage(windows, combined.response, segments.slopes, overlap, resolved)
-    weights = np.mean(combined.share, axis=2)
+    rest = without_leakage(windows, response, segments.slopes, overlap, resolved)
+    weights = np.mean(share, axis=2)
     trust = np.where(lost, 1e-9, 1.0)[:, None, None]
     outputs = np.moveaxis(channels.split(diagonal(sums))[2], 0, 2)
     noise = noise_root(omega, rest, outputs, weights * trust)
     power = np.sum(power_of(noise), axis=2)
-    error = np.sqrt(power[:, :, None] * gain / 2) / np.abs(combined.response)
-    response, coherence, direct = combined.response, combined.coherence, combined.coherence
+    error = np.sqrt(power[:, :, None] * gain / 2) / np.abs(response)
+    direct, finite = coherence, response
     if channels.instruments:  # partial coherence of inputs and outputs, without the instruments
         plain = condition(sums, channels._replace(instruments=0), counts).coherence
-        direct = np.einsum("foig,gfoi->foi", combined.share, plain)
+        direct = np.einsum("foig,gfoi->foi", share, plain)
     if np.any(lost):
         none = (response, np.nan), (coherence, 0.0), (error, np.inf)
         mask = inseparable[:, None, :]
         response, coherence, error = (np.where(mask, blank, field) for field, blank in none)
 
     def leakage() -> Float[np.ndarray, "2 frequencies outputs inputs"]:
-        biases = [fit.bias(*combined.response.shape[1:]) for fit in rest.fits]
+        biases = [fit.bias(*finite.shape[1:]) for fit in rest.fits]
         bias, square = (padded(part, omega.size) for part in zip(*biases, strict=True))
-        added = np.abs(np.sum(bias * combined.share, axis=3))
-        spread = np.sum(combined.share * np.sqrt(square), axis=3)
+        added = np.abs(np.sum(bias * share, axis=3))
+        spread = np.sum(share * np.sqrt(square), axis=3)
         doubt = np.sqrt(power / 2)[:, :, None] * spread
         with np.errstate(divide="ignore", invalid="ignore"):
-            return np.stack([added, doubt]) / np.abs(combined.response)
+            return np.stack([added, doubt]) / np.abs(finite)
 
-    return Averaged(
-        response,
-        coherence,
-        error,
-        direct,
-        np.einsum("fog,gfo->fo", weights, parts.multiple),
-        alone,
-        effect,
-        combined.share,
-        noise,
-        rest.freedom,
-        leakage,
-    )
+    multiple = np.einsum("fog,gfo->fo", weights, parts.multiple)
+    weights, freedom = np.mean(weights, axis=1), np.mean(rest.freedom, axis=1)
+    levels = weights / np.sqrt(freedom)
+    log_noise = covariance_of_windows(omega * dt, levels, welch.shape, lengths)
+    log_noise = smoothed(omega, log_noise, np.sum(weights * freedom, axis=1))
+    placement = place_windows(groups, welch.shape, dt, omega[-1] - omega[0])
+    errors = ErrorCovariance(omega, effect, noise, share, placement, many)
+    most = float(np.max(independent))
+    return Estimate(
+        omega, response, coherence, direct, multiple, errors, error, log_noise,
+        ft.partial(_remarks, first, omega, error, alone, leakage, most),
+        resolution=2 * np.pi / (lengths[0] * dt),
+    )  # fmt: skip
+
+
+def _remarks(
+    record: Record,
+    omega: Grid,
+    error: Pairs,
+    alone: Float[np.ndarray, "frequencies inputs"],
+    leakage: Callable[[], Float[np.ndarray, "2 frequencies outputs inputs"]],
+    independent: float,
+) -> tuple[Remark, ...]:
+    """On inputs that are alike, on leakage with its standard error, and on few windows."""
+    remarks, names = [], record.input_names
+    coherence = 1 - np.nan_to_num(alone)  # of each input with all others
+    for i, name in enumerate(names if len(names) > 1 else ()):
+        lost = coherence[:, i] > _LOST
+        if np.any(lost):
+            text = (
+                f"input {name} cannot be separated from the other inputs {{where}}; they are left "
+                "out. Excite the inputs independently, one after the other or with interleaved "
+                "multisines"
+            )
+            remarks.append(Remark(text, omega[lost], kind="undetermined"))
+        elif np.mean(coherence[:, i]) > _CORRELATED:
+            text = (
+                f"input {name} is correlated with the other inputs: their average coherence is "
+                f"{coherence[:, i].mean():.2f} (limit {_CORRELATED}), so the errors of conditioned "
+                f"responses are larger. Excite the inputs independently"
+            )
+            remarks.append(Remark(text, kind="correlated inputs"))
+    # Pairs whose response leakage biases, clearly and beyond the random error.
+    kernel = np.exp(-0.5 * (np.log(omega[:, None] / omega) / _AVERAGED) ** 2)
+    bias, doubt = leakage()
+    least = np.maximum(doubt, error)
+    with np.errstate(invalid="ignore"):
+        ratio = np.where(np.isfinite(least) & np.isfinite(bias), bias / least, 0.0)
+    for (o, output), (i, source) in itertools.product(
+        enumerate(record.output_names), enumerate(names)
+    ):
+        leaked = kernel @ ratio[:, o, i] ** 2 > _LEAKED**2 * np.sum(kernel, axis=1)
+        if np.any(leaked):
+            text = (
+                f"leakage through the window biases the response by about "
+                f"{100 * np.median(bias[leaked, o, i]):.2g} % {{where}}; the random error does not "
+                "include it. Use «jq.spectra.LocalPolynomial()», which estimates leakage, a longer "
+                "window, or «integrators=» where the plant integrates"
+            )
+            remarks.append(Remark(text, omega[leaked], (output, source), "leakage"))
+    if independent < 3:
+        remarks.append(Remark(_FEW.format(count=independent), kind="few windows"))
+    return tuple(remarks)

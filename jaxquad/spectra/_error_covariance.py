@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 
 from jaxquad._core import pytree_node
 
-from ._estimators import Pairs, Places
+from ._estimators import adjoint, Pairs, Places
 from ._fourier_sums import coefficients, Layout
 
 
@@ -115,28 +115,15 @@ class ErrorCovariance:
         weighted = columns.conj()[..., None, :] * self._shares[..., None]  # f o i g p
         drawn = np.einsum("foigp,foc->figcp", weighted, np.asarray(self.noise))
         total = np.zeros((count, count))
-        for part in self._drawn(drawn, columns):
-            part = part.reshape(-1, count)
-            total += 0.5 * np.real(part.T @ part.conj())
-        return total
-
-    def _drawn(
-        self,
-        drawn: Complex[np.ndarray, "frequencies inputs groups roots columns"],
-        columns: Complex[np.ndarray, "frequencies outputs inputs columns"],
-    ) -> Iterator[Complex[np.ndarray, "atoms roots_columns"]]:
-        """What unit noise does to Re(sum of `conj(columns) dT`), by pieces of the times or the
-        atoms."""
         if self.windows is not None:
-            along = np.swapaxes(drawn, 1, 2).reshape(-1, drawn.shape[3] * drawn.shape[4])
-            for k in range(0, self.windows.times.size, _CHUNK):
-                effect = self._at(self.windows.times[k : k + _CHUNK])
-                yield effect.reshape(-1, effect.shape[3]).T @ along
-            return
+            along = np.swapaxes(drawn, 1, 2).reshape(-1, drawn.shape[3] * count)
+            for effect in self._in_pieces():
+                part = (effect.reshape(-1, effect.shape[3]).T @ along).reshape(-1, count)
+                total += 0.5 * np.real(part.T @ part.conj())
+            return total
         effect, reach, driven = np.asarray(self.effect), self._reach, self._driven
-        values, moved = drawn.reshape(*effect.shape[:2], -1), np.zeros((0, columns.shape[3]))
-        drive = np.zeros((0, 0, 0), complex)
-        begin, end = int(np.min(reach.first)), int(np.max(reach.last))
+        values, drive = drawn.reshape(*effect.shape[:2], -1), np.zeros((0, 0, 0), complex)
+        begin, end, moved = int(np.min(reach.first)), int(np.max(reach.last)), None
         if self.sensitivity is not None and self.drive is not None:
             slope, drive = np.asarray(self.sensitivity), np.asarray(self.drive)
             moved = np.real(np.tensordot(slope, columns.conj(), axes=((0, 1, 2), (0, 1, 2))))
@@ -144,11 +131,13 @@ class ErrorCovariance:
         for low in range(begin, end, _ATOMS):
             part = np.zeros((min(_ATOMS, end - low), values.shape[2]), complex)
             add_effects(part, low, effect, reach, values)
-            if drive.size:
+            if moved is not None:
                 taken = slice(*np.searchsorted(driven, (low, low + len(part))))
                 both = np.einsum("nac,np->acp", drive[:, taken], moved)
                 part[driven[taken] - low] += both.reshape(len(both), part.shape[1])
-            yield part
+            part = part.reshape(-1, count)
+            total += 0.5 * np.real(part.T @ part.conj())
+        return total
 
     def variance(self) -> Pairs:
         """Mean squared error E|dT|^2 of each response, for independent atoms (no windows)."""
@@ -157,15 +146,13 @@ class ErrorCovariance:
                 "the errors of overlapping windows are correlated: use the diagonal of "
                 "errors.between(pair, pair)"
             )
-        effect, noise = np.asarray(self.effect), np.asarray(self.noise)
-        gain, power = (np.vecdot(x, x).real for x in (effect, noise))
+        gain, power = (np.vecdot(x, x).real for x in map(np.asarray, (self.effect, self.noise)))
         total = power[:, :, None] * gain[:, None, :] * self._shares[..., 0] ** 2
         if self.sensitivity is None or self.drive is None:
             return total
         slope = np.asarray(self.sensitivity)
-        crossed = np.sum(self._with_parameters() * np.conj(slope), axis=3)
-        moved = np.sum(slope @ self._parameters() * np.conj(slope), axis=3)
-        return np.maximum(total + np.real(crossed + moved), 0.0)
+        moved = self._with_parameters() + slope @ self._parameters()
+        return np.maximum(total + np.real(np.sum(moved * np.conj(slope), axis=3)), 0.0)
 
     def between(
         self, first: tuple[int, int], second: tuple[int, int]
@@ -203,26 +190,23 @@ class ErrorCovariance:
         """Covariance E[dT dT^H] of all pairs (output, input), output by output."""
         noise, share = np.asarray(self.noise), self._shares
         shape = (len(noise), share.shape[1] * share.shape[2])
-        spread = noise @ np.conj(np.swapaxes(noise, 1, 2))
+        spread = noise @ adjoint(noise)
         if self.windows is None:
             parts = iter([share[:, :, :, 0, None] * np.asarray(self.effect)[:, None]])
         else:
-            times = self.windows.times
-            at = (self._at(times[k : k + _CHUNK]) for k in range(0, times.size, _CHUNK))
-            parts = (np.einsum("foig,fgit->foit", share, effect) for effect in at)
+            parts = (np.einsum("foig,fgit->foit", share, effect) for effect in self._in_pieces())
         total = np.zeros((*shape, shape[1]), complex)
         for part in parts:
             part = part.reshape(*shape, -1)
-            total += part @ np.conj(np.swapaxes(part, 1, 2))
+            total += part @ adjoint(part)
         total = total.reshape(-1, *2 * share.shape[1:3]) * spread[:, :, None, :, None]
         total = total.reshape(*shape, -1)
         if self.sensitivity is None or self.drive is None:
             return total
         slope = np.asarray(self.sensitivity).reshape(*shape, -1)
-        adjoint = np.conj(np.swapaxes(slope, 1, 2))
-        moved = slope @ self._parameters() @ adjoint
-        mixed = 0.5 * (self._with_parameters().reshape(*shape, -1) @ adjoint)
-        return total + moved + mixed + np.conj(np.swapaxes(mixed, 1, 2))
+        moved = slope @ self._parameters() @ adjoint(slope)
+        mixed = 0.5 * (self._with_parameters().reshape(*shape, -1) @ adjoint(slope))
+        return total + moved + mixed + adjoint(mixed)
 
     def pair(self, output: int, input: int) -> "ErrorCovariance":
         """That of a single response."""
@@ -278,6 +262,12 @@ class ErrorCovariance:
         crossed = crossed.reshape(*effect.shape[:2], parameters, roots)
         return np.einsum("finc,foc->foin", crossed, np.asarray(self.noise), optimize=True)
 
+    def _in_pieces(self) -> Iterator[Complex[np.ndarray, "frequencies groups inputs times"]]:
+        """`_at` all times, some at once: those of a long record would not fit the memory."""
+        assert self.windows is not None
+        times = self.windows.times
+        return (self._at(times[k : k + _CHUNK]) for k in range(0, times.size, _CHUNK))
+
     def _at(
         self, times: Float[np.ndarray, " times"]
     ) -> Complex[np.ndarray, "frequencies groups inputs times"]:
@@ -293,15 +283,7 @@ class ErrorCovariance:
 def independent_errors(
     omega: Float[Numbers, " frequencies"], variance: Float[Numbers, "frequencies outputs inputs"]
 ) -> ErrorCovariance:
-    """The covariance of uncorrelated errors.
-
-    **Arguments:**
-
-    - `omega`: frequencies in rad/s.
-    - `variance`: E|dT|^2 of each response, shape `(frequencies, outputs, inputs)`.
-
-    **Returns:** an `ErrorCovariance`.
-    """
+    """The covariance of uncorrelated errors; `variance` is E|dT|^2 of each response."""
     share = np.sqrt(np.asarray(variance))
     count, outputs, inputs = share.shape
     effect = np.broadcast_to(np.eye(inputs, dtype=complex), (count, inputs, inputs))

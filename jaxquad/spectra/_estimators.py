@@ -276,9 +276,7 @@ class LocalPolynomial(eqx.Module):
         and added back, so that modes which still ring at the record's end do not spoil them. 0
         switches it off.
 
-    **Raises:**
-
-    - `ValueError`: for values out of range.
+    **Raises:** ValueError for values out of range.
     """
 
     order: int = eqx.field(static=True, default=2)
@@ -316,9 +314,7 @@ class Welch(eqx.Module):
     - `delay`: approximate delay of the output in s, which is removed before windowing and restored
         afterwards: otherwise input and output are weighted differently (1 % at the end of a sweep).
 
-    **Raises:**
-
-    - `ValueError`: for values out of range.
+    **Raises:** ValueError for values out of range.
     """
 
     window_length: float | None = eqx.field(static=True, default=None)
@@ -377,9 +373,7 @@ class Composite(eqx.Module):
         highest frequency.
     - `overlap`, `shape`, `detrend`, `integrators`, `delay`: as in `Welch`.
 
-    **Raises:**
-
-    - `ValueError`: for values out of range, and for no window or two equal ones.
+    **Raises:** ValueError for values out of range, and for no window or two equal ones.
     """
 
     windows: tuple[float, ...] | None = eqx.field(static=True, default=None)
@@ -425,9 +419,7 @@ class Periodic(eqx.Module):
     - `period`: in s, a whole number of samples.
     - `discard`: number of periods at the start of each record that are left out as transient.
 
-    **Raises:**
-
-    - `ValueError`: for values out of range.
+    **Raises:** ValueError for values out of range.
     """
 
     period: float = eqx.field(static=True)

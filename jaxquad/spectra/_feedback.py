@@ -66,8 +66,7 @@ _FED_BACK = (
 def remarks_on_feedback(
     records: Sequence[Record], method: Method, estimate: Estimate
 ) -> tuple[Remark, ...]:
-    """Remarks on feedback; points whose errors overlapping windows correlate count as
-    independent."""
+    """Remarks on feedback; points of overlapping windows count as independent."""
     from scipy.special import ndtri
 
     outputs, inputs, omega = records[0].output_names, records[0].input_names, estimate.omega
@@ -142,12 +141,7 @@ class PhaseSlope(NamedTuple):
     def rises(
         self, response: Response, covariance: Covariance | None = None, clear: float = 3.0
     ) -> bool:
-        """Whether the phase increases by `clear` standard errors, as that of -1/C and of no
-        actuator.
-
-        Neighbours share noise: the `covariance` is asked for where the points alone say that it
-        rises.
-        """
+        """Whether the phase rises by `clear` standard errors: as that of -1/C, no actuator's."""
         variance, top = self.variance, self.top
         if covariance is not None and self.value > clear * np.sqrt(variance):
             turned = self.pull / np.conj(response[top])
@@ -285,9 +279,7 @@ def deembed(
     **Returns:** the `FrequencyResponse` of the plant, with a remark where the loop amplifies the
     errors of the closed loop more than ten times.
 
-    **Raises:**
-
-    - `ValueError`: for another entry, or responses with more than one input or output.
+    **Raises:** ValueError for another entry, or responses with more than one input or output.
     """
     measured = np.asarray(closed.response)
     feedback = np.asarray(controller.frequency_response(jnp.asarray(closed.omega)))
@@ -377,9 +369,7 @@ def feedback_bias(
 
     **Returns:** a `FeedbackBias`, which prints as a summary.
 
-    **Raises:**
-
-    - `ValueError`: for other channels, and for frequencies that the window does not resolve.
+    **Raises:** ValueError for other channels, and for frequencies that the window does not resolve.
     """
     records = [record] if isinstance(record, Record) else list(record)
     check_compatible(records)

@@ -39,20 +39,12 @@ _Spectra = Complex[np.ndarray, "windows frequencies"]
 
 
 class BrokenLoop(NamedTuple):
-    """The response of a loop L that is broken at its error, as `estimate_broken_loop` estimates it.
+    """The response of a loop L broken at its error, as `estimate_broken_loop` estimates it."""
 
-    **Attributes:**
-
-    - `omega`: rad/s.
-    - `response`: L, with negative feedback: closed as 1 + L = 0.
-    - `error`: standard error, relative and in rad.
-    - `coherence`: of the reference with what it was estimated from.
-    """
-
-    omega: Grid
-    response: Response
-    error: Grid
-    coherence: Grid
+    omega: Grid  # rad/s
+    response: Response  # L, with negative feedback: closed as 1 + L = 0
+    error: Grid  # standard error, relative and in rad
+    coherence: Grid  # of the reference with what it was estimated from
 
     @property
     def crossover(self) -> float:
@@ -135,12 +127,7 @@ def estimate_broken_loop(
     answer = output or record.output_names[0]
     answer = answer if entry == "set-point" else input or record.input_names[0]
     size = 2 * (record.samples // (_PARTS + 1))
-    starts = np.arange(0, record.samples - size + 1, size // 2)
-    taper = np.sin(np.pi * (np.arange(size) + 0.5) / size) ** 2
-    one, other = (
-        np.fft.rfft(taper * (x - x.mean())[starts[:, None] + np.arange(size)], axis=1)
-        for x in (record.channel(source), record.channel(answer))
-    )
+    one, other = (_spectra(_windows(record.channel(name), size)) for name in (source, answer))
     fine = 2 * np.pi * np.fft.rfftfreq(size, record.dt)
     low, high = band or (_CYCLES * fine[1], 0.2 * 2 * np.pi * record.sample_rate)
     edges = np.geomspace(max(low, 2 * fine[1]), min(high, fine[-2]), _LINES + 1)
@@ -168,29 +155,18 @@ def estimate_broken_loop(
 
 
 class StepResponse(NamedTuple):
-    """What an output does after a step of 1 in a reference, as `estimate_step` estimates it.
+    """What an output does after a step of 1 in a reference, as `estimate_step` estimates it."""
 
-    **Attributes:**
-
-    - `time`: s after the step, from a quarter of the length before it.
-    - `mean`: the response, over all windows, in output units per reference unit.
-    - `standard_error`: of the mean, from the scatter between windows.
-    - `windows`: the response in each active window by itself.
-    - `resolution`: what the estimator would make of a perfect step: how the reference's lack of
-      power at some frequencies blurs and tilts the mean.
-    - `total`: windows of the record; `windows` are those in which the reference is active.
-    - `names`: reference and output.
-    - `simulated`, `simulated_error`: the same of a simulated output, where one was given.
-    """
-
-    time: Samples  # s
-    mean: Samples
-    standard_error: Samples
-    windows: Float[np.ndarray, "windows samples"]
+    time: Samples  # s after the step, from a quarter of the length before it
+    mean: Samples  # over all windows, in output units per reference unit
+    standard_error: Samples  # of the mean, from the scatter between windows
+    windows: Float[np.ndarray, "windows samples"]  # the response in each active one by itself
+    # What the estimator would make of a perfect step: how the reference's lack of power at some
+    # frequencies blurs and tilts the mean.
     resolution: Samples
-    total: int
-    names: tuple[str, str]
-    simulated: Samples | None = None
+    total: int  # windows of the record; `windows` are those in which the reference is active
+    names: tuple[str, str]  # reference and output
+    simulated: Samples | None = None  # the mean of a simulated output, where one was given
     simulated_error: Samples | None = None
 
     @property
@@ -324,10 +300,7 @@ def estimate_step(
             f"{record.duration:.4g} s at {record.sample_rate:.4g} Hz: choose another length"
         )
     moves = _moves(record.channel(names[0]), size, _RESTS)[:, None]
-    taper = np.sin(np.pi * (np.arange(size) + 0.5) / size) ** 2
-    source, answer = (
-        np.fft.rfft(taper * _windows(record.channel(name), size), axis=1) * moves for name in names
-    )
+    source, answer = (_spectra(_windows(record.channel(name), size)) * moves for name in names)
     noise = _noise_over_response(source, answer)
     power = np.sum(np.abs(source) ** 2, axis=0)
     bottom = np.maximum(power + noise, 1e-300)
@@ -338,7 +311,7 @@ def estimate_step(
             away = windows - _windows(record.channel(names[1]), size)
             basis = np.linalg.qr(np.vander(np.linspace(-1, 1, size), drift + 1))[0]
             windows = windows - away @ basis @ basis.T
-        answers.append(np.fft.rfft(taper * windows, axis=1) * moves)
+        answers.append(_spectra(windows) * moves)
     before, after = int(round(length / 4 / dt)), int(round(length / dt))
 
     def integrate(transfer: _Spectra) -> Float[np.ndarray, "windows samples"]:
@@ -375,6 +348,11 @@ def _windows(values: Samples, size: int) -> Float[np.ndarray, "windows size"]:
     """Windows that overlap by half, of the channel less its mean."""
     starts = np.arange(0, values.size - size + 1, size // 2)
     return (values - values.mean())[starts[:, None] + np.arange(size)]
+
+
+def _spectra(windows: Float[np.ndarray, "windows size"]) -> _Spectra:
+    size = windows.shape[1]
+    return np.fft.rfft(np.sin(np.pi * (np.arange(size) + 0.5) / size) ** 2 * windows, axis=1)
 
 
 def _moves(values: Samples, size: int, share: float) -> Bool[np.ndarray, " windows"]:

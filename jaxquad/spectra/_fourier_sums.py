@@ -20,6 +20,13 @@ from jaxquad._core import require_x64
 Grid = Float[np.ndarray, " frequencies"]
 Layout = tuple[tuple[int, tuple[int, ...]], ...]  # length and starts of each set of windows
 
+_BLOCKS = (32, 1024)  # samples to a block that windows of several lengths share
+_SHORT = 128  # samples below which a window is summed directly
+_AT_ONCE = 128  # blocks, about, whose sums stay in the processor's cache
+_TOLERANCE = 6e-14  # of a block's waves; leaves 2e-13 of the largest Fourier sum
+_THIN = 256  # samples that show a constant well enough
+_TRENDS = ("none", "constant", "linear")
+
 _SHAPES = {"hann": (0.5, 0.5), "hamming": (0.54, 0.46), "rectangular": (1.0, 0.0)}
 
 
@@ -31,8 +38,7 @@ def window(name: str, samples: int) -> Float[np.ndarray, " window"]:
 
 
 def waves(name: str) -> tuple[float, float, float]:
-    """level - cosine cos a - sine sin a of a window, a = 2 pi n / samples; primes stand for
-    d/da."""
+    """level - cosine cos a - sine sin a of a window, a = 2 pi n / samples; primes are d/da."""
     plain = name.rstrip("'")
     (level, cosine), sine = coefficients(plain), 0.0
     for _ in range(len(name) - len(plain)):
@@ -55,18 +61,11 @@ def segment_starts(samples: int, length: int, overlap: float) -> tuple[int, ...]
     return tuple(int(start) for start in np.round(np.linspace(0, samples - length, count)))
 
 
-_BLOCKS = (32, 1024)  # samples to a block that windows of several lengths share
-
-
 @ft.lru_cache(maxsize=64)
 def lattice_windows(
     samples: int, lengths: tuple[int, ...], overlap: float, highest: float
 ) -> Layout:
-    """Windows near `lengths` that overlap by about `overlap`, of whole blocks where that pays.
-
-    A block is about 50 rad long at the `highest` frequency (rad per sample), and counted from the
-    record's end; the first window of each length starts at the first sample.
-    """
+    """Windows near `lengths`, with about the `overlap`, of whole blocks that all share."""
     if not 0 <= overlap < 1:
         raise ValueError(f"overlap {overlap} is not in [0, 1): 0.5 or 0.8 are usual")
     for length in lengths:
@@ -92,15 +91,6 @@ def lattice_windows(
         starts = last - np.round((last - ideal) / block).astype(int) * block
         layout.append((length, tuple(sorted({max(int(s), 0) for s in (0, *starts[1:])}))))
     return tuple(layout)
-
-
-_SHORT = 128  # samples below which a window is summed directly
-_AT_ONCE = 128  # blocks, about, whose sums stay in the processor's cache
-_TOLERANCE = 6e-14  # of a block's waves; leaves 2e-13 of the largest Fourier sum
-_THIN = 256  # samples that show a constant well enough
-_TRENDS = ("none", "constant", "linear")
-
-Sums = Complex[np.ndarray, "frequencies _ windows"]
 
 
 class Taper(NamedTuple):
@@ -166,7 +156,17 @@ def fourier_sums(
         mine = [(t.shape, part[number - t.first]) for t, part in zip(tapers, sums, strict=True)
                 if t.first <= number]  # fmt: skip
         if blocks is None or length < _SHORT:
-            _sum_directly(rows, angle, length, starts, mine, detrend)
+            start = np.array(starts)
+            segments = np.lib.stride_tricks.sliding_window_view(rows, length, axis=1)[:, start]
+            if trends:
+                segments = segments - np.mean(segments, axis=2, keepdims=True)
+            if trends > 1:
+                ramp = np.linspace(-1.0, 1.0, length)
+                segments -= (segments @ ramp / np.sum(ramp**2))[:, :, None] * ramp
+            middle = np.exp(-1j * angle[:, None] * (start + length / 2))[:, None]
+            for shape, part in mine:
+                tapered = segments[: part.shape[1]] * window(shape, length)
+                part[...] = _from_middle(tapered, angle) * middle
             continue
         part = _place_windows(blocks, length, starts)
         for c, channel in enumerate(running):
@@ -356,28 +356,6 @@ def _trend_sums(
     """Those of a tapered constant, and of a ramp of slope 1."""
     rows = np.stack([np.ones(length), np.arange(length) - (length - 1) / 2][:trends])
     return _from_middle(rows[:, None] * window(shape, length), np.array(angle))[:, :, 0]
-
-
-def _sum_directly(
-    rows: Float[np.ndarray, "channels samples"],
-    angle: Grid,
-    length: int,
-    starts: tuple[int, ...],
-    into: Sequence[tuple[str, Sums]],
-    detrend: str,
-) -> None:
-    """The sums of short windows."""
-    start = np.array(starts)
-    segments = np.lib.stride_tricks.sliding_window_view(rows, length, axis=1)[:, start]
-    if detrend != "none":
-        segments = segments - np.mean(segments, axis=2, keepdims=True)
-    if detrend == "linear":
-        ramp = np.linspace(-1.0, 1.0, length)
-        segments -= (segments @ ramp / np.sum(ramp**2))[:, :, None] * ramp
-    middle = np.exp(-1j * angle[:, None] * (start + length / 2))[:, None]
-    for shape, sums in into:
-        tapered = segments[: sums.shape[1]] * window(shape, length)
-        sums[...] = _from_middle(tapered, angle) * middle
 
 
 def _from_middle(

@@ -1,6 +1,5 @@
 """Frequency responses: estimates of records, and tables that were measured elsewhere."""
 
-import functools as ft
 import itertools
 from collections.abc import Callable, Sequence
 from typing import NamedTuple, Protocol, runtime_checkable
@@ -172,9 +171,19 @@ class FrequencyResponse:
 
         Source: Bendat and Piersol, "Random Data", 4th ed., Table 9.6.
         """
-        grid, values, coherent, error = _read_table(
-            omega, response, coherence, random_error, averages
-        )
+
+        def like(name: str, numbers: ArrayLike) -> np.ndarray:
+            """A number, one for each frequency, or one for each pair, as all of the response."""
+            array = np.asarray(numbers, float)
+            array = array[:, None, None] if array.ndim == 1 else array
+            try:
+                return np.broadcast_to(array, values.shape).copy()
+            except ValueError:
+                raise ValueError(
+                    f"{name} has the shape {np.shape(numbers)} and the response {values.shape}: "
+                    "give one number, one for each frequency, or one for each number of the "
+                    "response"
+                ) from None
 
         def names(kind: str, chosen: Sequence[str], letter: str, count: int) -> tuple[str, ...]:
             names = tuple(chosen) or tuple(f"{letter}{k}" for k in range(count))
@@ -182,6 +191,49 @@ class FrequencyResponse:
                 raise ValueError(f"{kind} has {len(names)} names and the response {count} channels")
             return names
 
+        if isinstance(omega, HasFrequencyData):
+            if response is not None:
+                raise ValueError("give a FrequencyResponseData alone, or omega and response")
+            omega, response = np.asarray(omega.omega), np.moveaxis(np.asarray(omega.frdata), -1, 0)
+        elif response is None:
+            raise ValueError("a table needs its response: give omega and as many complex numbers")
+        grid, values = np.asarray(omega, float), np.asarray(response, complex)
+        values = values[:, None, None] if values.ndim == 1 else values
+        if grid.ndim != 1 or values.ndim != 3 or len(values) != grid.size:
+            raise ValueError(
+                f"omega has the shape {grid.shape} and the response {np.shape(response)}: give one "
+                "row of frequencies, and as many complex numbers or (frequencies, outputs, inputs)"
+            )
+        if not (np.all(np.isfinite(grid)) and np.all(grid > 0) and np.all(np.diff(grid) > 0)):
+            raise ValueError("omega must be finite, above 0 and rising: sort the table, in rad/s")
+        if not np.all(np.isfinite(values)):
+            first = grid[int(np.argmin(np.isfinite(values).all(axis=(1, 2))))]
+            raise ValueError(f"the response is not finite at {first:.4g} rad/s: leave that row out")
+        if (coherence is None) == (random_error is None):
+            raise ValueError(
+                "a table needs its errors, one of two: coherence= with averages=, or "
+                "random_error=, the relative standard error of the magnitude (0.02 for 2 %)"
+            )
+        if not averages > 0:
+            raise ValueError(
+                f"averages is {averages}: give how many windows were averaged, 1 or more"
+            )
+        if coherence is not None:
+            coherent = like("coherence", coherence)
+            if not np.all((coherent > 0) & (coherent <= 1)):
+                ends = f"{coherent.min():.4g} to {coherent.max():.4g}"
+                raise ValueError(f"the coherence runs from {ends}: give numbers above 0, up to 1")
+            error = np.sqrt((1 - coherent) / (2 * averages * coherent))
+        else:
+            assert random_error is not None
+            error = like("random_error", random_error)
+            if not np.all(error > 0):
+                raise ValueError(
+                    f"the random error is {error.min():.4g} at its least: give it above 0, 0.02 "
+                    "for 2 %"
+                )
+            coherent = 1 / (1 + 2 * averages * error**2)
+        error = np.maximum(error, _LEAST)
         variance = 2 * (error * np.abs(values)) ** 2
         _, outputs, inputs = values.shape
         return cls(
@@ -269,69 +321,6 @@ class FrequencyResponse:
         return "\n".join(lines + [f"  ! {remark}" for remark in shown])
 
 
-def _read_table(
-    omega: Float[ArrayLike, " frequencies"] | HasFrequencyData,
-    response: Complex[ArrayLike, "frequencies ..."] | None,
-    coherence: Float[ArrayLike, "..."] | None,
-    random_error: Float[ArrayLike, "..."] | None,
-    averages: float | int,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Frequencies, response, coherence and random error of `FrequencyResponse.from_table`."""
-    if isinstance(omega, HasFrequencyData):
-        if response is not None:
-            raise ValueError("give a FrequencyResponseData alone, or omega and response")
-        omega, response = np.asarray(omega.omega), np.moveaxis(np.asarray(omega.frdata), -1, 0)
-    elif response is None:
-        raise ValueError("a table needs its response: give omega and as many complex numbers")
-    grid, values = np.asarray(omega, float), np.asarray(response, complex)
-    values = values[:, None, None] if values.ndim == 1 else values
-    if grid.ndim != 1 or values.ndim != 3 or len(values) != grid.size:
-        raise ValueError(
-            f"omega has the shape {grid.shape} and the response {np.shape(response)}: give one "
-            "row of frequencies, and as many complex numbers or (frequencies, outputs, inputs)"
-        )
-    if not (np.all(np.isfinite(grid)) and np.all(grid > 0) and np.all(np.diff(grid) > 0)):
-        raise ValueError("omega must be finite, above 0 and rising: sort the table, in rad/s")
-    if not np.all(np.isfinite(values)):
-        first = grid[int(np.argmin(np.isfinite(values).all(axis=(1, 2))))]
-        raise ValueError(f"the response is not finite at {first:.4g} rad/s: leave that row out")
-    if (coherence is None) == (random_error is None):
-        raise ValueError(
-            "a table needs its errors, one of two: coherence= with averages=, or random_error=, "
-            "the relative standard error of the magnitude (0.02 for 2 %)"
-        )
-    if not averages > 0:
-        raise ValueError(f"averages is {averages}: give how many windows were averaged, 1 or more")
-    if coherence is not None:
-        coherent = _like("coherence", coherence, values)
-        if not np.all((coherent > 0) & (coherent <= 1)):
-            ends = f"{coherent.min():.4g} to {coherent.max():.4g}"
-            raise ValueError(f"the coherence runs from {ends}: give numbers above 0, up to 1")
-        error = np.sqrt((1 - coherent) / (2 * averages * coherent))
-    else:
-        assert random_error is not None
-        error = _like("random_error", random_error, values)
-        if not np.all(error > 0):
-            raise ValueError(
-                f"the random error is {error.min():.4g} at its least: give it above 0, 0.02 for 2 %"
-            )
-        coherent = 1 / (1 + 2 * averages * error**2)
-    return grid, values, coherent, np.maximum(error, _LEAST)
-
-
-def _like(name: str, numbers: ArrayLike, values: np.ndarray) -> np.ndarray:
-    """A number, one for each frequency, or one for each pair, as all of a response."""
-    array = np.asarray(numbers, float)
-    array = array[:, None, None] if array.ndim == 1 else array
-    try:
-        return np.broadcast_to(array, values.shape).copy()
-    except ValueError:
-        raise ValueError(
-            f"{name} has the shape {np.shape(numbers)} and the response {values.shape}: give one "
-            "number, one for each frequency, or one for each number of the response"
-        ) from None
-
-
 class Estimate(NamedTuple):
     """What an estimator makes of records; nan and infinite errors where it is undetermined."""
 
@@ -385,9 +374,9 @@ def frequency_response(
         print(response)
         ```
     """
+    from ._average import average_windows
     from ._local_polynomial import estimate_local_polynomial
     from ._periodic import estimate_periodic
-    from ._welch import average_windows
 
     require_x64("a frequency response")
     records = [record] if isinstance(record, Record) else list(record)
@@ -410,19 +399,21 @@ def frequency_response(
         estimate = average_windows(records, grid, estimator, method)
     else:
         check_excitation(records, method)
-        of_records = (
-            estimate_periodic if isinstance(estimator, Periodic) else estimate_local_polynomial
-        )
+        periodic = isinstance(estimator, Periodic)
+        of_records = estimate_periodic if periodic else estimate_local_polynomial
         estimate = of_records(records, grid, estimator, method)
+
+    def find_remarks() -> tuple[Remark, ...]:
+        from ._feedback import remarks_on_feedback
+        from ._linearity import remarks_on_linearity
+
+        remarks = remarks_on_feedback(records, method, estimate)
+        if estimate.distortion is None:  # periods show their own
+            remarks += remarks_on_linearity(records, method, estimate)
+        return remarks + estimate.remarks()
+
     # Not jnp.asarray: it compiles a program for each new shape. Each array once, in one go.
-    names = (
-        "omega",
-        "response",
-        "coherence",
-        "random_error",
-        "direct_coherence",
-        "multiple_coherence",
-    )
+    names = "omega response coherence random_error direct_coherence multiple_coherence".split()
     put = jax.device_put({name: getattr(estimate, name) for name in names})
     return FrequencyResponse(
         **put,
@@ -430,7 +421,7 @@ def frequency_response(
         method=method,
         input_names=first.input_names,
         output_names=first.output_names,
-        remarks=Remarks(ft.partial(_find_remarks, records, method, estimate)),
+        remarks=Remarks(find_remarks),
         integrators=0 if isinstance(estimator, Periodic) else estimator.integrators,
         resolution=estimate.resolution,
         distortion=estimate.distortion,
@@ -442,15 +433,3 @@ def frequency_response(
         input_units=first.input_units,
         output_units=first.output_units,
     )
-
-
-def _find_remarks(
-    records: Sequence[Record], method: Method, estimate: Estimate
-) -> tuple[Remark, ...]:
-    from ._feedback import remarks_on_feedback
-    from ._linearity import remarks_on_linearity
-
-    remarks = remarks_on_feedback(records, method, estimate)
-    if estimate.distortion is None:  # periods show their own
-        remarks += remarks_on_linearity(records, method, estimate)
-    return remarks + estimate.remarks()

@@ -16,17 +16,16 @@ from ._local_fit import Bins, left_power, LocalFit, window_slices
 from ._local_windows import SharedErrors
 from ._noise import Noise
 from ._rational_fit import (
+    Basis,
     columns_of,
     descend,
     Equations,
-    make_basis,
     next_order,
     parts_of,
     powers_of,
     PRICE,
     refine_orders,
     search_orders,
-    slopes_of,
     Solved,
 )
 
@@ -49,16 +48,11 @@ Levels = Float[np.ndarray, " bins"]
 
 
 class GlobalModel(NamedTuple):
-    """Y = (sum_i B_i U_i + C_r) / A of one output, polynomials in x = (exp(-j omega dt) - 1)/scale.
-
-    So a system of finite order answers to inputs that are held, or linear between samples; C_r is
-    the difference of the states at the ends of record r. Errors of the real parameters are Re(drive
-    V).
-    """
+    """Y = (sum_i B_i U_i + C_r) / A, of x = (exp(-j omega dt) - 1) / scale; C is of both ends."""
 
     solved: Solved
     fixed: int  # the power whose coefficient in A sets the common factor
-    drive: Complex[np.ndarray, "parameters places"]
+    drive: Complex[np.ndarray, "parameters places"]  # errors are Re(drive V), V the noise
     follow: Complex[np.ndarray, "places parameters"]  # orthonormal: what the model takes of noise
     noise: Float[np.ndarray, " places"]  # its power, smoothed, from what the model leaves
     scale: float
@@ -71,80 +65,26 @@ class GlobalModel(NamedTuple):
         """Degree of the denominator."""
         return self.solved.order
 
-    def response(self, omega: Grid, inputs: int) -> Complex[np.ndarray, "frequencies inputs"]:
-        """B_i / A."""
-        powers = self._powers(omega)
-        numerators = self.solved.linear[: inputs * (self.order + 1)].reshape(inputs, -1)
-        return (numerators @ powers / (self.solved.denominator @ powers)).T
-
-    def response_slopes(
-        self, omega: Grid, inputs: int
-    ) -> Complex[np.ndarray, "frequencies inputs parameters"]:
-        """Derivatives of `response` with respect to the parameters."""
-        powers, size = self._powers(omega), self.order + 1
-        powers = (powers / (self.solved.denominator @ powers)).T
-        slopes = np.zeros((omega.size, inputs, self.drive.shape[0]), complex)
-        for i in range(inputs):
-            slopes[:, i, i * size : (i + 1) * size] = powers
-        turned = -np.delete(powers, self.fixed, axis=1)
-        slopes[:, :, len(self.solved.linear) :] = (
-            self.response(omega, inputs)[:, :, None] * turned[:, None, :]
-        )
-        return slopes
+    def response(self, omega: Grid, inputs: int) -> tuple[np.ndarray, np.ndarray]:
+        """B_i / A by frequency and input, and its derivatives with respect to the parameters."""
+        transients = len(self.solved.linear) - inputs * (self.order + 1)
+        none = np.zeros((transients // max(self.order, 1), omega.size))
+        single = np.eye(inputs, dtype=complex)[:, :, None] * np.ones(omega.size)
+        parts = [self._output(omega, u, none) for u in single]
+        output, slopes = (np.stack(part, axis=1) for part in zip(*parts, strict=True))
+        return output, slopes
 
     def at_bins(self, bins: Bins, inputs: slice, rows: slice) -> tuple[np.ndarray, np.ndarray]:
         """The modelled output at some bins, and its derivatives with respect to the parameters."""
-        powers = self._powers(bins.omega[rows])
+        return self._output(bins.omega[rows], bins.values[rows, inputs].T, _owner(bins, rows))
+
+    def _output(self, omega: Grid, u: np.ndarray, owner: np.ndarray) -> tuple[np.ndarray, ...]:
+        powers = powers_of((np.exp(-1j * omega * self.dt) - 1) / self.scale, self.order + 1)
         powers /= self.solved.denominator @ powers
-        columns = columns_of(powers, bins.values[rows, inputs].T, _owner(bins, rows))
+        columns = columns_of(powers, u, owner)
         output = self.solved.linear @ columns
         turned = -np.delete(powers, self.fixed, axis=0)
         return output, np.concatenate([columns, output * turned]).T
-
-    def _powers(self, omega: Grid) -> Complex[np.ndarray, "powers frequencies"]:
-        return powers_of((np.exp(-1j * omega * self.dt) - 1) / self.scale, self.order + 1)
-
-
-def global_models(
-    bins: Bins, inputs: slice, outputs: slice, highest: float, dt: float, most: int
-) -> list[GlobalModel | None]:
-    """One model for each output, of one order more than has the least criterion; `None` for chance.
-
-    The criterion lies between Akaike's, under which a pole and a zero settle where the noise of
-    single bins rises, and a Bayesian one, which stops where what is left hides in that noise. It
-    cannot see what is of the size of the noise, as half a sample of a delay: so the order is the
-    next one. Of many bins one of each n is taken: each is an equation of its own, so that costs
-    precision alone.
-    """
-    reach = int(np.searchsorted(bins.omega, highest_modelled(highest), "right"))
-    places = _thin(reach, _MOST_BINS)
-    scale = float(np.abs(np.exp(-1j * dt * bins.omega[places[-1]]) - 1)) / 2
-    models = []
-    for output in range(outputs.start, outputs.stop):
-        equations = _equations(bins, places, inputs, output, scale, dt)
-        settled = _identify_kept(_Task(equations, bins.omega[places], most))
-        models.append(None if settled is None else GlobalModel(*settled, scale, dt, places, reach))
-    return models
-
-
-def weighted_model(
-    model: GlobalModel,
-    bins: Bins,
-    inputs: slice,
-    output: int,
-    most: int,
-    noise: Float[np.ndarray, " places"],
-) -> GlobalModel | None:
-    """The model of the same bins that count by `noise`: by what a first model leaves, quiet ones do
-    not."""
-    equations = _equations(bins, model.places, inputs, output, model.scale, model.dt)
-    omega, weight = bins.omega[model.places], 1 / np.sqrt(noise)
-    white = equations.weighted(weight).pick(_thin(len(omega), _TRIAL_BINS))
-    orders = search_orders(white, most)
-    if orders.best == 0:
-        return None
-    settled = _settle(equations, omega, weight, next_order(white, orders, most))
-    return GlobalModel(*settled, model.scale, model.dt, model.places, model.reach)
 
 
 def _equations(
@@ -160,14 +100,8 @@ def _owner(bins: Bins, rows: Places | slice) -> Float[np.ndarray, "records bins"
     return (bins.record[rows] == np.arange(bins.records)[:, None]).astype(float)
 
 
-def highest_modelled(highest: float) -> float:
-    """Frequency in rad/s up to which bins are modelled for responses up to `highest`."""
-    return _BEYOND * highest
-
-
 def _thin(count: int, most: int) -> Places:
-    """At most so many of `count` bins, one of each n neighbours: not every n-th, of periodic
-    lines."""
+    """At most so many of `count` bins, one of each n neighbours, not every n-th."""
     step = -(-count // most)
     first = np.arange(0, count, step)
     shift = np.floor(step * (0.6180339887 * np.arange(first.size) % 1.0)).astype(int)
@@ -178,26 +112,10 @@ def _thin(count: int, most: int) -> Places:
 Settled = tuple[Solved, int, np.ndarray, np.ndarray, np.ndarray]
 
 
-class _Task:
-    """Equations to solve, equal to others of the same content."""
-
-    def __init__(self, equations: Equations, omega: Levels, most: int):
-        self.identify = ft.partial(_identify, equations, omega, most)
-        data = b"".join(part.tobytes() for part in (*equations, omega))
-        self.content = hashlib.blake2b(data).digest(), equations.owner.shape, most
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Task) and self.content == other.content
-
-    def __hash__(self) -> int:
-        return hash(self.content)
-
-
 @ft.lru_cache(maxsize=2)
-def _identify_kept(task: _Task) -> Settled | None:
-    """A fit with another delay of the outputs asks for the model of the inputs again; one takes 20
-    MB."""
-    return task.identify()
+def _kept_models(content: tuple) -> list[Settled | None]:
+    """Room for the model of such equations; another delay asks again. One takes 20 MB."""
+    return []
 
 
 def _identify(equations: Equations, omega: Levels, most: int) -> Settled | None:
@@ -218,7 +136,7 @@ def _identify(equations: Equations, omega: Levels, most: int) -> Settled | None:
 
     first = first._replace(best=min((order for order in first.solved if order > 0), key=value))
     solved = first.solved[first.best]
-    basis = make_basis(equations, len(solved.denominator))
+    basis = Basis.of(equations, len(solved.denominator))
     below = solved.denominator @ basis.powers
     left = equations.y - solved.linear @ basis.columns / below
     noise = noise_left(omega, left, below, np.ones_like(omega))
@@ -237,10 +155,10 @@ def _settle(
 ) -> Settled:
     """A descent from `start`, and how noise moves its parameters."""
     white = equations.weighted(weight)
-    basis = make_basis(white, start.size)
-    solved = descend(white, basis, start, _SETTLED)
+    solved, basis = descend(white, start, _SETTLED)
     fixed = basis.largest(solved.denominator)
-    slopes = parts_of(slopes_of(white, basis, solved, fixed))
+    slopes = np.concatenate([basis.columns / solved.below, basis.slopes(solved, fixed)])
+    slopes = parts_of(slopes)
     length = np.linalg.norm(slopes, axis=1, keepdims=True)
     left, size, right = np.linalg.svd(slopes / length, full_matrices=False)
     inverse = np.where(size > 1e-12 * size[0], 1 / np.maximum(size, 1e-300), 0.0)
@@ -252,8 +170,7 @@ def _settle(
 
 
 def rough_noise(equations: Equations, omega: Levels) -> Levels:
-    """Power of what local rational functions leave; without their pole a light mode would leave
-    much."""
+    """Power that local rational functions leave; without a pole a light mode leaves much."""
     factors = np.concatenate([equations.u, equations.owner])
     count, columns = omega.size, 2 * len(factors) + 1
     length = min(2 * columns, count)
@@ -279,10 +196,7 @@ def noise_left(
     below: Complex[np.ndarray, " bins"],
     freedom: Levels,
 ) -> Levels:
-    """Running power of what a model leaves; that before its poles where it is clearly likelier.
-
-    `below` is the denominator: gusts pass the poles, and peak more narrowly than a running power.
-    """
+    """Running power of what a model leaves; that before its poles where clearly likelier."""
     after = running_power(omega, left, freedom)
     before = running_power(omega, left * below, freedom) / np.abs(below) ** 2
     gain = _log_likelihood(left, before) - _log_likelihood(left, after)
@@ -319,8 +233,7 @@ class Rest(NamedTuple):
     def without_followed(
         self, omega: Grid, half_width: Grid, order: int, fit: LocalFit
     ) -> LocalFit:
-        """The fit, its residuals corrected for noise that models follow and it would not have
-        followed."""
+        """The fit, its residuals corrected for noise that only models have followed."""
         scatter, freedom = np.array(fit.scatter), fit.freedom
         # A long record has many times the bins that the windows reach.
         reach = int(np.max(window_slices(omega, half_width, self.bins)[1]))
@@ -347,16 +260,35 @@ class Rest(NamedTuple):
         inputs, response = fit.response.shape[2], np.array(fit.response)
         for c, model in enumerate(self.models):
             if model is not None:
-                response[:, c] += model.response(omega, inputs)
+                response[:, c] += model.response(omega, inputs)[0]
         return fit._replace(response=response)
 
 
 def subtract_models(
     bins: Bins, sources: slice, moved: slice, highest: float, dt: float, most: int
 ) -> Rest:
-    """Fit a model of order up to `most` to each moved channel, and take it off; 0 for none."""
-    none = (None,) * (moved.stop - moved.start)
-    models = global_models(bins, sources, moved, highest, dt, most) if most else none
+    """Take a model off each moved channel, of one order more than has the least criterion; 0: none.
+
+    The criterion lies between Akaike's, under which a pole and a zero settle where the noise of
+    single bins rises, and a Bayesian one, which stops where what is left hides in that noise. It
+    cannot see what is of the size of the noise, as half a sample of a delay: so the order is the
+    next one. Of many bins one of each n is taken: each is an equation of its own, so that costs
+    precision alone.
+    """
+    reach = int(np.searchsorted(bins.omega, _BEYOND * highest, "right"))
+    places = _thin(reach, _MOST_BINS)
+    scale = float(np.abs(np.exp(-1j * dt * bins.omega[places[-1]]) - 1)) / 2
+    models = []
+    for channel in range(moved.start, moved.stop):
+        settled = None
+        if most:
+            equations = _equations(bins, places, sources, channel, scale, dt)
+            data = b"".join(part.tobytes() for part in (*equations, bins.omega[places]))
+            kept = _kept_models((hashlib.blake2b(data).digest(), equations.owner.shape, most))
+            if not kept:
+                kept.append(_identify(equations, bins.omega[places], most))
+            settled = kept[0]
+        models.append(None if settled is None else GlobalModel(*settled, scale, dt, places, reach))
     return take_off(bins, sources, moved, models)
 
 
@@ -399,7 +331,13 @@ def weighted_models(
         omega, channel = bins.omega[model.places], rest.moved.start + c
         power = noise._replace(power=noise.power[:, c : c + 1]).power_at(omega)[:, 0]
         power = np.where(omega > noise.omega[-1], model.noise, power)
-        models[c] = weighted_model(model, bins, rest.sources, channel, most, power) or model
+        equations = _equations(bins, model.places, rest.sources, channel, model.scale, model.dt)
+        white = equations.weighted(1 / np.sqrt(power)).pick(_thin(len(omega), _TRIAL_BINS))
+        orders = search_orders(white, most)
+        if orders.best:
+            start = next_order(white, orders, most)
+            settled = _settle(equations, omega, 1 / np.sqrt(power), start)
+            models[c] = GlobalModel(*settled, model.scale, model.dt, model.places, model.reach)
     return models
 
 
@@ -412,10 +350,7 @@ def shared_errors(
     left: Complex[np.ndarray, "frequencies outputs moved"],
     right: Complex[np.ndarray, "frequencies sources inputs"],
 ) -> SharedErrors | None:
-    """Errors of the models' parameters in left (models + `fit`) right; `None` without models.
-
-    A local fit follows what a wrong parameter leaves in its window: only the difference remains.
-    """
+    """Errors of models' parameters in left (models + `fit`) right, less what a fit follows."""
     used = [(c, model) for c, model in enumerate(rest.models) if model is not None]
     if not used:
         return None
@@ -433,7 +368,7 @@ def shared_errors(
                 low, high = max(first[f], start), min(last[f], stop)
                 part = effect[f, :, low - first[f] : high - first[f]]
                 followed[f] += part @ at_bins[low - start : high - start]
-        slopes[:, c, :, ends[c] : ends[c + 1]] = model.response_slopes(omega, inputs) - followed
+        slopes[:, c, :, ends[c] : ends[c + 1]] = model.response(omega, inputs)[1] - followed
     slopes = np.einsum("foc,fcsp,fsi->foip", left, slopes, right, optimize=True)
     places = used[0][1].places
     roots = noise.root_at(bins.omega[places])
@@ -446,19 +381,14 @@ def shared_errors(
 
 
 def highest_looked_at(highest: float, grid: Grid) -> float:
-    """Frequency above which neither models of responses up to `highest` nor `left_moving` take
-    bins."""
-    return max(highest_modelled(highest), np.exp(_AROUND) * grid[-1])
+    """Frequency above which neither models up to `highest` nor `left_moving` take bins."""
+    return max(_BEYOND * highest, np.exp(_AROUND) * grid[-1])
 
 
 def left_moving(
     rest: Rest, ends: Sequence[Float[np.ndarray, "_samples channels"]], grid: Grid, noise: Noise
 ) -> Bool[np.ndarray, " grid"]:
-    """Where models leave a peak, far above the noise, of a channel that moves at a record's `ends`.
-
-    The local fits cannot tell the response from a mode that still rings, narrower than their
-    windows.
-    """
+    """Where models leave a peak far above the noise of a channel moving at a record's `ends`."""
     ringing, bins = np.zeros(grid.size, bool), rest.bins
     place = np.log(bins.omega)
     for c in range(len(rest.models)):

@@ -69,7 +69,15 @@ def remarks_on_linearity(
         outputs = [o for o in range(usable.shape[1]) if np.sum(usable[:, o]) >= _FEWEST]
         if not outputs:
             continue
-        tones = _tones_of(records, i, method)
+        # The input's part at the frequency of a sweep, if all that moves it sweeps.
+        tones = []
+        for record in records:
+            u = record.inputs[: fast_length(record.samples), i]
+            swept = phase_of_sweep(u if method == "direct" else record.references[: u.size, i])
+            if swept is None:
+                tones = []
+                break
+            tones.append(swept[1] if method == "direct" else _at_phase(u, swept[0]))
         scale = float(np.sqrt(np.mean([np.var(record.inputs[:, i]) for record in records])))
         spectra = [] if tones else [_Spectra.of(record, i, method, scale) for record in records]
         for o in outputs:
@@ -228,61 +236,44 @@ class _Factors(NamedTuple):
         return float(np.sqrt(self.value @ np.linalg.solve(self.covariance, self.value)))
 
 
-class _Gains(NamedTuple):
-    """The gains of a static nonlinearity at two commands, relative to that of the response."""
+def _say_static(left: _LeftOver, v: Signal) -> str:
+    """What functions of the command v, of unit size, say of the gain."""
 
-    low: float = 1.0
-    high: float = 1.0
-    clear: float = 0.0  # the nonlinearity in standard errors; 0 where it is not clear
-
-    @classmethod
-    def at(
-        cls, left: _LeftOver, columns: list[int], v: Signal, x: Signal, percentiles: list[int]
-    ) -> "_Gains":
-        """At two percentiles of x; factors must be real: no dynamics before a nonlinearity."""
+    def gains(columns: list[int], x: Signal, low: int, high: int) -> tuple[float, float, float]:
+        """At two percentiles of x, relative to the response, and how clear; 1 where it is not."""
         if np.min(left.share[columns]) < _DISTINCT_STATIC:
-            return cls()
-        ends = np.percentile(x, percentiles)
+            return 1.0, 1.0, 0.0
         added = left.added[:, columns]
         factors = _Factors.of(left, added)
         clear = factors.size()
         if clear < _CLEAR or clear < 2 * _Factors.of(left, 1j * added).size():
-            return cls()
+            return 1.0, 1.0, 0.0
         powers = [_POWER[column] for column in columns]
         mean = [np.sum(x**power * v**2) / np.sum(v**2) for power in powers]
-        gains = 1 + (ends[:, None] ** powers - mean) @ factors.value
-        low, high = np.maximum(gains, 0.0).tolist()
-        return cls(low, high, clear)
+        ends = np.percentile(x, [low, high])[:, None] ** powers - mean
+        low_gain, high_gain = np.maximum(1 + ends @ factors.value, 0.0).tolist()
+        return low_gain, high_gain, clear
 
-    def difference(self) -> float:
-        """Relative to the larger one."""
-        return abs(self.high - self.low) / max(self.high, self.low)
-
-
-def _say_static(left: _LeftOver, v: Signal) -> str:
-    """What functions of the command v, of unit size, say of the gain."""
-    size, percentiles = np.abs(v), [_SMALL, _LARGE]
     # By v |v|, v^3, or both where these explain more.
-    first, second = (_Gains.at(left, [column], v, size, percentiles) for column in (0, 1))
-    odd = first if first.clear > second.clear else second
-    if odd.clear:
-        both = _Gains.at(left, [0, 1], v, size, percentiles)
-        odd = both if both.clear**2 > odd.clear**2 + _MORE**2 else odd
-    even, texts = _Gains.at(left, [2], v, v, [_NEGATIVE, _LARGE]), []
-    if odd.difference() > _SMALLEST:
+    first, second = (gains([column], np.abs(v), _SMALL, _LARGE) for column in (0, 1))
+    odd, texts = first if first[2] > second[2] else second, []
+    if odd[2]:
+        both = gains([0, 1], np.abs(v), _SMALL, _LARGE)
+        odd = both if both[2] ** 2 > odd[2] ** 2 + _MORE**2 else odd
+    low, high, _ = odd
+    if abs(high - low) / max(high, low) > _SMALLEST:
         where = "the largest commands to small ones, as a deadband or friction causes"
-        if odd.high < odd.low:
+        if high < low:
             where = (
                 "small commands to the largest, as a saturation causes, or noise in the measured "
                 "input"
             )
-        texts.append(f"falls by about {100 * odd.difference():.2g} % from {where}")
-    if even.difference() > _SMALLEST:
-        side = "smaller" if even.high < even.low else "larger"
-        texts.append(
-            f"is about {100 * even.difference():.2g} % {side} for positive commands than for "
-            "negative ones"
-        )
+        change = 100 * abs(high - low) / max(high, low)
+        texts.append(f"falls by about {change:.2g} % from {where}")
+    low, high, _ = gains([2], v, _NEGATIVE, _LARGE)
+    if abs(high - low) / max(high, low) > _SMALLEST:
+        side, change = "smaller" if high < low else "larger", 100 * abs(high - low) / max(high, low)
+        texts.append(f"is about {change:.2g} % {side} for positive commands than for negative ones")
     if not texts:
         return ""
     return (
@@ -293,8 +284,7 @@ def _say_static(left: _LeftOver, v: Signal) -> str:
 
 
 def period_of(signals: Sequence[Float[np.ndarray, "_samples sources"]]) -> int:
-    """Samples of the shortest period, of two at least, with which all signals repeat exactly; or
-    0."""
+    """Samples of the shortest period, of two at least, of all signals; 0 without one."""
     most = min(len(signal) for signal in signals) // 2
     lags, first = np.arange(4, most + 1), signals[0]
     near = _EXACT * max(float(np.max(np.abs(signal))) for signal in signals)
@@ -347,8 +337,36 @@ def _say_harmonics(
     """What the residual's harmonics of an input, whose parts are `tones`, say of the gain."""
     from scipy.special import gammainccinv
 
-    fits = map(lambda record, tone: _harmonics(record, tone, omega, response, pair), records, tones)
-    parts = [fit for fit in fits if fit is not None]
+    parts, (output, source) = [], pair
+    # The harmonics at the plant's input, relative to its fundamental, and their inverse variance:
+    # least squares of the residual's bins on harmonics that have passed the plant.
+    for record, tone in zip(records, tones, strict=True):
+        count = tone.size
+        grid = 2 * np.pi / (count * record.dt) * np.arange(count // 2 + 1)
+        band = slice(*np.searchsorted(grid, [omega[0], omega[-1]]).tolist())
+        if band.stop - band.start < 3 * _TRANSIENT:
+            continue
+        plant = interpolated(grid[band], omega, response)
+        u, y = (
+            np.fft.rfft(x[:count], axis=0)[band] for x in (record.inputs, record.outputs[:, output])
+        )
+        turn = tone / np.maximum(np.abs(tone), 1e-300)
+        waves = [np.fft.fft(tone * turn ** (k - 1))[band] / 2 for k in _HARMONICS]
+        columns = np.stack([y - np.sum(plant * u, axis=1), *(plant[:, source] * w for w in waves)])
+        # Less parabolas through the bins around each (Savitzky, Golay 1964); at the ends the last.
+        half = _TRANSIENT // 2
+        powers = np.linspace(-1, 1, _TRANSIENT)[:, None] ** np.arange(3)
+        fitted = powers @ np.linalg.pinv(
+            powers
+        )  # from the values in a window to those of its parabola
+        windows = np.lib.stride_tricks.sliding_window_view(columns, _TRANSIENT, axis=1)
+        first, last = windows[:, 0] @ fitted[:half].T, windows[:, -1] @ fitted[half + 1 :].T
+        sharp = columns - np.concatenate([first, windows @ fitted[half], last], axis=1)
+        left, harmonics = sharp[0], sharp[1:]
+        noise = np.maximum(local_mean(np.abs(left) ** 2, band.start), 1e-300)
+        weight = np.maximum(np.sum(np.abs(harmonics) ** 2 / noise, axis=1), 1e-300)
+        factor = np.sum(np.conj(harmonics) * left / noise, axis=1) / weight
+        parts.append((factor, weight))
     if not parts:
         return ""
     weight = np.sum([weight for _, weight in parts], axis=0)
@@ -375,30 +393,12 @@ def _say_harmonics(
     )
 
 
-def _tones_of(records: Sequence[Record], i: int, method: Method) -> list[Tone] | None:
-    """The input's part at the frequency of a sweep; `None` unless all that moves it sweeps."""
-    tones = []
-    for record in records:
-        count = fast_length(record.samples)
-        source = record.inputs[:count, i] if method == "direct" else record.references[:count, i]
-        swept = phase_of_sweep(source)
-        if swept is None:
-            return None
-        phase, tone = swept
-        tones.append(tone if method == "direct" else _at_phase(record.inputs[:count, i], phase))
-    return tones
-
-
 def phase_of_sweep(signal: Signal) -> tuple[Signal, Tone] | None:
-    """The rising phase and the part of a tone of slow frequency; `None` where much power is
-    beside."""
+    """The rising phase and the part of a tone of slow frequency; `None` of other signals."""
     centred = signal - np.mean(signal)
     # The signal without its negative frequencies, doubled; scipy.signal takes 0.4 s to import.
-    share = np.zeros(signal.size)
-    share[: (signal.size + 1) // 2] = 2.0
-    share[0] = 1.0
-    if signal.size % 2 == 0:
-        share[signal.size // 2] = 1.0
+    share = np.where(np.arange(signal.size) < (signal.size + 1) // 2, 2.0, 0.0)
+    share[[0, *([signal.size // 2] if signal.size % 2 == 0 else [])]] = 1.0
     analytic = np.fft.ifft(share * np.fft.fft(centred))
     size = np.abs(analytic)
     active = np.flatnonzero(size > _ACTIVE * np.max(size))
@@ -443,40 +443,6 @@ def _mean_of_cycles(phase: Signal, values: Tone | Signal, *, twice: bool = False
     return values
 
 
-def _harmonics(
-    record: Record, tone: Tone, omega: Grid, response: OfInputs, pair: tuple[int, int]
-) -> tuple[Complex[np.ndarray, " harmonics"], Float[np.ndarray, " harmonics"]] | None:
-    """The harmonics at the plant's input, relative to its fundamental, and their inverse variance.
-
-    Least squares of the residual's bins on harmonics that have passed the plant; `None` for few
-    bins.
-    """
-    output, source = pair
-    count = tone.size
-    grid = 2 * np.pi / (count * record.dt) * np.arange(count // 2 + 1)
-    band = slice(*np.searchsorted(grid, [omega[0], omega[-1]]).tolist())
-    if band.stop - band.start < 3 * _TRANSIENT:
-        return None
-    plant = interpolated(grid[band], omega, response)
-    u, y = (
-        np.fft.rfft(x[:count], axis=0)[band] for x in (record.inputs, record.outputs[:, output])
-    )
-    turn = tone / np.maximum(np.abs(tone), 1e-300)
-    waves = [np.fft.fft(tone * turn ** (k - 1))[band] / 2 for k in _HARMONICS]
-    columns = np.stack([y - np.sum(plant * u, axis=1), *(plant[:, source] * w for w in waves)])
-    # Less parabolas through the bins around each (Savitzky, Golay 1964), at the ends the last one.
-    half = _TRANSIENT // 2
-    powers = np.linspace(-1, 1, _TRANSIENT)[:, None] ** np.arange(3)
-    fitted = powers @ np.linalg.pinv(powers)  # from the values in a window to those of its parabola
-    windows = np.lib.stride_tricks.sliding_window_view(columns, _TRANSIENT, axis=1)
-    first, last = windows[:, 0] @ fitted[:half].T, windows[:, -1] @ fitted[half + 1 :].T
-    sharp = columns - np.concatenate([first, windows @ fitted[half], last], axis=1)
-    left, harmonics = sharp[0], sharp[1:]
-    noise = np.maximum(local_mean(np.abs(left) ** 2, band.start), 1e-300)
-    weight = np.maximum(np.sum(np.abs(harmonics) ** 2 / noise, axis=1), 1e-300)
-    return np.sum(np.conj(harmonics) * left / noise, axis=1) / weight, weight
-
-
 def fast_length(samples: int) -> int:
     """The longest length of at most `samples` with a fast Fourier transform."""
     from scipy.fft import next_fast_len
@@ -485,8 +451,7 @@ def fast_length(samples: int) -> int:
 
 
 def interpolated(grid: Bins, omega: Grid, response: OfInputs) -> Complex[np.ndarray, "bins inputs"]:
-    """Smooth in magnitude and phase along log frequency, and near the points where a spline leaves
-    them."""
+    """Smooth in magnitude and phase along log frequency, within limits of the points."""
     from scipy.interpolate import CubicSpline
 
     size, angle = np.log(np.abs(response)), np.unwrap(np.angle(response), axis=0)

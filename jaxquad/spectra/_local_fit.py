@@ -25,11 +25,24 @@ from ._estimators import (
 )
 
 
-class Bins(NamedTuple):
-    """Transforms of whole records over the root of their length, by increasing frequency.
+_UNEXCITED = 1e-12  # of an input's largest bin: below, it is rounding errors
+_LEAKED = 1e5  # ratio of an input's power to the part of it that transients cannot explain
+_CHUNK = 32  # frequencies solved at once, padded to the longest window among them
+_BINS = 32_768  # of them together: more take memory, and no less time
+_DEPENDENT = 1e-6  # smallest singular value of the scaled regressors, to the largest
+_ROUNDING = 1e-14  # added to the products of unit columns, so that they have an inverse
+_STEPS = 2  # of Gauss-Newton, after the linear estimate of a denominator
+_NEAREST = 1e-3  # size of the denominator, so that no pole falls onto a bin
 
-    The mean and the Nyquist bin are left out.
-    """
+InWindow = Float[np.ndarray, "frequencies window"]
+Inputs = Complex[np.ndarray, "frequencies window inputs"]
+Outputs = Complex[np.ndarray, "frequencies window outputs"]
+Owner = Bool[np.ndarray, "frequencies window records"]
+Columns = Complex[np.ndarray, "frequencies window columns"]
+
+
+class Bins(NamedTuple):
+    """Transforms of whole records over the root of their length; no mean, no Nyquist bin."""
 
     omega: Float[np.ndarray, " bins"]  # rad/s
     record: Int[np.ndarray, " bins"]  # number of the record that it belongs to
@@ -96,22 +109,6 @@ def window_slices(omega: Grid, half_width: Grid, bins: Bins) -> tuple[Places, Pl
     return first, np.searchsorted(bins.omega, omega + half_width, "right")
 
 
-_UNEXCITED = 1e-12  # of an input's largest bin: below, it is rounding errors
-_LEAKED = 1e5  # ratio of an input's power to the part of it that transients cannot explain
-_CHUNK = 32  # frequencies solved at once, padded to the longest window among them
-_BINS = 32_768  # of them together: more take memory, and no less time
-_DEPENDENT = 1e-6  # smallest singular value of the scaled regressors, to the largest
-_ROUNDING = 1e-14  # added to the products of unit columns, so that they have an inverse
-_STEPS = 2  # of Gauss-Newton, after the linear estimate of a denominator
-_NEAREST = 1e-3  # size of the denominator, so that no pole falls onto a bin
-
-Places = Float[np.ndarray, "frequencies window"]
-Inputs = Complex[np.ndarray, "frequencies window inputs"]
-Outputs = Complex[np.ndarray, "frequencies window outputs"]
-Owner = Bool[np.ndarray, "frequencies window records"]
-Columns = Complex[np.ndarray, "frequencies window columns"]
-
-
 class LocalFit(NamedTuple):
     """Responses at the centre of each window, and the effect of noise on them; nan if undetermined.
 
@@ -138,12 +135,10 @@ class LocalFit(NamedTuple):
 
     def replace_rows(self, rows: Where, part: "LocalFit") -> "LocalFit":
         """The fit with the frequencies `rows` replaced by `part`."""
-        longest = max(self.effect.shape[2], part.effect.shape[2])
+        spare = part.effect.shape[2] - self.effect.shape[2]
         old, new = (
-            fit._replace(
-                effect=np.pad(fit.effect, ((0, 0), (0, 0), (0, longest - fit.effect.shape[2])))
-            )
-            for fit in (self, part)
+            fit._replace(effect=np.pad(fit.effect, ((0, 0), (0, 0), (0, max(more, 0)))))
+            for fit, more in ((self, spare), (part, -spare))
         )
         fields = [np.array(field) for field in old]
         for field, values in zip(fields, new, strict=True):
@@ -160,8 +155,7 @@ def local_fit(
     order: int,
     shape: Literal["polynomial", "rational"],
 ) -> LocalFit:
-    """Fit polynomials of `order`, or these over a linear denominator, to responses and
-    transients."""
+    """Fit polynomials of `order`, or these over a linear denominator, and transients."""
     first, last = window_slices(omega, half_width, bins)
     longest, fields = max(int(np.max(last - first)), 1), []
     for chunk, window in _chunks(omega, half_width, bins, order):
@@ -175,10 +169,11 @@ def local_fit(
         padded = np.zeros((*effect.shape[:2], longest), complex)
         padded[:, :, : effect.shape[2]] = effect
         freedom = np.where(fine, solution.freedom, 0.0)
-        scatter = _products(solution.residual) / np.maximum(freedom, 1.0)[:, None, None]
+        left, power = (np.swapaxes(x, 1, 2) @ np.conj(x) for x in (solution.residual, u))
+        scatter = left / np.maximum(freedom, 1.0)[:, None, None]
         count = np.maximum(np.sum(window.used, axis=1), 1)[:, None, None]
         part = (solution.response * blank, padded * blank, solution.boost, scatter * blank,
-                freedom, _products(u) / count)  # fmt: skip
+                freedom, power / count)  # fmt: skip
         fields = fields or [np.empty((omega.size, *x.shape[1:]), x.dtype) for x in part]
         for field, values in zip(fields, part, strict=True):
             field[chunk] = values
@@ -187,15 +182,8 @@ def local_fit(
     return LocalFit(response, effect, boost, gain, first, scatter, freedom, power)
 
 
-def left_power(
-    omega: Grid,
-    half_width: Grid,
-    bins: Bins,
-    values: Complex[np.ndarray, "bins outputs"],
-    order: int,
-) -> Grid:
-    """Power of `values` that `local_fit` by polynomials would leave, all `bins` inputs; 0 without
-    fit."""
+def left_power(omega: Grid, half_width: Grid, bins: Bins, values: np.ndarray, order: int) -> Grid:
+    """Power of `values` that `local_fit` by polynomials would leave; 0 without a fit."""
     left, power = np.zeros(omega.size), np.sum(np.abs(values) ** 2, axis=1)
     for chunk, window in _chunks(omega, half_width, bins, order):
         u = bins.values[window.index] * window.used[:, :, None]
@@ -212,7 +200,7 @@ def left_power(
 
 class _Window(NamedTuple):
     index: Int[np.ndarray, "frequencies window"]
-    place: Places  # -1 to 1
+    place: InWindow  # -1 to 1
     used: Bool[np.ndarray, "frequencies window"]  # bins with information on the response
     owner: Owner  # the record of each of them
 
@@ -220,8 +208,7 @@ class _Window(NamedTuple):
 def _chunks(
     omega: Grid, half_width: Grid, bins: Bins, order: int
 ) -> Iterator[tuple[Int[np.ndarray, " chunk"], _Window]]:
-    """Frequencies with windows of about one length, padded; records with too few bins take no
-    part."""
+    """Frequencies with windows of about one length, padded; too few bins take no part."""
     first, last = window_slices(omega, half_width, bins)
     longest = max(int(np.max(last - first)), 1)
     places, size = np.argsort(last - first, kind="stable"), min(_CHUNK, max(_BINS // longest, 1))
@@ -236,11 +223,7 @@ def _chunks(
         yield chunk, _Window(index, place, np.any(owner, axis=2), owner)
 
 
-def _excited(
-    effect: Float[np.ndarray, "frequencies inputs"],
-    u: Inputs,
-    largest: Float[np.ndarray, " inputs"],
-) -> Where:
+def _excited(effect: np.ndarray, u: Inputs, largest: Float[np.ndarray, " inputs"]) -> Where:
     """Whether each input's power in the window is near that which determines its response.
 
     Beyond a sweep's end an input leaks as smoothly as a transient: the ratio, 2 to 30 within, is
@@ -249,11 +232,6 @@ def _excited(
     power = np.abs(u) ** 2
     excited = np.all(np.max(power, axis=1) > (_UNEXCITED * largest) ** 2, axis=1)
     return excited & np.all(effect * np.sum(power, axis=1) < _LEAKED, axis=1)
-
-
-def _products(x: Outputs) -> Complex[np.ndarray, "frequencies channels channels"]:
-    """Sums over the window of x_a conj(x_b)."""
-    return np.swapaxes(x, 1, 2) @ np.conj(x)
 
 
 class Solution(NamedTuple):
@@ -267,12 +245,12 @@ class Solution(NamedTuple):
     fine: Where  # whether the window determines the response
 
 
-def solve_polynomial(place: Places, u: Inputs, y: Outputs, owner: Owner, order: int) -> Solution:
+def solve_polynomial(place: InWindow, u: Inputs, y: Outputs, owner: Owner, order: int) -> Solution:
     """Y = sum_s (g_s U + t_s) place^s, with different t_s for each record."""
     return _least_squares(regressors(place, u, owner, order), y, owner, u.shape[2], order)
 
 
-def solve_rational(place: Places, u: Inputs, y: Outputs, owner: Owner, order: int) -> Solution:
+def solve_rational(place: InWindow, u: Inputs, y: Outputs, owner: Owner, order: int) -> Solution:
     """The same over 1 + a place (local rational method, McKelvey and Guerin, 2012), a for each
     output.
 
@@ -313,7 +291,7 @@ def _slope(x: Outputs, y: Outputs) -> Complex[np.ndarray, "frequencies outputs"]
     return np.vecdot(x, y) / np.maximum(np.vecdot(x, x).real, 1e-300)
 
 
-def regressors(place: Places, u: Inputs, owner: Owner, order: int) -> Columns:
+def regressors(place: InWindow, u: Inputs, owner: Owner, order: int) -> Columns:
     """Each input, then each record, times the powers of `place`; a column lies in one piece."""
     moving = np.concatenate([u, owner], axis=2)
     rows = np.empty((len(place), moving.shape[2], order + 1, place.shape[1]), complex)

@@ -117,7 +117,12 @@ def estimate_local_polynomial(
         moved = moved.replace_rows(rational, part)
     # Where the fit leaves much more than the noise, and where an input hardly moves.
     far_off = unresolved(omega, moved, sources, at, bins, rest.moved) & (options.width is None)
-    unmoved = find_unmoved(moved, sources, at, inputs) if joint else np.zeros_like(far_off)
+    unmoved = np.zeros_like(far_off)
+    if joint:  # there the ratio is that of two noises: -1 over the controller
+        invertible, _, turn = joint_factors(moved, inputs)
+        effect = np.sum(np.abs(np.swapaxes(turn, 1, 2) @ moved.effect) ** 2, axis=2)
+        relative = np.sqrt(sources.power[at][:, :inputs] * effect / 2)
+        unmoved = invertible & np.any(relative > _DIVISIBLE, axis=1)
     lost = far_off | unmoved
     blank = moved.rows(lost)
     names = "response", "effect", "gain", "scatter"
@@ -134,8 +139,10 @@ def estimate_local_polynomial(
     direct, multiple = (of(fit, power)[at] for of in (partial_coherence, multiple_coherence))
     coherence, finite = direct, np.isfinite(plant.response)
     if joint:
-        spread = windows.grid, windows.narrow, from_sources, inputs
-        coherence = coherence_of_references(*spread)[at]
+        # The smaller of the shares of input and output (Bendat and Piersol, Random Data, ch. 7).
+        power, alone = sources.power, power_alone(narrow)[:, None, :]
+        coherence = partial_coherence(narrow, power[:, inputs:])
+        coherence = np.minimum(coherence, alone / (alone + power[:, None, :inputs]))[at]
     coherent = np.any(coherence >= COHERENT, axis=(1, 2))
     coherence = np.where(finite, coherence, 0.0)
     ringing = np.zeros(at.size, bool)
@@ -159,18 +166,11 @@ def estimate_local_polynomial(
         bool(np.any(unmoved) and not np.any(finite)), ringing & coherent & ~far_off,
         None if options.width is None else windows.least[at],
     )  # fmt: skip
+    direct, log_noise = np.where(finite, direct, 0.0), log_noise[np.ix_(at, at)]
     return Estimate(
-        omega,
-        response,
-        coherence,
-        np.where(finite, direct, 0.0),
-        multiple,
-        errors,
-        error,
-        log_noise[np.ix_(at, at)],
-        remarks,
+        omega, response, coherence, direct, multiple, errors, error, log_noise, remarks,
         divided=share_of_inputs(left, sources, at, inputs) if joint else None,
-    )
+    )  # fmt: skip
 
 
 class Setup(NamedTuple):
@@ -259,10 +259,7 @@ def _repair_models(setup: Setup, rest: Rest) -> tuple[Rest, LocalFit]:
 
 
 def _narrowly(setup: Setup, rest: Rest) -> tuple[LocalFit, Float[np.ndarray, " moved"]]:
-    """Fits from the sources to what they move, and what models leave, to what the fits leave.
-
-    A rational fit counts where its residual is so much smaller that there must be a resonance.
-    """
+    """Fits from the sources to what they move; what models leave, to what the fits leave."""
     grid, width = setup.windows.grid, setup.windows.narrow
     respond = setup.to_moved(rest)
     fit, wider = respond(grid, width, "polynomial"), width
@@ -378,22 +375,8 @@ def joint_fit(fit: LocalFit, inputs: int) -> LocalFit:
     return LocalFit(response * blank, effect, boost, gain, fit.first, scatter, freedom, power)
 
 
-def coherence_of_references(omega: Grid, half_width: Grid, fit: LocalFit, inputs: int) -> Pairs:
-    """Partial coherence of the joint estimate: the smaller of the shares of input and output.
-
-    Source: Bendat and Piersol, Random Data, ch. 7.
-    """
-    noise = smooth_noise(omega, half_width, fit.scatter, fit.freedom)
-    moved = noise.power[:, None, :inputs]
-    plant = joint_fit(fit, inputs)
-    alone = power_alone(plant)[:, None, :]
-    through = partial_coherence(plant, noise.power[:, inputs:])
-    return np.minimum(through, alone / (alone + moved))
-
-
 def share_of_inputs(left: np.ndarray, noise: Noise, at: Places, inputs: int) -> Pairs:
-    """Share of a joint estimate's squared error by the noise of T_ru, half of what both make
-    included."""
+    """Share of the squared error by noise of T_ru, with half of what both make."""
     root = noise.root()[at]
     total = left @ root
     of_inputs = left[:, :, :inputs] @ root[:, :inputs]
@@ -401,12 +384,3 @@ def share_of_inputs(left: np.ndarray, noise: Noise, at: Places, inputs: int) -> 
     mine = np.sum(np.real(of_inputs * np.conj(total)), axis=2)
     share = np.clip(mine / np.maximum(power, 1e-300), 0.0, 1.0)
     return np.repeat(share[:, :, None], inputs, axis=2)
-
-
-def find_unmoved(moved: LocalFit, noise: Noise, at: Places, inputs: int) -> Where:
-    """Where references hardly move an input: the joint ratio of two noises is -1 over the
-    controller."""
-    invertible, _, back = joint_factors(moved, inputs)
-    effect = np.sum(np.abs(np.swapaxes(back, 1, 2) @ moved.effect) ** 2, axis=2)
-    relative = np.sqrt(noise.power[at][:, :inputs] * effect / 2)
-    return invertible & np.any(relative > _DIVISIBLE, axis=1)

@@ -1,7 +1,7 @@
 """Local fits: how wide their windows may be, and the errors and coherence from what they leave."""
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -50,11 +50,6 @@ class Windows(NamedTuple):
     most: Grid  # beyond which a window only costs memory and time
 
     @property
-    def omega(self) -> Float[np.ndarray, " response"]:
-        """The frequencies of the response."""
-        return self.grid[self.at]
-
-    @property
     def widest(self) -> Grid:
         """Half-widths that are tried at the most."""
         return np.minimum(np.maximum(_WIDEST * self.grid, _LEAST_SPAN * self.least), self.most)
@@ -92,7 +87,18 @@ def make_windows(
     steps = _PER_OCTAVE * np.log2([first, last])
     octaves = np.arange(np.ceil(steps[0]), np.floor(steps[1]) + 1) / _PER_OCTAVE
     grid = np.union1d(omega, 2**octaves)
-    least = _smallest_widths(grid, bins, coefficients, transients)
+    # The smallest windows with enough more bins than response and transients have coefficients.
+    low, high = np.zeros_like(grid), np.full_like(grid, bins.omega[-1])
+    parts = [bins.omega[bins.record == r] for r in range(bins.records)]
+    for _ in range(40):
+        middle, spare = (low + high) / 2, np.zeros(grid.size, int)
+        for part in parts:
+            first = np.searchsorted(part, grid - middle, "left")
+            last = np.searchsorted(part, grid + middle, "right")
+            spare += np.maximum(last - first - transients, 0)
+        enough = spare >= coefficients + _FREEDOM
+        low, high = np.where(enough, low, middle), np.where(enough, middle, high)
+    least = high * (1 + 1e-9)
     # Windows that reach half of the way to the next frequency leave nothing of a record out.
     density = bins.omega.size / (bins.omega[-1] - bins.omega[0])
     gaps = np.diff(grid)
@@ -102,45 +108,70 @@ def make_windows(
     return Windows(grid, np.searchsorted(grid, omega), least, narrow, most)
 
 
-def _smallest_widths(omega: Grid, bins: Bins, columns: int, transient: int) -> Grid:
-    """Half-widths of the smallest windows with enough more bins than response and transients
-    have."""
-    least, most = np.zeros_like(omega), np.full_like(omega, bins.omega[-1])
-    grids = [bins.omega[bins.record == r] for r in range(bins.records)]
-    for _ in range(40):
-        middle = (least + most) / 2
-        spare = np.zeros(omega.size, int)
-        for grid in grids:
-            first = np.searchsorted(grid, omega - middle, "left")
-            last = np.searchsorted(grid, omega + middle, "right")
-            spare += np.maximum(last - first - transient, 0)
-        enough = spare >= columns + _FREEDOM
-        least, most = np.where(enough, least, middle), np.where(enough, middle, most)
-    return most * (1 + 1e-9)
-
-
 def choose_widths(
     omega: Grid, least: Grid, reach: Grid, noise: Noise, respond: Respond
 ) -> tuple[Grid, Where]:
-    """Half-widths from `least` to `reach`, by intersecting confidence intervals, and where
-    rational.
+    """Half-widths from `least` to `reach`, by intersecting confidence intervals; where rational.
 
     A wider window is used while its response agrees with those of all narrower ones within the
     variance of their difference (Goldenshluger and Nemirovski, 1997), also on average over its
     neighbours. The test cannot see a bias of the size of the noise: the window is one step smaller,
     its bias a fifth.
     """
-    widest = np.maximum(reach, least)
+    from scipy.special import fdtri
+
+    def without_effect(omega: Grid, width: Grid) -> LocalFit:
+        """A fit without its largest array: the tests look at all widths at once."""
+        fit = respond(omega, width, "polynomial")
+        return fit._replace(effect=fit.effect[:, :, :0])
+
+    def quantile(count: Grid | float, chance: float) -> Grid:
+        """Of the mean of `count` squared differences over their estimated variance."""
+        return fdtri(2 * count, 2 * np.maximum(noise.freedom, 1.0), 1 - chance)
+
+    def differences(wide: LocalFit, narrow: LocalFit) -> tuple[Grid, Grid]:
+        """Sums over pairs of squared differences over their variance, and how many pairs count."""
+        # A narrow window much noisier than the wide one says little about its bias.
+        doubt = np.maximum(1.0, narrow.gain / (_NOISIER * np.maximum(wide.gain, 1e-300)))
+        variance = power * (narrow.gain - wide.gain) * doubt
+        tested = variance > 0.02 * power * wide.gain
+        tested &= np.isfinite(wide.response) & np.isfinite(narrow.response)
+        difference = np.abs(wide.response - narrow.response) ** 2
+        statistic = np.where(tested, difference / np.where(tested, variance, 1.0), 0.0)
+        return np.sum(statistic, axis=(1, 2)), np.sum(tested, axis=(1, 2)).astype(float)
+
+    widest, power = np.maximum(reach, least), noise.power[:, :, None]
     steps = int(np.ceil(np.log(np.max(widest / least)) / np.log(_RATIO) - 1e-9)) + 1
     widths = np.stack([np.minimum(least * _RATIO**m, widest) for m in range(steps)])
-    fits = [_without_effect(respond(omega, widths[0], "polynomial"))]
+    fits = [without_effect(omega, widths[0])]
     for below, width in zip(widths[:-1], widths[1:], strict=True):
         wider = width > below
-        part = _without_effect(respond(omega[wider], width[wider], "polynomial"))
-        fits.append(fits[-1].replace_rows(wider, part))
-    rational = _resonant(fits, respond(omega, least, "rational"), noise)
-    step, place = _widest_unbiased(omega, widths, fits, noise), np.arange(omega.size)
-    gain = np.stack([np.mean(fit.gain, axis=(1, 2)) for fit in fits])
+        fits.append(fits[-1].replace_rows(wider, without_effect(omega[wider], width[wider])))
+    # Where a polynomial is wrong and a rational function accurate: its error linear in the noise.
+    sharp = respond(omega, least, "rational")
+    pairs = float(sharp.response.shape[1] * sharp.response.shape[2])
+    alone = quantile(pairs, _CHANCE_ALONE)
+    left = diagonal(fits[0].scatter) / noise.power
+    rational = np.any(left > quantile(fits[0].freedom, _CHANCE_ALONE)[:, None], axis=1)
+    for wide in fits[1:2]:
+        statistic, count = differences(wide, fits[0])
+        rational |= statistic > alone * np.maximum(count, 1)
+    accurate = power * sharp.gain < _ACCURATE**2 * np.abs(sharp.response) ** 2
+    rational &= np.all(accurate, axis=(1, 2))
+    # The widest without a visible bias.
+    step, going = np.zeros(omega.size, int), np.ones(omega.size, bool)
+    kernel = np.exp(-0.5 * ((np.log(omega)[:, None] - np.log(omega)) / _SMOOTHING) ** 2)
+    for m in range(1, len(fits)):
+        windows = 1 + np.sqrt(np.pi) * _SMOOTHING * omega / widths[m]
+        shared = quantile(pairs * windows, _CHANCE)
+        for narrow in fits[:m]:
+            statistic, count = differences(fits[m], narrow)
+            # One frequency far off, as beside a resonance, says nothing about its neighbours.
+            total = kernel @ np.minimum(statistic, alone * count)
+            going &= total <= shared * (kernel @ count)
+            going &= statistic <= alone * pairs
+        step = np.where(going, m, step)
+    place, gain = np.arange(omega.size), np.stack([np.mean(x.gain, axis=(1, 2)) for x in fits])
     gain = np.where(np.isfinite(gain), gain, np.inf)
     # At the lowest frequencies one step less can cost more than any bias.
     below = gain[np.maximum(step - 1, 0), place]
@@ -153,75 +184,8 @@ def choose_widths(
     return np.where(rational, least, climbed), rational
 
 
-def _without_effect(fit: LocalFit) -> LocalFit:
-    """The fit without its largest array: the tests look at all widths at once."""
-    return fit._replace(effect=fit.effect[:, :, :0])
-
-
-def _resonant(fits: Sequence[LocalFit], sharp: LocalFit, noise: Noise) -> Where:
-    """Where a polynomial is wrong and a rational function accurate: its error linear in the
-    noise."""
-    pairs = noise.power.shape[1] * sharp.response.shape[2]
-    left = diagonal(fits[0].scatter) / noise.power
-    wrong = np.any(left > _quantile(fits[0].freedom, noise, _CHANCE_ALONE)[:, None], axis=1)
-    for wide in fits[1:2]:
-        statistic, count = _differences(wide, fits[0], noise)
-        alone = _quantile(np.full(len(left), float(pairs)), noise, _CHANCE_ALONE)
-        wrong |= statistic > alone * np.maximum(count, 1)
-    error = noise.power[:, :, None] * sharp.gain
-    return wrong & np.all(error < _ACCURATE**2 * np.abs(sharp.response) ** 2, axis=(1, 2))
-
-
-def _widest_unbiased(
-    omega: Grid,
-    widths: Float[np.ndarray, "steps frequencies"],
-    fits: Sequence[LocalFit],
-    noise: Noise,
-) -> Places:
-    step, going = np.zeros(omega.size, int), np.ones(omega.size, bool)
-    kernel = np.exp(-0.5 * ((np.log(omega)[:, None] - np.log(omega)) / _SMOOTHING) ** 2)
-    pairs = noise.power.shape[1] * fits[0].response.shape[2]
-    alone = _quantile(np.full(omega.size, float(pairs)), noise, _CHANCE_ALONE)
-    for m in range(1, len(fits)):
-        windows = 1 + np.sqrt(np.pi) * _SMOOTHING * omega / widths[m]
-        shared = _quantile(pairs * windows, noise, _CHANCE)
-        for narrow in fits[:m]:
-            statistic, count = _differences(fits[m], narrow, noise)
-            # One frequency far off, as beside a resonance, says nothing about its neighbours.
-            total = kernel @ np.minimum(statistic, alone * count)
-            going &= total <= shared * (kernel @ count)
-            going &= statistic <= alone * pairs
-        step = np.where(going, m, step)
-    return step
-
-
-def _quantile(count: Grid, noise: Noise, chance: float) -> Grid:
-    """Quantile of the mean of `count` squared differences over their estimated variance."""
-    from scipy.special import fdtri
-
-    return fdtri(2 * count, 2 * np.maximum(noise.freedom, 1.0), 1 - chance)
-
-
-def _differences(wide: LocalFit, narrow: LocalFit, noise: Noise) -> tuple[Grid, Grid]:
-    """Sums over the pairs of squared differences over their variance, and how many pairs count."""
-    power = noise.power
-    # A narrow window much noisier than the wide one says little about its bias.
-    doubt = np.maximum(1.0, narrow.gain / (_NOISIER * np.maximum(wide.gain, 1e-300)))
-    variance = power[:, :, None] * (narrow.gain - wide.gain) * doubt
-    tested = variance > 0.02 * power[:, :, None] * wide.gain
-    tested &= np.isfinite(wide.response) & np.isfinite(narrow.response)
-    difference = np.abs(wide.response - narrow.response) ** 2
-    statistic = np.where(tested, difference / np.where(tested, variance, 1.0), 0.0)
-    return np.sum(statistic, axis=(1, 2)), np.sum(tested, axis=(1, 2)).astype(float)
-
-
 def reach(omega: Grid, centre: Grid, widest: Grid, bins: Bins, columns: slice) -> Grid:
-    """Half-widths in rad/s within which the excitation is even, `widest` at most.
-
-    Beyond a sweep's end, a window that reaches back takes the response from there: smooth, and
-    wrong. So the mean power on one side of `centre` must not outweigh that at the centre, unless
-    both do.
-    """
+    """Half-widths of even excitation: beyond a sweep's end a window would take its response."""
     running = np.cumsum(np.abs(bins.values[:, columns]) ** 2, axis=0)
     running = np.concatenate([np.zeros((1, running.shape[1])), running])
 
@@ -265,10 +229,7 @@ class SharedErrors(NamedTuple):
     def on_atoms(
         self, reached: Bool[np.ndarray, " bins"]
     ) -> tuple[np.ndarray, np.ndarray, Int[np.ndarray, " driven"]]:
-        """Slopes by the parameters' errors of unit size, their drive by atoms, and which atoms.
-
-        The bins that no local fit reaches are one more atom for each parameter, behind all bins.
-        """
+        """Slopes by errors of unit size, their drive by atoms, and these; others are one more."""
         level = np.sum(np.abs(self.lines) ** 2, axis=2)
         pairs = zip(self.single, self.line, strict=True)
         size = np.sqrt(0.5 * np.array([np.abs(row) ** 2 @ level[:, k] for row, k in pairs]))
@@ -298,11 +259,7 @@ def error_covariance(
     left: Left,
     models: SharedErrors | None,
 ) -> ErrorCovariance:
-    """Errors of `fit`, recoloured by `back`; `at` is the place of each frequency in `noise`.
-
-    The atoms are the bins, each with its own noise: `left` times that of the `sources`. Where the
-    residual is larger than chance allows, so is the error. The same noise disturbs the `models`.
-    """
+    """Errors of `fit`: atoms are bins, their noise `left` times `sources`, more where misfit."""
     colour = _colour_of_noise(sources, left, omega, bins, fit)
     effect = fit.effect * np.exp(0.5 * np.mean(np.log(colour), axis=2))[:, None, :]
     scale = fit.boost * np.sqrt(_misfit(fit, noise, at, colour, _CHANCE_OF_MISFIT))
@@ -381,8 +338,7 @@ def multiple_coherence(fit: LocalFit, noise: Levels) -> Levels:
 def unresolved(
     omega: Grid, fit: LocalFit, noise: Noise, at: Places, bins: Bins, moved: slice
 ) -> Where:
-    """Where `fit` leaves residuals far above the noise, and more than a hundredth of what
-    `moved`."""
+    """Where `fit` leaves far more than the noise, and than a hundredth of what `moved`."""
     outputs = fit.response.shape[1]
     left = np.broadcast_to(np.eye(outputs, dtype=complex), (omega.size, outputs, outputs))
     colour = _colour_of_noise(noise, left, omega, bins, fit)
@@ -395,13 +351,7 @@ def unresolved(
     return fit.determined & np.any(large, axis=1)
 
 
-def _misfit(
-    fit: LocalFit,
-    noise: Noise,
-    at: Places,
-    colour: Float[np.ndarray, "frequencies window outputs"],
-    chance: float,
-) -> Levels:
+def _misfit(fit: LocalFit, noise: Noise, at: Places, colour: np.ndarray, chance: float) -> Levels:
     """Ratio of residuals to the noise where it is larger than chance allows, else 1."""
     from scipy.special import fdtri
 

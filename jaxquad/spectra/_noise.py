@@ -36,7 +36,7 @@ _BANDWIDTH = 0.2  # of the smoothing, in ln(omega)
 _WIDE = 2.0  # that of the correlations between outputs in open loop
 _UNLIKELY = 1e-4  # chance at which a residual counts as a misfit, or a line in the noise
 _NEAR = 1e-2  # of a pole: its neighbourhood's rounding is below 1e-13
-_FEW = 256  # frequencies, of which a square takes half a megabyte
+_KEPT = 256  # frequencies, of which a square takes half a megabyte
 _FLOOR = 1e-26  # of the output's power: below it lies rounding
 _RIDGE = 1e-12  # of the columns' size, so that empty ones do no harm
 _ROUNDING = 1e-7  # of a residual: the square is below rounding
@@ -81,7 +81,7 @@ def hermitian_root(covariance: Covariances) -> Covariances:
     # Not Cholesky's: along frequency the root must change as slowly as the matrix does.
     values, vectors = np.linalg.eigh(covariance)
     stretched = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
-    return stretched @ np.conj(np.swapaxes(vectors, 1, 2))
+    return stretched @ adjoint(vectors)
 
 
 def smooth_noise(
@@ -95,18 +95,27 @@ def smooth_noise(
     """
     from scipy.special import digamma, gammaincinv
 
+    def correlated(weight: Grid, bandwidth: float) -> Covariances:
+        offset, size = place[None, :] - place[:, None], np.sqrt(raw)
+        kernel = weight[None, :] * np.exp(-0.5 * (offset / bandwidth) ** 2)
+        normal = np.where(weight[:, None, None] > 0, scatter, 0) / size[:, :, None]
+        mixed = np.einsum("fg,gop->fop", kernel, normal / size[:, None, :])
+        mixed += 1e-12 * np.eye(raw.shape[1])
+        size = np.sqrt(diagonal(mixed))
+        return mixed / (size[:, :, None] * size[:, None, :])
+
     finite = freedom > 0
     freedom = np.where(finite, freedom, 1.0)
-    raw = np.real(np.diagonal(scatter, axis1=1, axis2=2))
+    raw = diagonal(scatter)
     raw = np.where(finite[:, None], np.maximum(raw, 1e-300), 1.0)
     bias = (digamma(freedom) - np.log(freedom))[:, None]
     high = np.log(gammaincinv(freedom, 1 - _UNLIKELY) / freedom)[:, None]
     place, level = np.log(omega), np.log(raw) - bias
     weight = np.where(finite, freedom, 0.0)[:, None] * np.ones_like(level)
-    smooth = _local_lines(place, level, weight)
+    smooth = _local_lines(omega, level, weight)
     for _ in range(3):
         outlier = finite[:, None] & (np.log(raw) > smooth + high)
-        smooth = _local_lines(place, level, np.where(outlier, 1e-9 * weight, weight))
+        smooth = _local_lines(omega, level, np.where(outlier, 1e-9 * weight, weight))
     if np.any(finite):  # Far from all determined frequencies the kernel vanishes.
         isolated = np.interp(place, place[finite], np.arange(np.sum(finite)))
         isolated = np.abs(place - place[finite][np.round(isolated).astype(int)]) > 3 * _BANDWIDTH
@@ -114,12 +123,12 @@ def smooth_noise(
         smooth = np.where(isolated[:, None], np.stack(nearest, axis=1), smooth)
     freedom = np.where(finite, freedom, 0.0)
     counts = freedom * (1 + np.sqrt(np.pi) * _BANDWIDTH * omega / half_width)
-    correlation = _correlation(place, scatter, raw, freedom, _BANDWIDTH)
+    correlation = correlated(freedom, _BANDWIDTH)
     if open_loop and raw.shape[1] > 1:
         # Wide ones where the narrow ones differ from them by chance, towards the narrow ones as the
         # squared differences grow to twice that: a complex correlation r of n complex degrees of
         # freedom has the variance (1 - |r|^2) / n.
-        wide = _correlation(place, scatter, raw, counts, _WIDE)
+        wide = correlated(counts, _WIDE)
         distance = np.sum(counts[:, None, None] * np.abs(correlation - wide) ** 2)
         chance = np.sum((1 - np.abs(wide) ** 2)[counts > 0])
         share = np.clip(distance / max(float(chance), 1e-300) - 1, 0.0, 1.0)
@@ -127,32 +136,9 @@ def smooth_noise(
     return Noise(omega, np.exp(smooth), correlation, counts)
 
 
-def _local_lines(place: Grid, level: Levels, weight: Levels) -> Levels:
-    """Weighted local straight lines along ln(omega)."""
-    offset = place[None, :] - place[:, None]
-    kernel = np.exp(-0.5 * (offset / _BANDWIDTH) ** 2)
-    m0, m1, m2 = ((kernel * offset**k) @ weight for k in (0, 1, 2))
-    l0, l1 = ((kernel * offset**k) @ (weight * level) for k in (0, 1))
-    # A single frequency has no slope: a prior on the slope keeps the line flat there.
-    spread = m2 + 1e-3 * _BANDWIDTH**2 * m0 + 1e-300
-    return (spread * l0 - m1 * l1) / (spread * m0 - m1**2 + 1e-300)
-
-
-def _correlation(
-    place: Grid, scatter: Covariances, power: Levels, weight: Grid, bandwidth: float
-) -> Covariances:
-    offset = place[None, :] - place[:, None]
-    kernel = weight[None, :] * np.exp(-0.5 * (offset / bandwidth) ** 2)
-    size = np.sqrt(power)
-    normal = np.where(weight[:, None, None] > 0, scatter, 0) / (size[:, :, None] * size[:, None, :])
-    mixed = np.einsum("fg,gop->fop", kernel, normal) + 1e-12 * np.eye(power.shape[1])
-    size = np.sqrt(np.real(np.diagonal(mixed, axis1=1, axis2=2)))
-    return mixed / (size[:, :, None] * size[:, None, :])
-
-
 def kept_if_few(function: Function, frequencies: int) -> Function:
     """The function with its `ft.lru_cache` for few frequencies, else without: squares are large."""
-    return function if frequencies <= _FEW else inspect.unwrap(function)
+    return function if frequencies <= _KEPT else inspect.unwrap(function)
 
 
 def kernels(omega: Grid) -> Float[np.ndarray, "3 frequencies frequencies"]:
@@ -168,9 +154,17 @@ def _kernels_of(omega: tuple[float, ...]) -> Float[np.ndarray, "3 frequencies fr
     return np.stack([kernel, kernel * offset, kernel * offset**2])
 
 
+def _local_lines(omega: Grid, level: Levels, weight: Levels) -> Levels:
+    """Weighted local straight lines along ln(omega)."""
+    near = kernels(omega)
+    (m0, m1, m2), (l0, l1, _) = near @ weight, near @ (weight * level)
+    # A single frequency has no slope: a prior on the slope keeps the line flat there.
+    spread = m2 + 1e-3 * _BANDWIDTH**2 * m0 + 1e-300
+    return (spread * l0 - m1 * l1) / (spread * m0 - m1**2 + 1e-300)
+
+
 def smoothed(omega: Grid, covariance: Square, weight: Grid) -> Square:
-    """Covariance of the logarithm of noise powers, of `weight` degrees of freedom, after
-    smoothing."""
+    """Covariance of the logarithm of noise powers after smoothing."""
     near = kernels(omega)
     m0, m1, m2 = (near @ weight)[:, :, None]
     # A single frequency has no slope: the small term keeps the line flat there.
@@ -181,8 +175,7 @@ def smoothed(omega: Grid, covariance: Square, weight: Grid) -> Square:
 
 
 def covariance_of_bands(first: Places, last: Places, freedom: Grid) -> Square:
-    """Of the logarithm of mean residual powers over bins: bands share as much of it as of their
-    bins."""
+    """Of the logarithm of mean residual powers over bins, by the bins that bands share."""
     count = np.maximum(last - first, 1)
     shared = np.minimum(last[:, None], last) - np.maximum(first[:, None], first)
     overlap = np.maximum(shared, 0) / np.sqrt(np.outer(count, count))
@@ -197,10 +190,8 @@ def covariance_of_windows(
 ) -> Square:
     """Of the logarithm of residual powers of all lengths, whose standard errors are `levels`."""
     angles, shared = tuple(angle.tolist()), kept_if_few(_shared_power, angle.size)
-    parts = (
-        shared(shape, length, angles) * level * level[:, None]
-        for level, length in zip(levels.T, lengths, strict=True)
-    )
+    pairs = zip(levels.T, lengths, strict=True)
+    parts = (shared(shape, length, angles) * level * level[:, None] for level, length in pairs)
     return ft.reduce(np.add, parts)
 
 
@@ -226,18 +217,8 @@ def _shared_power(shape: str, length: int, angle: tuple[float, ...]) -> Square:
     return (correlation / terms[0]) ** 2
 
 
-class Slopes(NamedTuple):
-    """Transforms behind the derivatives of the windows of one length."""
-
-    first: Complex[np.ndarray, "frequencies _ channels"]  # derivative: inputs, then outputs
-    second: Complex[np.ndarray, "frequencies _ inputs"]
-
-
 class Rest(NamedTuple):
-    """What is left of the outputs' windows: sums of `conj(a) b`, by window length.
-
-    `trace` is the energy that unit noise leaves.
-    """
+    """What is left of the outputs' windows: sums of `conj(a) b`, and the energy of unit noise."""
 
     products: Complex[np.ndarray, "frequencies outputs outputs groups"]
     trace: Groups
@@ -282,29 +263,72 @@ def shows_leakage(windows: int, inputs: int) -> bool:
 def without_leakage(
     windows: Sequence[tuple[np.ndarray, np.ndarray]],
     response: Responses,
-    slopes: Sequence[Slopes],
+    slopes: Sequence[tuple[np.ndarray, np.ndarray]],
     overlap: Overlap,
     resolved: Resolved,
 ) -> Rest:
     """Outputs less all that inputs and leakage explain, by window length, from where it is
     `resolved`.
 
-    A length with too few windows for its leakage keeps it, as noise; its slopes do not matter.
+    A length with too few windows for its leakage keeps it, as noise; its slopes do not matter. With
+    P the projection and O the overlap: tr(P O), the degrees of freedom tr(P O)^2 / tr(P O P O).
     """
-    parts, first = [], 0
+    parts, end, outputs = [], 0, response.shape[1]
     for pair, derivatives, where in zip(windows, slopes, resolved, strict=True):
         # What a window does not resolve lies below what it does, and has no weight.
         few = slice(int(np.argmax(where)), None)
         x, y, x1, x2 = (np.swapaxes(part[few], 1, 2) for part in (*pair, *derivatives))
         inputs, count = x.shape[1:]
         columns, both = x, y - response[few] @ x
-        if shows_leakage(count, inputs):
+        if shows_leakage(count, inputs):  # each output on its own slope, too, behind it in `both`
             columns = np.concatenate([x, x1[:, :inputs], x2], axis=1)
             both = np.concatenate([both, x1[:, inputs:]], axis=1)
-        mine = slice(first, first + count)
+        begin, end = end, end + count
+        mutual = overlap[begin:end, begin:end]
         columns = np.ascontiguousarray(columns)
-        parts.append(_least_squares(both, columns, y.shape[1], overlap[mine, mine]))
-        first += count
+        size, conjugate = columns.shape[1], np.conj(columns)
+        weighed = _times_overlap(columns, mutual)
+        # One product of all: many small ones take as long to begin as to make.
+        stacked = conjugate @ np.swapaxes(np.concatenate([columns, weighed, both], axis=1), 1, 2)
+        gram, aa = stacked[:, :, :size], stacked[:, :, size : 2 * size]
+        power = diagonal(gram)
+        units = 1 / np.maximum(np.sqrt(power), 1e-100)
+        units = units[:, :, None] * units[:, None, :]
+        solver = np.linalg.inv(gram * units + _RIDGE * np.eye(size)) * units
+        fitted = solver @ stacked[:, :, 2 * size :]
+        rest = both - np.swapaxes(fitted, 1, 2) @ columns
+        before, left = (np.sqrt(_inner(part, part)) for part in (both, rest))
+        # Nearly dependent columns leave a part of themselves: orthogonal to all else, so its square
+        # counts.
+        least = diagonal(solver) * power
+        if np.any(2e-16 * np.max(least, axis=1, keepdims=True) * before > _ROUNDING * left):
+            rest -= np.swapaxes(solver @ (conjugate @ np.swapaxes(rest, 1, 2)), 1, 2) @ columns
+            left = np.sqrt(_inner(rest, rest))
+        rest, q, length = rest[:, :outputs], rest[:, outputs:], left[:, outputs:]
+        inverse = np.where(
+            length > _WITHIN * before[:, outputs:], 1 / np.maximum(length, 1e-300), 0.0
+        )
+        q = q * inverse[:, :, None]
+        along = np.vecdot(q, rest[:, : q.shape[1]])
+        if q.shape[1]:
+            rest = rest - q * along[:, :, None]
+        weighed_q = _times_overlap(q, mutual)
+        products = np.conj(weighed) @ np.swapaxes(np.concatenate([weighed, q], axis=1), 1, 2)
+        aa_twice, aq = products[:, :, :size], products[:, :, size:]
+        qq, qq_twice = _inner(q, weighed_q), _inner(weighed_q, weighed_q)
+        through = solver @ aa
+        trace = (np.trace(mutual) - _trace(solver, aa))[:, None]
+        square = np.sum(mutual**2) - 2 * _trace(solver, aa_twice)
+        square = (square + _trace(through, adjoint(through)))[:, None]
+        if q.shape[1]:
+            crossed = qq_twice - np.sum(np.conj(aq) * (solver @ aq), axis=1).real
+            trace, square = trace - qq, square - 2 * crossed + qq**2
+        freedom = np.maximum(trace**2 / square, 0.5)
+        if not q.shape[1]:
+            trace, freedom = (np.repeat(part, outputs, axis=1) for part in (trace, freedom))
+        products = np.conj(rest) @ np.swapaxes(rest, 1, 2)
+        fit = Fit(solver, fitted, inverse, along, aa, aq, qq)
+        parts.append((products, trace, freedom, fit))
     *sums, fits = zip(*parts, strict=True)
     products, trace, freedom = (padded(part, len(response)) for part in sums)
     return Rest(products, np.where(trace > 0, trace, 1.0), np.maximum(freedom, 0.5), fits)
@@ -316,59 +340,6 @@ def padded(parts: Sequence[np.ndarray], frequencies: int) -> np.ndarray:
     for k, part in enumerate(parts):
         joined[frequencies - len(part) :, ..., k] = part
     return joined
-
-
-def _least_squares(
-    both: Rows,
-    columns: Complex[np.ndarray, "frequencies columns windows"],
-    outputs: int,
-    overlap: Overlap,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, Fit]:
-    """`Rest` of one length: each output on the columns, and on its own slope, behind it in `both`.
-
-    With P the projection and O the overlap: tr(P O), the degrees of freedom tr(P O)^2 / tr(P O P
-    O).
-    """
-    count, conjugate = columns.shape[1], np.conj(columns)
-    weighed = _times_overlap(columns, overlap)
-    # One product of all: many small ones take as long to begin as to make.
-    stacked = conjugate @ np.swapaxes(np.concatenate([columns, weighed, both], axis=1), 1, 2)
-    gram, aa = stacked[:, :, :count], stacked[:, :, count : 2 * count]
-    power = diagonal(gram)
-    units = 1 / np.maximum(np.sqrt(power), 1e-100)
-    units = units[:, :, None] * units[:, None, :]
-    solver = np.linalg.inv(gram * units + _RIDGE * np.eye(count)) * units
-    fitted = solver @ stacked[:, :, 2 * count :]
-    rest = both - np.swapaxes(fitted, 1, 2) @ columns
-    size, left = (np.sqrt(_inner(part, part)) for part in (both, rest))
-    # Nearly dependent columns leave a part of themselves: orthogonal to all else, so its square
-    # counts.
-    least = diagonal(solver) * power
-    if np.any(2e-16 * np.max(least, axis=1, keepdims=True) * size > _ROUNDING * left):
-        rest -= np.swapaxes(solver @ (conjugate @ np.swapaxes(rest, 1, 2)), 1, 2) @ columns
-        left = np.sqrt(_inner(rest, rest))
-    rest, q, length = rest[:, :outputs], rest[:, outputs:], left[:, outputs:]
-    inverse = np.where(length > _WITHIN * size[:, outputs:], 1 / np.maximum(length, 1e-300), 0.0)
-    q = q * inverse[:, :, None]
-    along = np.vecdot(q, rest[:, : q.shape[1]])
-    if q.shape[1]:
-        rest = rest - q * along[:, :, None]
-    weighed_q = _times_overlap(q, overlap)
-    products = np.conj(weighed) @ np.swapaxes(np.concatenate([weighed, q], axis=1), 1, 2)
-    aa_twice, aq = products[:, :, :count], products[:, :, count:]
-    qq, qq_twice = _inner(q, weighed_q), _inner(weighed_q, weighed_q)
-    through = solver @ aa
-    trace = (np.trace(overlap) - _trace(solver, aa))[:, None]
-    square = np.sum(overlap**2) - 2 * _trace(solver, aa_twice)
-    square = (square + _trace(through, adjoint(through)))[:, None]
-    if q.shape[1]:
-        crossed = qq_twice - np.sum(np.conj(aq) * (solver @ aq), axis=1).real
-        trace, square = trace - qq, square - 2 * crossed + qq**2
-    freedom = np.maximum(trace**2 / square, 0.5)
-    if not q.shape[1]:
-        trace, freedom = (np.repeat(part, outputs, axis=1) for part in (trace, freedom))
-    products = np.conj(rest) @ np.swapaxes(rest, 1, 2)
-    return products, trace, freedom, Fit(solver, fitted, inverse, along, aa, aq, qq)
 
 
 def _times_overlap(rows: Rows, overlap: Overlap) -> Rows:

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Complex, Float, Int
+from jaxtyping import Complex, Float, Int
 
 from jaxquad._core import Message
 from jaxquad.records import Record
@@ -22,10 +22,7 @@ from ._estimators import (
     Levels,
     Method,
     Periodic,
-    Places,
     Remark,
-    Responses,
-    Where,
 )
 from ._frequency_response import Distortion, Estimate
 from ._noise import smooth_noise, smoothed
@@ -97,75 +94,6 @@ def excited_lines(periods: Sequence[Periods], channels: slice) -> Int[np.ndarray
     return np.flatnonzero(np.any(clear & (power > _FAINT * np.max(power, axis=0)), axis=1))
 
 
-class Fit(NamedTuple):
-    """The error of `response` is `sum_r v[f, o, r] effect[f, i, r]`, v the averages' noise."""
-
-    u: Complex[np.ndarray, "frequencies inputs realisations"]
-    y: Complex[np.ndarray, "frequencies outputs realisations"]
-    response: Responses
-    effect: Complex[np.ndarray, "frequencies inputs realisations"]
-    determined: Where
-
-
-class Scatter(NamedTuple):
-    """Powers per line of the averages over a record's periods, smooth along frequency."""
-
-    noise: Levels
-    total: Levels | None  # needs more realisations than inputs
-    significant: Bool[np.ndarray, " outputs"]
-    root: Covariances  # of the larger of the two
-    periods: float  # in an average
-    freedom: float  # complex degrees of freedom of the root's power at each line
-
-    def nonlinear(self) -> Levels:
-        """Power that the noise does not explain."""
-        total = self.noise if self.total is None else self.total
-        return np.maximum(total - self.noise, 0.0)
-
-
-def estimate_scatter(omega: Grid, fit: Fit, periods: Sequence[Periods], lines: Places) -> Scatter:
-    """Noise between periods, from v = y - G u, and scatter between realisations.
-
-    With input noise and feedback, v is what perturbs G (Pintelon and Schoukens, eq. 2-25).
-    """
-    from scipy.special import fdtri, gammaincinv
-
-    def smooth(covariance: Covariances, freedom: float) -> tuple[Levels, Covariances]:
-        """Powers and roots, smooth along frequency except at lines that stand out."""
-        spacing = np.gradient(omega) if omega.size > 1 else omega
-        counts = np.where(fit.determined, freedom, 0.0)
-        smooth = smooth_noise(omega, spacing, covariance, counts)
-        raw, high = diagonal(covariance), gammaincinv(freedom, 1 - _CHANCE) / freedom
-        power = np.where(raw > high * smooth.power, raw, smooth.power)
-        return power, smooth._replace(power=power).root()
-
-    inputs, outputs = fit.u.shape[1], fit.y.shape[1]
-    count = 1 / float(np.mean([1 / one.count for one in periods]))
-    freedom = float(sum(one.count - 1 for one in periods))
-    ones = np.broadcast_to(np.eye(outputs), (len(lines), outputs, outputs))
-    left, channels = np.concatenate([-fit.response, ones], axis=2), slice(0, inputs + outputs)
-    covariance = pooled(periods)[lines][:, channels, channels] / count
-    noise = left @ covariance @ adjoint(left)
-    power, root = smooth(noise, freedom)
-    spare = float(fit.u.shape[2] - inputs)
-    if spare <= 0:
-        return Scatter(power, None, np.zeros(outputs, bool), root, count, freedom)
-    residual = fit.y - fit.response @ fit.u
-    between = residual @ adjoint(residual) / spare
-    total, total_root = smooth(between, spare)
-    ratio = np.sum(diagonal(between) / power * fit.determined[:, None], axis=0)
-    size = 2.0 * max(np.sum(fit.determined), 1)
-    ratio = 2 * ratio / size
-    significant = ratio > fdtri(size * spare, size * freedom, 1 - _CHANCE)
-    # Rounding errors repeat from period to period, and not from one realisation to the next.
-    output = np.mean(np.abs(fit.y) ** 2, axis=(0, 2))
-    significant &= np.mean(diagonal(between), axis=0) > _ROUNDING * output
-    if np.any(significant):
-        larger = np.sqrt(np.maximum(power, total) / total)
-        return Scatter(power, total, significant, total_root * larger[:, :, None], count, spare)
-    return Scatter(power, total, significant, root, count, freedom)
-
-
 def estimate_periodic(
     records: Sequence[Record],
     omega: Float[np.ndarray, " response"] | None,
@@ -178,6 +106,8 @@ def estimate_periodic(
     records, G = Y Z^H (U Z^H)^-1. For one input and one record that is Y / U, which fed-back noise
     does not bias either: only its average over the periods remains.
     """
+    from scipy.special import fdtri, gammaincinv
+
     inputs, outputs = records[0].inputs.shape[1], records[0].outputs.shape[1]
     sizes = {options.samples(record) for record in records}
     if len(sizes) > 1:
@@ -221,60 +151,74 @@ def estimate_periodic(
     fine = strength[:, -1] > _DEPENDENT * np.maximum(strength[:, 0], 1e-300)
     inverse = np.linalg.inv(np.where(fine[:, None, None], cross, np.eye(inputs)))
     effect = np.swapaxes(adjoint(z) @ inverse, 1, 2)
-    fit = Fit(u, y, np.swapaxes(effect @ np.swapaxes(y, 1, 2), 1, 2), effect, fine)
-    scatter = estimate_scatter(omega, fit, periods, lines)
-    determined = fit.determined[:, None, None]
+    response, determined = np.swapaxes(effect @ np.swapaxes(y, 1, 2), 1, 2), fine[:, None, None]
+
+    def smooth(covariance: Covariances, freedom: float) -> tuple[Levels, Covariances]:
+        """Powers and roots, smooth along frequency except at lines that stand out."""
+        spacing, counts = np.gradient(omega) if omega.size > 1 else omega, fine * freedom
+        smooth = smooth_noise(omega, spacing, covariance, counts)
+        raw, high = diagonal(covariance), gammaincinv(freedom, 1 - _CHANCE) / freedom
+        power = np.where(raw > high * smooth.power, raw, smooth.power)
+        return power, smooth._replace(power=power).root()
+
+    # Noise between periods, from v = y - G u, and scatter between realisations. With input noise
+    # and feedback, v is what perturbs G (Pintelon and Schoukens, eq. 2-25).
+    count = 1 / float(np.mean([1 / one.count for one in periods]))
+    freedom, spare = float(sum(one.count - 1 for one in periods)), float(u.shape[2] - inputs)
+    ones = np.broadcast_to(np.eye(outputs), (len(lines), outputs, outputs))
+    covariance = pooled(periods)[lines]
+    left, first = np.concatenate([-response, ones], axis=2), inputs + outputs
+    noise, root = smooth(left @ covariance[:, :first, :first] / count @ adjoint(left), freedom)
+    significant, total, size = np.zeros(outputs, bool), noise, 2.0 * max(np.sum(fine), 1)
+    if spare > 0:  # more realisations than inputs
+        residual = y - response @ u
+        between = residual @ adjoint(residual) / spare
+        total, total_root = smooth(between, spare)
+        ratio = 2 * np.sum(diagonal(between) / noise * fine[:, None], axis=0) / size
+        significant = ratio > fdtri(size * spare, size * freedom, 1 - _CHANCE)
+        # Rounding errors repeat from period to period, and not from one realisation to the next.
+        output = np.mean(np.abs(y) ** 2, axis=(0, 2))
+        significant &= np.mean(diagonal(between), axis=0) > _ROUNDING * output
+        if np.any(significant):
+            root = total_root * np.sqrt(np.maximum(noise, total) / total)[:, :, None]
+            freedom = spare
+    nonlinear = np.maximum(total - noise, 0.0)
     # Coherence is that of one period: the share of an output that an input explains, and of the
     # joint estimate the smaller of that and of the repeated share of the input.
     power = np.einsum("fir,fjr->fij", u, np.conj(u)) / u.shape[2]
-    inverse = np.linalg.inv(np.where(determined, power, np.eye(inputs)))
-    alone = 1 / diagonal(inverse)
-    explained = np.abs(fit.response) ** 2 * alone[:, None, :]
-    left = scatter.noise * scatter.periods + scatter.nonlinear()
+    alone = 1 / diagonal(np.linalg.inv(np.where(determined, power, np.eye(inputs))))
+    explained = np.abs(response) ** 2 * alone[:, None, :]
+    left = noise * count + nonlinear
     direct = np.where(determined, explained / (explained + left[:, :, None]), 0.0)
-    jitter = diagonal(pooled(periods)[lines])[:, :inputs]
+    jitter = diagonal(covariance)[:, :inputs]
     steady = np.minimum(direct, (alone / (alone + jitter))[:, None, :] * determined)
-    together = np.mean(np.abs(np.nan_to_num(fit.response) @ u) ** 2, axis=2)
+    together = np.mean(np.abs(np.nan_to_num(response) @ u) ** 2, axis=2)
     # The noise of each line is independent: as many atoms as inputs at each.
-    kernel = np.einsum("fir,fjr->fij", fit.effect, np.conj(fit.effect))
+    kernel = np.einsum("fir,fjr->fij", effect, np.conj(effect))
     kernel = np.where(determined, kernel, _UNKNOWN**2 * np.eye(inputs))
     values, vectors = np.linalg.eigh(kernel)
     effect = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
-    noise = np.where(determined, scatter.root, np.eye(outputs))
-    weight = np.where(fit.determined, scatter.freedom, 1e-9)
-    blank = np.nan if scatter.total is None else 1.0
-    total = scatter.noise if scatter.total is None else scatter.total
-    errors = ErrorCovariance(omega, effect, noise, first=inputs * np.arange(omega.size))
-    response = np.where(determined, fit.response, np.nan)
+    root = np.where(determined, root, np.eye(outputs))
+    blank, names = 1.0 if spare > 0 else np.nan, records[0].output_names
+    errors = ErrorCovariance(omega, effect, root, first=inputs * np.arange(omega.size))
+    amplitude = np.sqrt(np.mean(np.abs(response @ u) ** 2, axis=2))
+    scatter = np.sqrt(noise), np.sqrt(total) * blank, np.sqrt(nonlinear) * blank
+    response = np.where(determined, response, np.nan)
     with np.errstate(divide="ignore", invalid="ignore"):
         relative = np.sqrt(errors.variance() / 2) / np.abs(response)
+    relative = np.where(np.isfinite(response), relative, np.inf)
+    together, steady = together / (together + left), steady if method == "joint" else direct
+    log_noise = smoothed(omega, np.eye(omega.size) / freedom, np.where(fine, freedom, 1e-9))
+    remarks = ft.partial(_remarks, omega[~fine], bool(np.any(significant)), periods)
+    distortion = Distortion(omega, amplitude, *scatter, significant, names, len(records))
     return Estimate(
-        omega,
-        response,
-        steady if method == "joint" else direct,
-        direct,
-        together / (together + left),
-        errors,
-        np.where(np.isfinite(response), relative, np.inf),
-        smoothed(omega, np.eye(omega.size) / scatter.freedom, weight),
-        ft.partial(_remarks, omega, fit, scatter, periods),
-        distortion=Distortion(
-            omega,
-            np.sqrt(np.mean(np.abs(fit.response @ u) ** 2, axis=2)),
-            np.sqrt(scatter.noise),
-            np.sqrt(total) * blank,
-            np.sqrt(scatter.nonlinear()) * blank,
-            scatter.significant,
-            records[0].output_names,
-            len(records),
-        ),
-    )
+        omega, response, steady, direct, together, errors, relative, log_noise, remarks,
+        distortion=distortion,
+    )  # fmt: skip
 
 
-def _remarks(
-    omega: Grid, fit: Fit, scatter: Scatter, periods: Sequence[Periods]
-) -> tuple[Remark, ...]:
-    remarks, lost = [], omega[~fit.determined]
+def _remarks(lost: Grid, distorted: bool, periods: Sequence[Periods]) -> tuple[Remark, ...]:
+    remarks = []
     if lost.size:
         text = (
             "undetermined {where}: the inputs cannot be separated there. Use different phases in "
@@ -288,7 +232,7 @@ def _remarks(
             "noise power, because a transient remains: discard more periods"
         )
         remarks.append(Remark(text, kind="transient"))
-    if np.any(scatter.significant):
+    if distorted:
         text = (
             "nonlinear distortion exceeds the noise: the error bars are those of the best linear "
             "approximation. Use a smaller amplitude, or take the fit as that at this amplitude"

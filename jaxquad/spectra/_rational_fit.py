@@ -16,6 +16,12 @@ _NEAREST = 1e-9  # size of the denominator, to its terms', so that no pole falls
 _EXACT = 1e-20  # share of the output's power that is rounding
 _LEAST_CONDITION = 1e-10  # reciprocal, of normal equations that leave digits enough
 _DEPENDENT = 1e-13  # singular value, to the largest, of a direction that is left alone
+_TRIAL = 1e-3  # relative gain of a step at which a descent ends
+_PER_PARAMETER = 6  # real equations
+_THOROUGH, _PATIENCE = 6, 4  # least order, and orders in a row no better, that end the search
+_DOUBTED = 2  # orders in a row no better that end the search around an order
+PRICE = 4.0  # of a parameter: Akaike's is 2, a Bayesian one ln(count), 7 to 8
+_PLACES = 5  # at which one more pole is tried
 
 Powers = Float[np.ndarray, " powers"]
 Bins = Complex[np.ndarray, " bins"]
@@ -43,6 +49,17 @@ class Equations(NamedTuple):
         """Real coefficients of a model of this order, without the common factor."""
         return len(self.u) * (order + 1) + len(self.owner) * order + order
 
+    def highest(self, most: int) -> int:
+        """The highest order, up to `most`, of which there are equations enough."""
+        enough = 2 * len(self.y) / _PER_PARAMETER
+        return sum(self.parameters(order) <= enough for order in range(1, most + 1))
+
+    def criterion(self, solved: "Solved") -> float:
+        """Of the solution's order: the least is the best."""
+        count, parameters = 2 * len(self.y), self.parameters(solved.order) if solved.order else 1
+        cost = max(solved.cost + 0.01 * self.rounding, 1e-300)
+        return count * np.log(cost / count) + PRICE * parameters
+
     @property
     def rounding(self) -> float:
         """What rounding may leave of the output's sum of squares."""
@@ -66,19 +83,35 @@ class Solved(NamedTuple):
 class Basis(NamedTuple):
     """What all models of one order have in common."""
 
+    equations: Equations
     powers: Complex[np.ndarray, "powers bins"]
     columns: Complex[np.ndarray, "parameters bins"]  # of the numerators and transients
     magnitude: Float[np.ndarray, "powers bins"]  # of the powers
+
+    @classmethod
+    def of(cls, equations: Equations, size: int) -> "Basis":
+        powers = powers_of(equations.x, size)
+        columns = columns_of(powers, equations.u, equations.owner)
+        return cls(equations, powers, columns, np.abs(powers))
 
     def largest(self, denominator: Powers) -> int:
         """The power whose term is largest over the bins."""
         return int(np.argmax(np.abs(denominator) * np.mean(self.magnitude, axis=1)))
 
+    def solve(self, denominator: Powers) -> "tuple[Solved, _Span]":
+        """The best linear coefficients under a denominator, and what their columns span."""
+        below = denominator @ self.powers
+        least = _NEAREST * (np.abs(denominator) @ self.magnitude)
+        below = np.where(np.abs(below) < least, least, below)
+        span = _Span.of(parts_of(self.columns * (1 / below)))
+        linear, left = span.nearest(parts_of(self.equations.y))
+        solved = Solved(denominator, linear, below, left.view(complex), float(left @ left))
+        return solved, span
 
-def make_basis(equations: Equations, size: int) -> Basis:
-    powers = powers_of(equations.x, size)
-    columns = columns_of(powers, equations.u, equations.owner)
-    return Basis(powers, columns, np.abs(powers))
+    def slopes(self, solved: Solved, fixed: int) -> Complex[np.ndarray, "rows bins"]:
+        """Derivatives of the fitted output by the denominator's coefficients but the fixed one."""
+        fitted = self.equations.y - solved.left
+        return np.delete(self.powers, fixed, axis=0) * (-fitted / solved.below)
 
 
 def powers_of(x: Bins, size: int) -> Complex[np.ndarray, "powers bins"]:
@@ -105,15 +138,18 @@ def columns_of(
     return columns
 
 
-def descend(equations: Equations, basis: Basis, denominator: Powers, least_gain: float) -> Solved:
-    """Gauss-Newton steps of the denominator (variable projection: Golub, Pereyra 1973; Kaufman
-    1975)."""
+def descend(equations: Equations, denominator: Powers, least_gain: float) -> tuple[Solved, Basis]:
+    """Gauss-Newton steps of the denominator, which variable projection leaves alone.
+
+    Source: Golub and Pereyra (1973), as simplified by Kaufman (1975).
+    """
     from scipy.linalg.lapack import dgeqrf  # pyright: ignore[reportAttributeAccessIssue]
 
-    solved, span = _project(equations, basis, denominator)
+    basis = Basis.of(equations, denominator.size)
+    solved, span = basis.solve(denominator)
     for _ in range(_STEPS):
         fixed = basis.largest(solved.denominator)
-        slopes = parts_of(_denominator_slopes(equations, basis, solved, fixed))
+        slopes = parts_of(basis.slopes(solved, fixed))
         rows = np.concatenate([span.nearest(slopes)[1], parts_of(solved.left)[None]])
         length = _lengths(rows)
         # R of the QR decomposition of unit columns; numpy's takes twice the time.
@@ -121,22 +157,18 @@ def descend(equations: Equations, basis: Basis, denominator: Powers, least_gain:
         triangle = np.triu(unit[: len(rows)])
         step = np.linalg.lstsq(triangle[:-1, :-1], triangle[:-1, -1], rcond=_DEPENDENT)[0]
         step = np.insert(step * length[-1] / length[:-1], fixed, 0.0)
-        trials = (_project(equations, basis, solved.denominator + step / 3**k) for k in range(6))
+        trials = (basis.solve(solved.denominator + step / 3**k) for k in range(6))
         better = next((trial for trial in trials if trial[0].cost < solved.cost), None)
         if better is None:
             break
         gain, (solved, span) = 1 - better[0].cost / solved.cost, better
         if gain < least_gain or solved.cost < equations.rounding:
             break
-    return solved
+    return solved, basis
 
 
 class _Span(NamedTuple):
-    """What rows span, with the Cholesky factor of the products of these rows at unit length.
-
-    A QR decomposition takes three times as long: it is for products that would lose too many
-    digits.
-    """
+    """What rows span, by Cholesky of products at unit length, or QR where digits are lost."""
 
     rows: Rows
     length: Vector
@@ -189,54 +221,15 @@ class _Span(NamedTuple):
         return linear + more, rest - more @ self.rows
 
 
-def solve_linear(equations: Equations, basis: Basis, denominator: Powers) -> Solved:
-    return _project(equations, basis, denominator)[0]
-
-
-def _project(equations: Equations, basis: Basis, denominator: Powers) -> tuple[Solved, _Span]:
-    """The best linear coefficients under a denominator, and what their columns span."""
-    below = denominator @ basis.powers
-    least = _NEAREST * (np.abs(denominator) @ basis.magnitude)
-    below = np.where(np.abs(below) < least, least, below)
-    span, y = _Span.of(parts_of(basis.columns * (1 / below))), parts_of(equations.y)
-    linear, left = span.nearest(y)
-    solved = Solved(denominator, linear, below, left.view(complex), float(left @ left))
-    return solved, span
-
-
 def parts_of(rows: Complex[np.ndarray, "*rows bins"]) -> Float[np.ndarray, "*rows parts"]:
     """Real and imaginary parts by turns, a view where it can be."""
     return np.ascontiguousarray(rows).view(float)
-
-
-def _denominator_slopes(
-    equations: Equations, basis: Basis, solved: Solved, fixed: int
-) -> Complex[np.ndarray, "rows bins"]:
-    """Derivatives of the fitted output by the denominator's coefficients but the fixed one."""
-    fitted = equations.y - solved.left
-    return np.delete(basis.powers, fixed, axis=0) * (-fitted / solved.below)
-
-
-def slopes_of(
-    equations: Equations, basis: Basis, solved: Solved, fixed: int
-) -> Complex[np.ndarray, "rows bins"]:
-    """Derivatives of the fitted output, all coefficients but the fixed one."""
-    turned = _denominator_slopes(equations, basis, solved, fixed)
-    return np.concatenate([basis.columns / solved.below, turned])
 
 
 def _lengths(rows: Rows) -> Vector:
     """Euclidean norms; 1 for rows of zeros."""
     length = np.sqrt(np.vecdot(rows, rows))
     return np.where(length > 0, length, 1.0)
-
-
-_TRIAL = 1e-3  # relative gain of a step at which a descent ends
-_PER_PARAMETER = 6  # real equations
-_THOROUGH, _PATIENCE = 6, 4  # least order, and orders in a row no better, that end the search
-_DOUBTED = 2  # orders in a row no better that end the search around an order
-PRICE = 4.0  # of a parameter: Akaike's is 2, a Bayesian one ln(count), 7 to 8
-_PLACES = 5  # at which one more pole is tried
 
 
 class Orders(NamedTuple):
@@ -247,15 +240,12 @@ class Orders(NamedTuple):
 
     @classmethod
     def of(cls, equations: Equations, solved: dict[int, Solved]) -> "Orders":
-        return cls(solved, min(solved, key=lambda order: _criterion(equations, solved[order])))
+        return cls(solved, min(solved, key=lambda order: equations.criterion(solved[order])))
 
 
 def search_orders(equations: Equations, most: int) -> Orders:
-    """From 0 upwards, each order from the one below with one pole more.
-
-    Linear estimates are no better places to begin: the noise draws their poles to instability.
-    """
-    solved = {0: solve_linear(equations, make_basis(equations, 1), np.ones(1))}
+    """From 0 upwards, each order from the one below with one pole more."""
+    solved = {0: Basis.of(equations, 1).solve(np.ones(1))[0]}
     _climb(equations, solved, most, {}, _THOROUGH, _PATIENCE)
     return Orders.of(equations, solved)
 
@@ -263,10 +253,10 @@ def search_orders(equations: Equations, most: int) -> Orders:
 def refine_orders(equations: Equations, before: Orders, most: int) -> Orders:
     """Of the same equations in other weights: orders around the best one `before`."""
     first, starts = before.best, before.solved
-    solved = {first: _descend(equations, starts[first].denominator)}
+    solved = {first: descend(equations, starts[first].denominator, _TRIAL)[0]}
     _climb(equations, solved, most, starts, first, _DOUBTED)
     for order in range(first - 1, 0, -1):
-        solved[order] = _descend(equations, starts[order].denominator)
+        solved[order] = descend(equations, starts[order].denominator, _TRIAL)[0]
         if Orders.of(equations, solved).best != order:
             break
     return Orders.of(equations, solved)
@@ -282,28 +272,25 @@ def _climb(
 ) -> None:
     """Add orders, from a pole more or from `starts`, until too many have no better criterion."""
     order, worse = max(solved), 0
-    least = _criterion(equations, solved[order])
-    while order < _most(equations, most) and not _is_exact(equations, solved[order]):
+    least = equations.criterion(solved[order])
+    while order < equations.highest(most) and solved[order].cost > equations.rounding:
         if worse >= patience and order >= thorough:
             break
         order += 1
         start = _with_pole(equations, solved[order - 1])
         if order in starts:
-            basis = make_basis(equations, start.size)
-            start = min(
-                (starts[order].denominator, start),
-                key=lambda trial, basis=basis: solve_linear(equations, basis, trial).cost,
-            )
-        solved[order] = _descend(equations, start)
-        value = _criterion(equations, solved[order])
+            basis = Basis.of(equations, start.size)
+            trials = starts[order].denominator, start
+            start = trials[int(np.argmin([basis.solve(trial)[0].cost for trial in trials]))]
+        solved[order] = descend(equations, start, _TRIAL)[0]
+        value = equations.criterion(solved[order])
         worse, least = (0, value) if value < least else (worse + 1, least)
 
 
 def next_order(equations: Equations, orders: Orders, most: int) -> Powers:
-    """Where a descent of the order above the best one begins: a pole at infinity, as half a
-    sample's delay."""
+    """Where a descent of the next order begins: a pole at infinity, as a small delay's."""
     best = orders.solved[orders.best]
-    if orders.best >= _most(equations, most) or _is_exact(equations, best):
+    if orders.best >= equations.highest(most) or best.cost <= equations.rounding:
         return best.denominator
     return np.pad(best.denominator, (0, 1))
 
@@ -312,8 +299,7 @@ def _with_pole(equations: Equations, solved: Solved) -> Powers:
     """The denominator with a real pole more, at that of a few places where it leaves least."""
     size = np.abs(equations.x)
     places = np.geomspace(np.min(size), np.max(size), _PLACES)
-    basis = make_basis(equations, len(solved.denominator))
-    _, span = _project(equations, basis, solved.denominator)
+    _, span = Basis.of(equations, len(solved.denominator)).solve(solved.denominator)
     driven = np.concatenate([equations.u, equations.owner]) / solved.below
     driven = driven / (1 - equations.x / places[:, None])[:, None]
     _, rows = span.nearest(parts_of(driven.reshape(-1, len(equations.x))))
@@ -323,26 +309,3 @@ def _with_pole(equations: Equations, solved: Solved) -> Powers:
     products = rows @ np.swapaxes(rows, 1, 2) + _LEAST_CONDITION * np.eye(rows.shape[1])
     gain = np.vecdot(along, np.linalg.solve(products, along[:, :, None])[:, :, 0])
     return np.convolve(solved.denominator, [1.0, -1.0 / places[np.argmin(solved.cost - gain)]])
-
-
-def _descend(equations: Equations, start: Powers) -> Solved:
-    return descend(equations, make_basis(equations, start.size), start, _TRIAL)
-
-
-def _most(equations: Equations, most: int) -> int:
-    """The highest order, up to `most`, of which there are equations enough."""
-    for order in range(1, most + 1):
-        if equations.parameters(order) * _PER_PARAMETER > 2 * len(equations.y):
-            return order - 1
-    return most
-
-
-def _criterion(equations: Equations, solved: Solved) -> float:
-    count = 2 * len(equations.y)
-    parameters = equations.parameters(solved.order) if solved.order else 1
-    cost = max(solved.cost + 0.01 * equations.rounding, 1e-300)
-    return count * np.log(cost / count) + PRICE * parameters
-
-
-def _is_exact(equations: Equations, solved: Solved) -> bool:
-    return solved.cost <= equations.rounding

@@ -1,7 +1,5 @@
 """Responses and spectral densities by averages over windows: one length, or several (Composite)."""
 
-import functools as ft
-import itertools
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -14,18 +12,12 @@ from jaxtyping import Array, ArrayLike, Complex, Float
 from jaxquad._core import Message, one_blas_thread, require_x64
 from jaxquad.records import Record
 
-from ._average import average, Averaged, Channels, Segments
-from ._error_covariance import ErrorCovariance, place_windows
 from ._estimators import (
     adjoint,
     check_band,
     check_compatible,
-    check_excitation,
-    Composite,
     Grid,
     in_hertz,
-    Method,
-    Remark,
     Welch,
 )
 from ._fourier_sums import (
@@ -36,19 +28,22 @@ from ._fourier_sums import (
     segment_starts,
     Taper,
 )
-from ._frequency_response import Estimate
-from ._noise import covariance_of_windows, shows_leakage, Slopes, smoothed
+from ._noise import shows_leakage
 
 
-_ROUNDING = 1e-14  # of a Fourier sum, relative to the largest value summed
-_CORRELATED = 0.5  # average coherence of inputs above which Tischler & Remple, ch. 9, warn
-_LOST = 0.9999
-_LEAKED = 3.0  # bias over random error, averaged over a third of an octave, that is remarked
-_AVERAGED = 0.2  # in ln(omega)
-_FEW = (
-    "only {count:.1f} independent windows: the coherence is near 1 for any signals, and the error "
-    "bars are rough. Record longer, or use a shorter window"
-)
+class Slopes(NamedTuple):
+    """Transforms behind the derivatives of the windows of one length."""
+
+    first: Complex[np.ndarray, "frequencies _ channels"]  # derivative: inputs, then outputs
+    second: Complex[np.ndarray, "frequencies _ inputs"]
+
+
+class Segments(NamedTuple):
+    """Transforms by `Record.names` for each length, in absolute phase; records have gaps."""
+
+    transforms: tuple[Complex[np.ndarray, "frequencies windows channels"], ...]
+    slopes: tuple[Slopes, ...]  # empty where they are not needed, or nothing follows from them
+    groups: Layout
 
 
 def transform_records(
@@ -71,16 +66,32 @@ def transform_records(
         options = welch.overlap, float(np.max(omega)) * dt
         lengths = tuple(n for n, _ in lattice_windows(min(samples), lengths, *options))
         layouts = [lattice_windows(count, lengths, *options) for count in samples]
-    inputs, outputs = len(first.input_names), len(first.output_names)
+    inputs = len(first.input_names)
+    last = inputs + len(first.output_names)
     counts = [sum(len(mine) for _, mine in groups) for groups in zip(*layouts, strict=True)]
     enough = [shows_leakage(count, inputs) for count in counts]
     start = enough.index(True) if any(enough) else len(counts)
     shape = welch.shape
-    slopes = Taper(f"{shape}'", inputs + outputs, start), Taper(f"{shape}''", inputs, start)
+    slopes = Taper(f"{shape}'", last, start), Taper(f"{shape}''", inputs, start)
     tapers = Taper(shape, len(first.names)), *slopes[:derivatives]
+    n, late, angle = welch.integrators, int(round(welch.delay / dt)), omega * dt
+    factor = np.ones((omega.size, 1, len(first.names)), complex)
+    recolour = np.exp(-1j * (late + n // 2) * angle) / (1 - np.exp(-1j * angle)) ** n
+    factor[:, :, inputs:last] = recolour[:, None, None]
     parts, starts, origin = [], [[] for _ in members], 0
     for record, layout in zip(records, layouts, strict=True):
-        parts.append(_transform_record(record, omega, welch, layout, origin, tapers))
+        # The outputs differenced, and earlier by the delay.
+        outputs = np.diff(record.outputs, n, axis=0)
+        if late:
+            outputs = np.concatenate([outputs[late:], np.repeat(outputs[-1:], late, axis=0)])
+        # A difference delays by n/2 samples, and the window would act on it like on any delay.
+        centre = slice(n - n // 2, record.samples - n // 2)
+        columns = record.inputs[centre], outputs, record.references[centre]
+        options = {"detrend": welch.detrend, "origin": float(origin)}
+        transforms, *derived = fourier_sums(columns, angle, layout, tapers, **options)
+        if n or late:
+            transforms = [part * factor for part in transforms]
+        parts.append([transforms, *derived])
         for mine, (_, local) in zip(starts, layout, strict=True):
             mine += [origin + place for place in local]
         origin += record.samples + max(length for length, _ in layout)
@@ -98,34 +109,6 @@ def transform_records(
     none = Slopes(np.zeros((0, 0, 0), complex), np.zeros((0, 0, 0), complex))
     derived = tuple(map(Slopes, *slopes)) if derivatives else ()
     return Segments(joined, (none,) * (len(joined) - len(derived)) + derived, groups)
-
-
-def _transform_record(
-    record: Record,
-    omega: Grid,
-    welch: Welch,
-    layout: Layout,
-    origin: int,
-    tapers: tuple[Taper, ...],
-) -> list[list[Complex[np.ndarray, "frequencies _ _"]]]:
-    """By taper and then by length; the outputs differenced, and earlier by the delay."""
-    n, late = welch.integrators, int(round(welch.delay / record.dt))
-    outputs = np.diff(record.outputs, n, axis=0)
-    if late:
-        outputs = np.concatenate([outputs[late:], np.repeat(outputs[-1:], late, axis=0)])
-    # A difference delays by n/2 samples, and the window would act on it like on any delay.
-    centre = slice(n - n // 2, record.samples - n // 2)
-    columns, angle = (record.inputs[centre], outputs, record.references[centre]), omega * record.dt
-    transforms, *slopes = fourier_sums(
-        columns, angle, layout, tapers, detrend=welch.detrend, origin=float(origin)
-    )
-    if n or late:
-        factor = np.ones((omega.size, len(record.names)), complex)
-        first = len(record.input_names)
-        recolour = np.exp(-1j * (late + n // 2) * angle) / (1 - np.exp(-1j * angle)) ** n
-        factor[:, first : first + record.outputs.shape[1]] = recolour[:, None]
-        transforms = [part * factor[:, None] for part in transforms]
-    return [transforms, *slopes]
 
 
 def frequencies_for(
@@ -157,109 +140,6 @@ def frequencies_for(
             f"longer than {2 * np.pi / omega[0]:.4g} s"
         )
     return omega
-
-
-@one_blas_thread()
-def average_windows(
-    records: Sequence[Record], omega: Grid | None, spectra: Welch | Composite, method: Method
-) -> Estimate:
-    """Response by averages over tapered windows of one or several lengths."""
-    single = isinstance(spectra, Welch)
-    members = (spectra,) if single else spectra.windowed(records, omega)
-    omega, welch = frequencies_for(omega, records, members[0]), members[0]
-    segments = transform_records(records, omega, members, derivatives=2)
-    first, dt, groups = records[0], records[0].dt, segments.groups
-    instruments = len(first.reference_names) if method == "joint" else 0
-    channels = Channels(len(first.input_names), len(first.output_names), instruments)
-    lengths = [length for length, _ in groups]
-    independent = sum(record.samples for record in records) / np.array(lengths)  # n_d
-    sums = np.stack([adjoint(part) @ part for part in segments.transforms])
-    for count, (_, starts) in zip(independent, groups, strict=True):
-        if len(starts) <= channels.inputs or count < channels.inputs:
-            raise ValueError(
-                f"{count:.1f} independent windows are too few for {channels.inputs} inputs: use "
-                f"a window shorter than 1/{channels.inputs + 2} of the record, or record longer"
-            )
-    # Mean power of the inputs and of the instruments, in the longest windows.
-    power = np.real(np.diagonal(sums[0], axis1=1, axis2=2)) / len(groups[0][1])
-    largest = check_excitation(records, method)
-    for name in first.input_names + first.reference_names[:instruments]:
-        place = first.names.index(name)
-        least = _ROUNDING * coefficients(welch.shape)[0] * welch.length(records) * largest[place]
-        lost = np.flatnonzero(~(np.sqrt(power[:, place]) > least))
-        if lost.size:
-            raise ValueError(
-                f"no excitation at {in_hertz(omega[lost[:1]])}: the spectrum of {name!r} is zero "
-                "there. Keep the frequencies within the band that was excited"
-            )
-    options = channels, omega, dt, welch.shape, independent
-    averaged = average(segments, sums, *options)
-    weights = np.mean(averaged.share, axis=(1, 2))
-    freedom = np.mean(averaged.freedom, axis=1)
-    levels = weights / np.sqrt(freedom)
-    noise = covariance_of_windows(omega * dt, levels, welch.shape, tuple(lengths))
-    windows = place_windows(groups, welch.shape, dt, omega[-1] - omega[0])
-    counts = tuple(len(starts) for _, starts in groups)
-    errors = ErrorCovariance(
-        omega, averaged.effect, averaged.noise, averaged.share, windows, counts
-    )
-    return Estimate(
-        omega,
-        averaged.response,
-        averaged.coherence,
-        averaged.direct_coherence,
-        averaged.multiple_coherence,
-        errors,
-        averaged.random_error,
-        smoothed(omega, noise, np.sum(weights * freedom, axis=1)),
-        ft.partial(_remarks, first, omega, averaged, float(np.max(independent))),
-        resolution=2 * np.pi / (lengths[0] * dt),
-    )
-
-
-def _remarks(
-    record: Record, omega: Grid, averaged: Averaged, independent: float
-) -> tuple[Remark, ...]:
-    """On inputs that are alike, on leakage, and on few windows."""
-    remarks, names = [], record.input_names
-    coherence = 1 - np.nan_to_num(averaged.alone)  # of each input with all others
-    for i, name in enumerate(names if len(names) > 1 else ()):
-        lost = coherence[:, i] > _LOST
-        if np.any(lost):
-            text = (
-                f"input {name} cannot be separated from the other inputs {{where}}; they are left "
-                "out. Excite the inputs independently, one after the other or with interleaved "
-                "multisines"
-            )
-            remarks.append(Remark(text, omega[lost], kind="undetermined"))
-        elif np.mean(coherence[:, i]) > _CORRELATED:
-            text = (
-                f"input {name} is correlated with the other inputs: their average coherence is "
-                f"{coherence[:, i].mean():.2f} (limit {_CORRELATED}), so the errors of conditioned "
-                f"responses are larger. Excite the inputs independently"
-            )
-            remarks.append(Remark(text, kind="correlated inputs"))
-    # Pairs whose response leakage biases, clearly and beyond the random error.
-    kernel = np.exp(-0.5 * (np.log(omega[:, None] / omega) / _AVERAGED) ** 2)
-    bias, doubt = averaged.leakage()
-    least = np.maximum(doubt, averaged.random_error)
-    with np.errstate(invalid="ignore"):
-        ratio = np.where(np.isfinite(least) & np.isfinite(bias), bias / least, 0.0)
-    for (o, output), (i, source) in itertools.product(
-        enumerate(record.output_names), enumerate(names)
-    ):
-        leaked = kernel @ ratio[:, o, i] ** 2 > _LEAKED**2 * np.sum(kernel, axis=1)
-        if np.any(leaked):
-            text = (
-                f"leakage through the window biases the response by about "
-                f"{100 * np.median(bias[leaked, o, i]):.2g} % {{where}}; the random error does not "
-                "include it. Use «jq.spectra.LocalPolynomial()», which estimates leakage, a longer "
-                "window, or «integrators=» where the plant integrates"
-            )
-            remarks.append(Remark(text, omega[leaked], (output, source), "leakage"))
-    if independent < 3:
-        remarks.append(Remark(_FEW.format(count=independent), kind="few windows"))
-    return tuple(remarks)
 
 
 class SpectralDensity(eqx.Module):
@@ -342,25 +222,15 @@ _OFTEN = 0.5  # share of the windows
 
 
 class SpectralLine(NamedTuple):
-    """The strongest narrow line of a channel, as `find_line` returns it.
+    """The strongest narrow line of a channel, as `find_line` returns it."""
 
-    **Attributes:**
-
-    - `omega`: rad/s, median of the windows in which it stands out.
-    - `low`, `high`: rad/s, between which it lies in 90 % of these windows.
-    - `height`: dB above its surroundings, median.
-    - `share`: of the windows in which it stands out.
-    - `harmonics`: which multiples of it stand out, too.
-    - `follows`: rank correlation with another channel, -1 to 1; nan without one.
-    """
-
-    omega: float
-    low: float
+    omega: float  # rad/s, median of the windows in which it stands out
+    low: float  # rad/s; it lies between this and `high` in 90 % of these windows
     high: float
-    height: float
-    share: float
-    harmonics: tuple[int, ...]
-    follows: float
+    height: float  # dB above its surroundings, median
+    share: float  # of the windows in which it stands out
+    harmonics: tuple[int, ...]  # which multiples of it stand out, too
+    follows: float  # rank correlation with another channel, -1 to 1; nan without one
 
 
 def find_line(

@@ -55,22 +55,18 @@ class Identification:
 
     **Attributes:**
 
-    - `path`: of the log.
     - `settings`: those that were used, a proposal included.
     - `records`: one for each segment of each log.
     - `responses`: the frequency response by method, the one to trust first.
     - `fits`: the fit to each of them.
     - `parts`: where the misfit is large, the fit beside those to the upper and to the lower part of
       the band; None for one that diverged.
-    - `proposal`: where the log itself said what is input and output.
     - `more`: the logs that were taken together with the first.
     - `flown`: the gyro's filters and the law of an autopilot's log, up to whose filters the model
       is, unless `settings.keep_gyro_filters`.
     - `check`: the second record simulated, where `settings.verify` names one.
-    - `bands`: the same parameters from the lower and the upper half of the band, where there is a
-      fit.
-    - `explanation`: which further term the response wants, where `settings.explain` asks for it and
-      the misfit exceeds 1.5 random errors.
+    - `bands`: the same parameters from the lower and the upper half of the band.
+    - `explanation`: which further term the response wants, where `settings.explain` asks for it.
     - `failures`: by title, why something beside the fit could not be computed.
     """
 
@@ -144,8 +140,20 @@ class Identification:
 
     @property
     def formula(self) -> str:
-        """The structure of the model in words."""
-        return model_formula(self.settings, damped="damping" in self.fit.names)
+        """The structure of the model, such as `q / M = K e^(-delay s) / (s (lag s + 1))`."""
+        settings, n = self.settings, self.settings.integrators
+        [output], [source] = mix_of(settings.output), mix_of(settings.input)
+        if settings.poles is not None:
+            kind = f"{settings.zeros} zeros over {settings.poles} poles and {n} integrators"
+            return f"{output} / {source}, {kind}{', delayed' if settings.delay else ''}"
+        damped = "damping" in self.fit.names
+        pure = n - damped
+        below = [] if pure == 0 else ["s"] if pure == 1 else [f"s^{pure}"]
+        below += ["(s + damping)"] if damped else []
+        below += ["(lag s + 1)"] if settings.lag else []
+        above, product = "K e^(-delay s)" if settings.delay else "K", " ".join(below)
+        ratio = f" / ({product})" if len(below) > 1 else f" / {product}" if below else ""
+        return f"{output} / {source} = {above}{ratio}"
 
     @property
     def sums(self) -> Mapping[str, Callable[[Model], Float[Array, ""]]]:
@@ -362,22 +370,6 @@ class Identification:
 def total_delay(model: Model) -> Float[Array, ""]:
     """The sum of lag and delay, which a record determines better than either of them."""
     return model.delay if isinstance(model, TransferFunction) else model.lag + model.delay
-
-
-def model_formula(settings: IdentifySettings, *, damped: bool = False) -> str:
-    """The structure of the model, such as `q / M = K e^(-delay s) / (s (lag s + 1))`."""
-    n = settings.integrators
-    [output], [source] = mix_of(settings.output), mix_of(settings.input)
-    if settings.poles is not None:
-        kind = f"{settings.zeros} zeros over {settings.poles} poles and {n} integrators"
-        return f"{output} / {source}, {kind}{', delayed' if settings.delay else ''}"
-    pure = n - damped
-    below = [] if pure == 0 else ["s"] if pure == 1 else [f"s^{pure}"]
-    below += ["(s + damping)"] if damped else []
-    below += ["(lag s + 1)"] if settings.lag else []
-    above, product = "K e^(-delay s)" if settings.delay else "K", " ".join(below)
-    ratio = f" / ({product})" if len(below) > 1 else f" / {product}" if below else ""
-    return f"{output} / {source} = {above}{ratio}"
 
 
 def _on_negative_gain(fit: Fit, frf: FrequencyResponse) -> list[str]:

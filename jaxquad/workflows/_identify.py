@@ -86,12 +86,7 @@ def identify_again(
 
 
 def identify_opened(opened: OpenedLogs) -> Identification:
-    """Identify logs that are open, as `identify` does those of a path.
-
-    **Arguments:**
-
-    - `opened`: what `open_logs`, or `open_again` of a stored result, returned.
-    """
+    """Identify logs that are open, as `identify` does those of a path."""
     settings, flown, check, failures = opened.settings, None, None, {}
     [outputs] = mix_of(settings.output).values() or [{}]
     axes = [axis for name in outputs if (axis := axis_of_rate(name)) is not None]

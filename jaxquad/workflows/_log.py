@@ -76,27 +76,18 @@ def propose_settings(
 
 
 class OpenedLogs(NamedTuple):
-    """What `identify_opened` computes with: one log, or several of one vehicle, as records.
-
-    **Attributes:**
-
-    - `paths`: of the logs.
-    - `settings`: those given, with what the log proposes.
-    - `proposal`: where the log itself said what is input and output.
-    - `records`: one for each segment of each log.
-    """
+    """What `identify_opened` computes with: one log, or several of one vehicle, as records."""
 
     paths: tuple[Path, ...]
-    settings: IdentifySettings
-    proposal: Proposal | None
-    records: tuple[Record, ...]
+    settings: IdentifySettings  # with what the log proposes
+    proposal: Proposal | None  # where the log itself said what is input and output
+    records: tuple[Record, ...]  # one for each segment of each log
 
 
 def open_logs(
-    path: str | Path | Sequence[str | Path],
-    settings: IdentifySettings | None = None,
+    path: str | Path | Sequence[str | Path], settings: IdentifySettings | None = None,
     proposal: Proposal | None = None,
-) -> OpenedLogs:
+) -> OpenedLogs:  # fmt: skip
     """Read what `identify` takes, with the same arguments; it needs no JAX.
 
     **Raises:** `RecordError` or `ReadError` (both ValueErrors) for a log that cannot be used, and
@@ -106,7 +97,21 @@ def open_logs(
     settings = settings or IdentifySettings()
     if proposal is None:
         settings, proposal = propose_settings(paths[0], settings, several=len(paths) > 1)
-    records = read_logs(paths, settings)
+    logs = {path: read_records(path, settings) for path in paths}
+    rates = [records[0].sample_rate for records in logs.values()]
+    if max(rates) > (1 + 1e-6) * min(rates):
+        common = dataclasses.replace(settings, rate=float(f"{min(rates):.3g}"))
+        logs = {path: read_records(path, common) for path in paths}
+    (first, [reference, *_]), *others = logs.items()
+    for path, [record, *_] in others:
+        for name in (*reference.input_names, *reference.output_names):
+            if record.unit(name) != reference.unit(name):
+                raise RecordError(
+                    f"the unit of {name} is {reference.unit(name) or 'not known'} in {first}, but "
+                    f"{record.unit(name) or 'not known'} in {path}: logs that are identified "
+                    f"together need one unit. Leave one of them out."
+                )
+    records = tuple(record for of_one in logs.values() for record in of_one)
     if proposal is not None and settings.reference == proposal.options["references"]:
         names = records[0].reference_names
         if names and not any(np.ptp(record.channel(x)) > 0 for record in records for x in names):
@@ -138,25 +143,6 @@ def open_again(result: str | Path | StoredResult, *, log: str | Path | None = No
                 f"instead of {identified[:12]}...)"
             )
     return open_logs(list(paths), stored.settings)
-
-
-def read_logs(paths: Sequence[Path], settings: IdentifySettings) -> tuple[Record, ...]:
-    """The records of all logs, with one sample rate. Raises RecordError where units differ."""
-    logs = {path: read_records(path, settings) for path in paths}
-    rates = [records[0].sample_rate for records in logs.values()]
-    if max(rates) > (1 + 1e-6) * min(rates):
-        common = dataclasses.replace(settings, rate=float(f"{min(rates):.3g}"))
-        logs = {path: read_records(path, common) for path in paths}
-    (first, [reference, *_]), *others = logs.items()
-    for path, [record, *_] in others:
-        for name in (*reference.input_names, *reference.output_names):
-            if record.unit(name) != reference.unit(name):
-                raise RecordError(
-                    f"the unit of {name} is {reference.unit(name) or 'not known'} in {first}, but "
-                    f"{record.unit(name) or 'not known'} in {path}: logs that are identified "
-                    f"together need one unit. Leave one of them out."
-                )
-    return tuple(record for records in logs.values() for record in records)
 
 
 def read_records(
@@ -194,8 +180,8 @@ DEMO = IdentifySettings(
 def write_demo_log(path: str | Path, seed: int = 0) -> Path:
     """Write time, reference x0, command M and rate q as CSV; the same for the same seed.
 
-    An axis under rate feedback, in gusts, is excited by a sweep of its command. `DEMO` holds the
-    settings to identify it with, `DEMO_TRUTH` the true parameters.
+    An axis under rate feedback, in gusts, is excited by a sweep of its command. `DEMO` are the
+    settings to identify it with.
     """
     low, high = 2 * np.pi * 0.4, 2 * np.pi * 15
     signal = sweep(low, high, duration=40, sample_rate=_RATE, amplitude=0.06)

@@ -245,9 +245,8 @@ def load_tuning(path: str | Path) -> StoredTuning:
     except FileNotFoundError as error:
         raise ValueError(f"{path}: no such result: run jaxquad tune first") from error
     except (KeyError, TypeError, ValueError) as error:
-        raise ValueError(
-            f"{path}: no result of this version of jaxquad tune: tune again"
-        ) from error
+        text = f"{path}: no result of this version of jaxquad tune: tune again"
+        raise ValueError(text) from error
 
 
 def _part(content: Mapping[str, object], key: str) -> Mapping[str, Any]:
@@ -265,12 +264,8 @@ def free_folder(
 ) -> Path:
     """The folder `wanted`, or `wanted-2`, `wanted-3`, ..., without a result of another origin.
 
-    **Arguments:**
-
-    - `wanted`: need not exist.
-    - `name`: of the JSON file that holds a result, such as `result.json`.
-    - `same`: what that file holds if the result is the same, made again, by key.
-    - `sources`: the files that it is made from, in the order of its provenance.
+    The JSON file of that `name` (`result.json`) holds what is the `same`, by key, if the result is
+    the same, made again, of the same `sources`.
     """
     from jaxquad._core import plain_content
     from jaxquad.report import sha256_of

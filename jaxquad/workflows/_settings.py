@@ -359,7 +359,17 @@ class BatchSettings(Settings):
                 raise SettingsError("`override` is no list of tables: write [[override]]")
             settings: dict[str, Value] = {k: content[k] for k in content if k in cls.options()}
             settings["identify"] = {key: content[key] for key in content if key in _LOG_KEYS}
-            settings["overrides"] = [_override(k, table) for k, table in enumerate(tables, 1)]
+            settings["overrides"] = overrides = []
+            for k, table in enumerate(tables, 1):
+                try:
+                    check_keys(table, [*_LOG_KEYS, "logs"])
+                    if "logs" not in table:
+                        raise SettingsError('`logs` is missing: add logs = "flight_07*"')
+                    patterns = convert("logs", kinds.PATTERNS, table["logs"])
+                    changes = _checked({k: v for k, v in table.items() if k != "logs"})
+                except SettingsError as error:
+                    raise SettingsError(f"override {k}: {error}") from error
+                overrides.append(Override(patterns, changes))
             return cls(**settings)
         except SettingsError as error:
             raise within_file(where, error) from error
@@ -394,17 +404,6 @@ class BatchSettings(Settings):
             if any(fnmatchcase(log, pattern) for pattern in patterns):
                 settings = updated(settings, changes)
         return IdentifySettings.from_mapping(settings, f"settings of {log}")
-
-
-def _override(k: int, table: Mapping[str, object]) -> Override:
-    try:
-        check_keys(table, [*_LOG_KEYS, "logs"])
-        if "logs" not in table:
-            raise SettingsError('`logs` is missing: add logs = "flight_07*"')
-        patterns = convert("logs", kinds.PATTERNS, table["logs"])
-        return Override(patterns, _checked({k: v for k, v in table.items() if k != "logs"}))
-    except SettingsError as error:
-        raise SettingsError(f"override {k}: {error}") from error
 
 
 def _checked(content: Mapping[str, object]) -> dict[str, object]:

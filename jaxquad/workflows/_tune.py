@@ -32,19 +32,11 @@ _START = 10.0, 30.0  # rad/s, wc and wo
 
 @dataclasses.dataclass(frozen=True)
 class Tuning:
-    """A tuned controller as `tune` returns it, with what it was tuned on; `str()` shows both.
+    """A tuned controller as `tune` returns it, with what it was tuned on; `str()` shows both."""
 
-    **Attributes:**
-
-    - `identification`: the axis; of a stored result its fit alone, without what stands beside it.
-    - `settings`: those that were used.
-    - `tuned`: controller, gains and certificate.
-    - `loop`, `ensemble`, `flight`: what it was tuned on.
-    """
-
-    identification: Identification
+    identification: Identification  # of a stored result the fit alone
     settings: TuneSettings
-    tuned: Tuned
+    tuned: Tuned  # controller, gains and certificate
     loop: Loop
     ensemble: Ensemble
     flight: Scenario
@@ -58,17 +50,14 @@ class Tuning:
             "verdicts": [verdict._asdict() for verdict in tuned.verdicts],
             "values": tuned.values,
             "controller": tuning.describe_controller(tuned.controller) | {"dt": self.loop.dt},
-            "cost": tuned.cost,
-            "converged": tuned.converged,
+            "cost": tuned.cost, "converged": tuned.converged,
             "bounds": [bound._asdict() for bound in tuned.bounds],
-            "stabilised": tuned.stabilised,
-            "evaluations": tuned.evaluations,
-            "seconds": tuned.seconds,
-            "remarks": tuned.remarks,
+            "stabilised": tuned.stabilised, "evaluations": tuned.evaluations,
+            "seconds": tuned.seconds, "remarks": tuned.remarks,
             "certificate": None if certificate is None else certificate.content(),
             "settings": self.settings.content(),
             "identified_with": self.identification.settings.content(),
-        }
+        }  # fmt: skip
         return {key: plain_content(value) for key, value in content.items()}
 
     def write(self, folder: str | Path) -> list[Path]:

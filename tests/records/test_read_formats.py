@@ -15,7 +15,7 @@ from scipy.io import savemat
 from jaxquad.records import channels, formats, read, ReadError, RecordWarning
 
 
-READERS = "jaxquad.records.formats._readers"
+READERS = "jaxquad.records.formats"
 CHILD = Path(formats.__file__).with_name("_by_library.py")
 TIME = 5.0 + np.arange(400) / 100.0
 U = np.sin(3 * TIME)

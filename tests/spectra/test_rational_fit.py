@@ -13,12 +13,10 @@ from jaxquad.spectra._rational_fit import (
     Basis,
     descend,
     Equations,
-    make_basis,
     next_order,
     parts_of,
     refine_orders,
     search_orders,
-    solve_linear,
 )
 
 
@@ -48,7 +46,7 @@ def test_a_search_of_the_order_finds_an_exact_ratio_to_rounding():
     given = equations()
     orders = search_orders(given, ORDER)
     assert orders.best == POLES.size - 1
-    found = descend(given, make_basis(given, POLES.size), orders.solved[4].denominator, 1e-6)
+    found = descend(given, orders.solved[4].denominator, 1e-6)[0]
     assert found.cost < 1e-24 * np.sum(np.abs(given.y) ** 2)
     np.testing.assert_allclose(found.denominator / found.denominator[0], POLES, rtol=1e-9)
     np.testing.assert_allclose(found.linear[: ZEROS.size] / found.denominator[0], ZEROS, rtol=1e-9)
@@ -59,29 +57,29 @@ def test_normal_equations_leave_what_least_squares_of_the_columns_leave(size):
     """Bins of a tenth of the band count most: the condition of 25 columns is 3e5."""
     place = (np.arange(BINS) / BINS - 0.5) / 0.1
     given = equations(noise=0.01).weighted(np.exp(-0.5 * place**2) + 1e-4)
-    basis, denominator = make_basis(given, size), np.pad(POLES, (0, ORDER))[:size]
+    basis, denominator = Basis.of(given, size), np.pad(POLES, (0, ORDER))[:size]
     expected = left_by_numpy(given, basis, denominator)
-    assert solve_linear(given, basis, denominator).cost == pytest.approx(expected, rel=1e-10)
+    assert basis.solve(denominator)[0].cost == pytest.approx(expected, rel=1e-10)
 
 
 def test_columns_that_depend_on_each_other_are_solved_by_their_singular_values():
     given = equations(noise=0.01)
     twice = given._replace(u=np.concatenate([given.u, 2 * given.u]))
-    basis, alone = make_basis(twice, ORDER + 1), make_basis(given, ORDER + 1)
+    basis, alone = Basis.of(twice, ORDER + 1), Basis.of(given, ORDER + 1)
     denominator = np.pad(POLES, (0, ORDER + 1 - POLES.size))
-    found = solve_linear(twice, basis, denominator)
+    found = basis.solve(denominator)[0]
     assert np.all(np.isfinite(found.linear))
     assert found.cost == pytest.approx(left_by_numpy(given, alone, denominator), rel=1e-8)
 
 
 def test_a_descent_leaves_no_more_than_it_began_with_and_reaches_the_noise():
     given = equations(noise=0.05)
-    basis = make_basis(given, POLES.size)
+    basis = Basis.of(given, POLES.size)
     start = 1.1 * POLES
     start[0] = POLES[0]
-    found = descend(given, basis, start, 1e-6)
-    assert found.cost <= solve_linear(given, basis, start).cost
-    truth = solve_linear(given, basis, POLES).cost
+    found = descend(given, start, 1e-6)[0]
+    assert found.cost <= basis.solve(start)[0].cost
+    truth = basis.solve(POLES)[0].cost
     parameters = given.parameters(POLES.size - 1)
     assert found.cost < truth < found.cost * (1 + 5 * parameters / (2 * BINS))
 
@@ -155,7 +153,7 @@ def test_the_order_next_to_the_best_begins_with_the_same_model():
     orders = search_orders(given, MOST)
     start = next_order(given, orders, MOST)
     assert start.size == 6 and start[-1] == 0
-    again = descend(given, make_basis(given, start.size), start, np.inf)
+    again = descend(given, start, np.inf)[0]
     assert again.cost <= orders.solved[4].cost * (1 + 1e-9)
 
 

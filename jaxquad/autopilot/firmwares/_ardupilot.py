@@ -150,20 +150,17 @@ class ArduPilotAttitude(AngleLoop):
         return {"wanted": zero}
 
     def wanted_rate(
-        self, memory: Memories, reference: Reference, angle: Signal, rate: Signal
+        self, memory: Memories, aim: Setpoint, angle: Signal, rate: Signal
     ) -> tuple[dict[str, PyTree], Signal]:
-        aim = reference.angle if isinstance(reference, Setpoint) else reference
         # The square-root controller: linear for small errors, then the braking parabola.
         p, most = (broadcast_gain(x, angle) for x in (self.p, self.acceleration_limit))
-        error, edge = aim - angle, most / p**2
+        error, edge = aim.angle - angle, most / p**2
         size = jnp.abs(error)
         far = size > edge
         root = jnp.sqrt(2 * most * (jnp.where(far, size, edge) - edge / 2))
         braking = jnp.sign(error) * jnp.minimum(root, size / self.dt)
         turning = jnp.where(far, braking, jnp.minimum(p, 1 / self.dt) * error)
-        wanted = bounded(turning, self.rate_limit)
-        if isinstance(reference, Setpoint):
-            wanted = wanted + reference.rate
+        wanted = bounded(turning, self.rate_limit) + aim.rate
         return {"wanted": wanted}, memory["wanted"]
 
 

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Complex, Float
+from jaxtyping import Float
 
 from jaxquad._core import as_messages
 from jaxquad.identify import B0Law, B0Schedule, draw_models, filter_response, GainOverThrottle
@@ -19,7 +19,7 @@ from jaxquad.records import AXES
 from .._filters import FilterChain, PT2
 from .._law import FlownLoop, law_responses
 from .._parameters import list_parameters
-from .._rate_loops import cells_of, hold_plants, LoopQualities, RateLoops
+from .._rate_loops import cells_of, Frequencies, hold_plants, LoopQualities, Paths, RateLoops
 from ._betaflight import betaflight_loop, flies_adrc, FlownBetaflight
 from ._betaflight_law import BetaflightADRC
 
@@ -28,8 +28,6 @@ _NUMBERED: tuple[B0Law, ...] = ("QUADRATIC", "SQRT", "LINEAR", "FIXED")  # as th
 _LARGEST_WITHOUT_LAW = 9.0  # adrc_b0_scale_max of a build without adrc_b0_law
 Design = Float[np.ndarray, "3"]  # wc, wo, b0
 Designs = Float[np.ndarray, "designs 3"]
-Paths = Complex[np.ndarray, "designs frequencies"]
-Frequencies = Float[np.ndarray, " frequencies"]
 
 
 class ADRCFrame(NamedTuple):
@@ -43,11 +41,10 @@ class ADRCFrame(NamedTuple):
     def parameters(self) -> dict[str, float]:
         """By the firmware's names."""
         return {
-            "adrc_gyro_lpf_hz": self.lowpass_hz,
-            "adrc_td_hz": self.setpoint_hz,
+            "adrc_gyro_lpf_hz": self.lowpass_hz, "adrc_td_hz": self.setpoint_hz,
             "adrc_hover_throttle": 100 * self.schedule.hover,
             "adrc_sigma_decay": 10 * self.forgetting,
-        }
+        }  # fmt: skip
 
 
 class FlownADRC(FlownLoop[BetaflightADRC]):
@@ -135,8 +132,7 @@ def betaflight_adrc_loop(
     left_out: list[str] = [x for x in pid.unmodelled if x.kind in ("notch", "feedforward")]
     left_out.append("the gate before liftoff, and wc on the ground")
     if number("adrc_sat_z3_inhibit", 0.0) > 0:
-        text = "adrc_sat_z3_inhibit: the observer's integrator rests at the mixer's limits"
-        left_out.append(text)
+        left_out += ["adrc_sat_z3_inhibit: the observer's integrator rests at the mixer's limits"]
     if any(float(x) != 100 for k in values if "adrc_zeta" in k for x in values[k].split(",")):
         left_out.append("adrc_zeta: the damping ratio is taken as 1")
     flown = FlownADRC(law, as_messages(left_out), pid=pid, schedule=schedule)

@@ -4,7 +4,7 @@ A design is a search over wc, wo and b0 on responses, as that of a PID is one ov
 """
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -243,9 +243,9 @@ def propose_adrc(
     loops = draw(max(1, members // len(grid)), seed)
     for attempt in range(1, _CERTIFICATES + 1):
         announce(f"searching wc, wo and b0 at {len(grid)} throttles")
-        score = _Score(loops, targets, edge, before)
+        score = _score(loops, targets, edge, before)
         first = [dataclasses.replace(loop, plants=loop.plants[:1]) for loop in loops]
-        rough, ends = _Score(first, targets, edge, before), (np.log(low), np.log(high))
+        rough, ends = _score(first, targets, edge, before), (np.log(low), np.log(high))
         middle, half = np.log(low * high) / 2, np.log(high / low) / 2
         for level in range(_LEVELS):
             used = rough if level < _ROUGH else score
@@ -348,35 +348,30 @@ def _judge(
     )
 
 
-class _Score:
+def _score(
+    loops: Sequence[ADRCLoops], targets: ADRCTargets, edge: float, before: Design | None
+) -> Callable[[Designs], Float[np.ndarray, " designs"]]:
     """The effect of torque; designs beyond a target come after all that keep them."""
+    limit, flown = _RESERVE * targets.sensitivity, [loop.flown() for loop in loops]
+    last = lambda x, beyond: np.where(np.all(x.stable, axis=1), beyond, 1e6 * beyond)
 
-    def __init__(
-        self, loops: Sequence[ADRCLoops], targets: ADRCTargets, edge: float, before: Design | None
-    ):
-        self.loops, self.targets, self.edge, self.before = loops, targets, edge, before
-        self.flown = [loop.flown() for loop in loops]
-
-    def __call__(self, designs: Designs) -> Float[np.ndarray, " designs"]:
-        parts = np.array_split(designs, max(1, len(designs) // 64))
-        return np.concatenate([self._of(part) for part in parts])
-
-    def _of(self, designs: Designs) -> Float[np.ndarray, " designs"]:
+    def score(designs: Designs) -> Float[np.ndarray, " designs"]:
         worst, rejected = designs[:, 0] / designs[:, 1], np.zeros(len(designs))  # wc at most wo
-        targets, limit = self.targets, _RESERVE * self.targets.sensitivity
-        last = lambda x, beyond: np.where(np.all(x.stable, axis=1), beyond, 1e6 * beyond)
-        for loop, flown in zip(self.loops, self.flown, strict=True):
+        for loop, flew in zip(loops, flown, strict=True):
             x = loop.qualities(designs)
             beyond = np.stack([
                 np.max(x.peak, axis=1) / limit,
                 np.max(x.resonance, axis=1) / (_RESERVE * targets.resonance),
-                np.mean(x.noise / flown.noise, axis=1) / (_RESERVE * targets.noise),
-                np.max(x.crossover, axis=1) / self.edge,
+                np.mean(x.noise / flew.noise, axis=1) / (_RESERVE * targets.noise),
+                np.max(x.crossover, axis=1) / edge,
             ])  # fmt: skip
             worst = np.maximum(worst, last(x, beyond.max(axis=0)))
-            if self.before is not None:  # Ms a third of the way, or that of what flew
-                third = loop.qualities(_third(self.before, designs))
-                allowed = max(limit, float(np.max(flown.peak)))
+            if before is not None:  # Ms a third of the way, or that of what flew
+                third = loop.qualities(_third(before, designs))
+                allowed = max(limit, float(np.max(flew.peak)))
                 worst = np.maximum(worst, last(third, np.max(third.peak, axis=1) / allowed))
-            rejected += np.mean((x.rejection / flown.rejection) ** 2, axis=1)
-        return np.where(worst <= 1, np.sqrt(rejected / len(self.loops)), 1e9 * worst)
+            rejected += np.mean((x.rejection / flew.rejection) ** 2, axis=1)
+        return np.where(worst <= 1, np.sqrt(rejected / len(loops)), 1e9 * worst)
+
+    parts = lambda designs: np.array_split(designs, max(1, len(designs) // 64))
+    return lambda designs: np.concatenate([score(part) for part in parts(designs)])

@@ -12,7 +12,6 @@ from jaxquad.plot import StepBand, ThrottleCurve
 from jaxquad.records import AXES
 from jaxquad.report import Headline, Provenance, Table
 
-from .._files import change_table, parameter_file, ParameterChange, propose_changes, WordChange
 from .._filters import FilterChain, PT2
 from .._flight_channels import FlightChannels
 from .._page import (
@@ -25,10 +24,17 @@ from .._page import (
     PilotPage,
     VERDICTS,
 )
-from .._parameters import find_parameter
+from .._parameters import (
+    change_table,
+    find_parameter,
+    parameter_file,
+    ParameterChange,
+    propose_changes,
+    WordChange,
+)
 from .._proposal import write_result
 from .._rate_loops import StepGrid
-from .._reproduce_flight import Reproduction
+from .._replay import Reproduction
 from .._stages import DesignSettings, Kind
 from ._betaflight_adrc import adrc_loops, adrc_parameters, b0_law, Flown, FlownADRC
 from ._betaflight_adrc_design import ADRCProposal

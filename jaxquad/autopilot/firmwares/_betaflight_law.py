@@ -1,7 +1,7 @@
 """Betaflight's PID, its proposed ADRC, its angle mode, and what changes them in flight."""
 
 import dataclasses
-from typing import ClassVar, Literal, Self, TYPE_CHECKING
+from typing import ClassVar, Literal
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
 from jaxquad._core import as_float, broadcast_gain, per_member, require_positive
-from jaxquad.control import Reference
+from jaxquad.control import Reference, Setpoint
 
 from .._filters import Filter, FilterChain, PT2, PT3
 from .._law import (
@@ -115,15 +115,12 @@ class BetaflightRate(RateLoop):
     firmware: ClassVar[str] = "betaflight"
     feed_forward: ClassVar[tuple[str, ...]] = ("f",)
     of_sticks: ClassVar[bool] = True
-    if TYPE_CHECKING:
-
-        @property
-        def filters(self) -> tuple[Filter, ...]: ...  # of the gyro, at the loop's rate
+    filters: eqx.AbstractVar[tuple[Filter, ...]]  # of the gyro, at the loop's rate
 
     def gyro_chains(self) -> list[FilterChain]:
         return [self.gyro, FilterChain(self.filters, 1 / self.dt)] if self.filters else [self.gyro]
 
-    def without_gyro_filters(self) -> Self:
+    def without_gyro_filters(self) -> "BetaflightRate":
         return dataclasses.replace(self, gyro=FilterChain(), filters=())
 
 
@@ -193,7 +190,7 @@ class BetaflightPID(BetaflightRate):
     def derivative_chain(self, axis: int) -> FilterChain:
         return FilterChain(self.dterm, 1 / self.dt)
 
-    def levelled(self) -> Self:
+    def levelled(self) -> "BetaflightPID":
         """Inside of an angle loop, the integral is held from a fifth of the speed on."""
         if self.relax is None:
             return self
@@ -412,9 +409,8 @@ class BetaflightAngle(AngleLoop):
         return {"smooth": self._smooth.init(zero)}
 
     def wanted_rate(
-        self, memory: Memories, reference: Reference, angle: Signal, rate: Signal
+        self, memory: Memories, aim: Setpoint, angle: Signal, rate: Signal
     ) -> tuple[dict[str, PyTree], Signal]:
-        aim, _ = split_reference(reference, angle, self.dt)
         level = broadcast_gain(self.level, angle) / 10
-        smooth, wanted = self._smooth.step(memory["smooth"], level * (aim - angle))
+        smooth, wanted = self._smooth.step(memory["smooth"], level * (aim.angle - angle))
         return {"smooth": smooth}, wanted

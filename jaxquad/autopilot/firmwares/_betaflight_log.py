@@ -1,7 +1,6 @@
 """Betaflight: PID sum, filtered gyro, set-point, and the chirp mode's debug channels."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 
@@ -38,9 +37,9 @@ def betaflight_setup(log: Log, wanted: Selection) -> Setup:
     rates = {x: first_logged(signals, [f"{prefix}gyroADC[{i}]"]) for i, x in enumerate(AXES)}
     if not any(rates.values()):
         raise RecordError("the log has no gyroADC.")
-    sweeps = [sweep for sweep in chirps(table) if axis in (None, AXES[sweep.axis])]
-    best = max(sweeps, key=lambda sweep: sweep.stop - sweep.start, default=None)
-    axis = axis or (most_active_axis(signals, rates) if best is None else AXES[best.axis])
+    sweeps = [(x, run) for x, run in chirps(table) if axis in (None, x)]
+    best, _ = max(sweeps, key=lambda sweep: sweep[1].stop - sweep[1].start, default=("", None))
+    axis = axis or best or most_active_axis(signals, rates)
     i = AXES.index(axis)
     command = first_logged(signals, [f"{prefix}axisMixed[{i}]", f"{prefix}axisSum[{i}]"])
     if not command or not rates[axis]:
@@ -56,14 +55,14 @@ def betaflight_setup(log: Log, wanted: Selection) -> Setup:
     ]
     setup = Setup(axis, {command: 1.0}, rates[axis], levelled=bool(levelled))
     with_reference = lambda channel: setup._replace(reference=channel, remarks=tuple(remarks))
-    if best is not None:
+    if best:
         remarks += [
-            f"another chirp on the set-point of {AXES[sweep.axis]}, "
-            f"t = {sweep.start:.6g} .. {sweep.stop:.6g} s"
-            for sweep in sweeps if sweep.axis != best.axis
+            f"another chirp on the set-point of {x}, t = {run.start:.6g} .. {run.stop:.6g} s"
+            for x, run in sweeps if x != best
         ]  # fmt: skip
-        alike = [Injection(*sweep[1:5]) for sweep in sweeps if sweep.axis == best.axis]
-        chirped = with_reference(f"{prefix}{best.channel}")._replace(injected_at="rate")
+        excitation = "chirp" if "chirp" in table.columns else "debug[3]"
+        chirped = with_reference(f"{prefix}{excitation}")._replace(injected_at="rate")
+        alike = [run for x, run in sweeps if x == best]
         return with_injections(chirped, alike, "chirp on the rate set-point")
     setpoint = first_logged(signals, [f"{prefix}setpoint[{i}]"])
     if setpoint and not moves(signals, setpoint):
@@ -115,24 +114,12 @@ def saturation(log: Log, setup: Setup, spans: Sequence[tuple[float, float]]) -> 
     return (f"{share} exceed {name} = {text}, where it saturates",) if beyond else ()
 
 
-class Chirp(NamedTuple):
-    """A sweep that Betaflight's chirp mode injected, on axis 0 (roll), 1 (pitch) or 2 (yaw)."""
-
-    axis: int
-    start: float  # s
-    stop: float
-    low: float  # Hz
-    high: float
-    channel: str = "debug[3]"  # of the excitation
-
-
-_AXES = (0, 1, 2)
 _SHORTEST = 1.0  # s
 _MOST_EDGES = 10_000
 
 
-def chirps(table: Table) -> list[Chirp]:
-    """The sweeps in a log whose debug channels are those of debug mode CHIRP.
+def chirps(table: Table) -> list[tuple[str, Injection]]:
+    """The sweeps in a log whose debug channels are those of debug mode CHIRP, and their axes.
 
     There, debug[1] is the axis (-1 when idle), debug[2] the frequency in 0.1 Hz and debug[3] the
     excitation (betaflight pull request 15113). The number of that mode depends on the version, so
@@ -149,16 +136,16 @@ def chirps(table: Table) -> list[Chirp]:
     _, axis, tenths, excitation = (np.asarray(x, np.float64) for x in debug)
     active = np.where(tenths > 0, axis, -1)
     edges = np.flatnonzero(np.diff(active)) + 1
-    if not np.isin(axis, (-1, *_AXES)).all() or edges.size > _MOST_EDGES:
+    if not np.isin(axis, (-1, 0, 1, 2)).all() or edges.size > _MOST_EDGES:
         return []
     sweeps = []
     for first, end in zip([0, *edges], [*edges, axis.size], strict=True):
         frequency, time = tenths[first:end] / 10, table.time[first:end]
         rises = (np.diff(frequency) >= 0).all() and frequency[-1] > frequency[0]
         moves = rises and np.ptp(excitation[first:end]) > 0
-        if active[first] in _AXES and moves and time[-1] - time[0] >= _SHORTEST:
-            ends = (float(time[0]), float(time[-1]), float(frequency[0]), float(frequency[-1]))
-            sweeps.append(Chirp(int(active[first]), *ends))
+        if active[first] >= 0 and moves and time[-1] - time[0] >= _SHORTEST:
+            ends = (*time[[0, -1]].tolist(), *frequency[[0, -1]].tolist())
+            sweeps.append((AXES[int(active[first])], Injection(*ends)))
     return sweeps
 
 
@@ -167,7 +154,7 @@ _DRIVEN = 0.1  # of its variance that a sweep explains, at least, in the set-poi
 _EDGE = 20  # of the samples of a sweep, one part: its begin and its end
 
 
-def _chirps_of_phase(table: Table, time: np.ndarray) -> list[Chirp]:
+def _chirps_of_phase(table: Table, time: np.ndarray) -> list[tuple[str, Injection]]:
     """The sweeps of a log that has their phase alone (debug[0], 5000 a radian).
 
     The axis is the one whose set-point is most coherent with the sweep, whatever its lead or lag.
@@ -181,8 +168,8 @@ def _chirps_of_phase(table: Table, time: np.ndarray) -> list[Chirp]:
             continue
         inside = slice(part[0], part[-1] + 1)
         wave, shares = np.exp(1j * phase[inside]) * (phase[inside] > 0), {}
-        for axis in _AXES:
-            if (setpoint := table.columns.get(f"setpoint[{axis}]")) is not None:
+        for i, axis in enumerate(AXES):
+            if (setpoint := table.columns.get(f"setpoint[{i}]")) is not None:
                 values = np.asarray(setpoint[inside], np.float64)
                 values = np.nan_to_num(values - np.nanmean(values))
                 if (power := float(np.mean(values**2))) > 0:
@@ -196,7 +183,7 @@ def _chirps_of_phase(table: Table, time: np.ndarray) -> list[Chirp]:
         pieces = np.array_split(speed[:ends], max(1, ends // 50))
         low, high = np.min([np.median(x) for x in pieces]), np.median(speed[-ends:])
         start, stop = float(time[part[0]]), float(time[part[-1]])
-        sweeps.append(Chirp(axis, start, stop, max(float(low), 0.1), float(high), "chirp"))
+        sweeps.append((axis, Injection(start, stop, max(float(low), 0.1), float(high))))
     return sweeps
 
 
@@ -242,9 +229,8 @@ def flights_of(log: Log) -> tuple[Flight, ...]:
         if table.time is None or table.time.size < FEWEST:
             continue
         throttle, lasting = _scaled(table, "setpoint[3]"), {}
-        for sweep in chirps(table):
-            axis = AXES[sweep.axis]
-            lasting[axis] = lasting.get(axis, 0.0) + sweep.stop - sweep.start
+        for axis, run in chirps(table):
+            lasting[axis] = lasting.get(axis, 0.0) + run.stop - run.start
         sticks = {axis: _scaled(table, f"rcCommand[{i}]") for i, axis in enumerate(AXES)}
         name = prefix.rstrip(".")
         flights.append(Flight(

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Array, Float, PyTree
 
 from jaxquad._core import as_float, as_float_or_none, broadcast_gain, per_member, require_positive
-from jaxquad.control import Reference
+from jaxquad.control import Reference, Setpoint
 from jaxquad.records import AXES
 
 from .._filters import Butterworth, FilterChain
@@ -137,11 +137,10 @@ class CrazyflieAttitude(AngleLoop):
         return {"integral": zero}
 
     def wanted_rate(
-        self, memory: Memories, reference: Reference, angle: Signal, rate: Signal
+        self, memory: Memories, aim: Setpoint, angle: Signal, rate: Signal
     ) -> tuple[dict[str, PyTree], Signal]:
         at = lambda gain: broadcast_gain(gain, angle)
-        aim, _ = split_reference(reference, angle, self.dt)
-        error = DEGREES * (aim - angle)
+        error = DEGREES * (aim.angle - angle)
         integral = bounded(memory["integral"] + error * self.dt, self.integral_limit)
         wanted = at(self.kp) * error + at(self.ki) * integral - at(self.kd) * DEGREES * rate
         return {"integral": integral}, wanted / DEGREES

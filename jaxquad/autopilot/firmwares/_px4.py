@@ -157,12 +157,9 @@ class PX4Attitude(AngleLoop):
         require_positive("rate_limit", self.rate_limit, "give rad/s")
 
     def wanted_rate(
-        self, memory: Memories, reference: Reference, angle: Signal, rate: Signal
+        self, memory: Memories, aim: Setpoint, angle: Signal, rate: Signal
     ) -> tuple[dict[str, PyTree], Signal]:
-        aim = reference.angle if isinstance(reference, Setpoint) else reference
-        wanted = broadcast_gain(self.p, angle) * (aim - angle)
-        if isinstance(reference, Setpoint):
-            wanted = wanted + reference.rate
+        wanted = broadcast_gain(self.p, angle) * (aim.angle - angle) + aim.rate
         return {}, bounded(wanted, self.rate_limit)
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int, PyTree
 
 from jaxquad._core import Message, Normal, solve_definite
-from jaxquad.models import simulate_linear, StateSpace, TransferFunction
+from jaxquad.models import simulate_linear, TransferFunction
 from jaxquad.records import Record
 
 from ..frequency_domain._parameters import Numbers
@@ -25,9 +25,15 @@ from ._simulated import (
     integrate_plant,
     linear_model,
     Motions,
+    Plant,
 )
 
 
+Series = Float[Array, " samples"]
+Outputs = Float[Array, "samples outputs"]
+Columns = Float[Array, "samples outputs *columns"]
+Unknowns = Float[Array, "samples outputs unknowns"]
+Sizes = Float[np.ndarray, " outputs"]
 _RIDGE = 1e-10  # of the squared length of a column, and taken out again by refinement
 _LOOSE = 1e-2  # standard errors per unit of initial state: holds what has no effect
 _FIRST = 64  # samples of a series that are inverted by a triangular solve
@@ -97,12 +103,7 @@ def feedback_response(
     return command
 
 
-def close_loop(
-    plant: TransferFunction | StateSpace,
-    x: Float[Array, "samples outputs *columns"],
-    feedback: Float[Array, " samples"],
-    dt: float,
-) -> Float[Array, "samples outputs *columns"]:
+def close_loop(plant: Plant, x: Columns, feedback: Series, dt: float) -> Columns:
     """What a disturbance `x` of the output becomes in the loop, which rested before: S x.
 
     S = 1 / (1 - G C) as a series in the delay, with the sampled plant G and C from the output to
@@ -119,7 +120,7 @@ def close_loop(
 
 
 def convolve(
-    kernel: Float[Array, " samples"], x: Float[Array, " samples *columns"]
+    kernel: Series, x: Float[Array, " samples *columns"]
 ) -> Float[Array, " samples *columns"]:
     """The first samples of a convolution; both begin at rest."""
     length = 2 * len(x)
@@ -127,7 +128,7 @@ def convolve(
     return jnp.fft.irfft(spectrum * jnp.fft.rfft(x, length, axis=0), length, axis=0)[: len(x)]
 
 
-def invert_series(a: Float[Array, " samples"]) -> Float[Array, " samples"]:
+def invert_series(a: Series) -> Series:
     """The series b with a * b = 1, 0, 0, ..., by Newton's method: each step doubles what is right.
 
     Source: Knuth, The Art of Computer Programming, vol. 2, sec. 4.7.
@@ -157,9 +158,7 @@ class RecordTerm(eqx.Module):
     whitener: Whitener | None = None  # of the noise, where it has a model
     feedback: Float[Numbers, " samples"] | None = None  # of a known loop, after a unit of output
 
-    def weighted(
-        self, x: Float[Numbers, "samples outputs *columns"]
-    ) -> Float[Array, "samples outputs *columns"]:
+    def weighted(self, x: Float[Numbers, "samples outputs *columns"]) -> Columns:
         """What counts of outputs: within the band, unpredicted by the noise, in units of it."""
         x = jnp.asarray(x)
         counted = band_filter(x, self.gain) if self.whitener is None else self.whitener(x)
@@ -185,7 +184,7 @@ class OutputError(eqx.Module):
     terms: tuple[RecordTerm, ...]
     zeros: tuple[int, ...] = eqx.field(static=True)  # arrays of the model that are known to be 0
 
-    def reweighted(self, sizes: Sequence[Float[np.ndarray, " outputs"]]) -> "OutputError":
+    def reweighted(self, sizes: Sequence[Sizes]) -> "OutputError":
         """The same problem with its residuals divided by `sizes`."""
         terms = [
             dataclasses.replace(term, weights=np.asarray(term.weights) / size)
@@ -211,7 +210,7 @@ def insert_parameters(z: Float[Numbers, " n"], problem: OutputError) -> PyTree:
 
 def misfit_and_columns(
     model: PyTree, start: Float[Array, " unknown"], term: RecordTerm
-) -> tuple[Float[Array, "samples outputs"], Float[Array, "samples outputs unknowns"]]:
+) -> tuple[Outputs, Unknowns]:
     """Weighted misfit at zero start and trim, and what each unit of them adds to the output."""
     if term.motions is None:
         simulated = integrate_plant(model, term.u, term.start * start, term.dt, term.hold)
@@ -229,9 +228,7 @@ def misfit_and_columns(
     return jnp.asarray(term.measured) - term.weighted(simulated), term.weighted(columns)
 
 
-def project_out(
-    misfit: Float[Array, "samples outputs"], columns: Float[Array, "samples outputs unknowns"]
-) -> Float[Array, "samples outputs"]:
+def project_out(misfit: Outputs, columns: Unknowns) -> Outputs:
     """The `misfit` that no start, trim or shift explains (variable projection)."""
     flat = columns.reshape(misfit.size, -1)
     square = jax.lax.stop_gradient(jnp.sum(flat**2, axis=0))
@@ -255,14 +252,14 @@ class Evaluation(NamedTuple):
     columns: Sequence[Float[Numbers, "samples outputs unknowns"]]  # of start, trim and shift
     normal: Normal  # of these, of the priors and of a hold on the initial states
 
-    def reweighted(self, sizes: Sequence[Float[np.ndarray, " outputs"]]) -> "Evaluation":
+    def reweighted(self, sizes: Sequence[Sizes]) -> "Evaluation":
         """The same, divided by `sizes`; the normal equations as they were."""
+        sizes = [np.asarray(size) for size in sizes]
         divided = lambda parts: [
-            part / np.asarray(size).reshape(1, -1, *(1,) * (part.ndim - 2))
+            part / size.reshape(1, -1, *(1,) * (part.ndim - 2))
             for part, size in zip(parts, sizes, strict=True)
         ]
-        parts = (divided(self.misfits), divided(self.slopes), divided(self.columns))
-        return Evaluation(*parts, normal=self.normal)
+        return Evaluation(*map(divided, self[:3]), normal=self.normal)
 
 
 @eqx.filter_jit

@@ -53,8 +53,7 @@ from ._problem import (
 from ._simulated import (
     band_filter,
     band_gain,
-    check_channels,
-    check_growth,
+    check_plant,
     count_states,
     DifferentialModel,
     inputs_between_samples,
@@ -112,10 +111,6 @@ def refine(
     - `hold`, `band`: as in `jq.verify`, the hold by default as each record says; model and data are
         filtered alike.
     - `max_steps`: of the solver.
-
-    **Returns:**
-
-    A `jq.identify.Fit`.
 
     **Raises:**
 
@@ -214,8 +209,7 @@ def _term(
             )
     else:
         plant = linear_model(model)
-        check_channels(plant, record)
-        check_growth(plant, record)
+        check_plant(plant, record)
         motions, start = unknown_motions(plant, record.duration)[:2], np.zeros(0)
     y = band_filter(np.asarray(record.outputs), gain)
     weights = 1 / np.std(y, axis=0)

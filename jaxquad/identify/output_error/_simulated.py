@@ -23,6 +23,7 @@ from jaxquad.records import Record
 
 
 Numbers = Array | np.ndarray
+Plant = TransferFunction | StateSpace
 
 
 def band_gain(
@@ -154,9 +155,7 @@ def integrate_plant(
     - `dt`: sample interval in s.
     - `hold`: "first" (straight between samples) or "zero" (held).
 
-    **Returns:**
-
-    The outputs; not finite where a sample takes too many steps.
+    **Returns:** The outputs; not finite where a sample takes too many steps.
     """
     # Imported late: diffrax triples the time of `import jaxquad`.
     import diffrax as dfx
@@ -201,7 +200,7 @@ class Motions(NamedTuple):
     groups: tuple[int, ...]  # how many of the fast columns belong to each speed
 
 
-def linear_model(model: PyTree) -> TransferFunction | StateSpace:
+def linear_model(model: PyTree) -> Plant:
     """The model as one that `simulate_linear` takes."""
     if isinstance(model, TransferFunction | StateSpace):
         return model
@@ -218,8 +217,8 @@ def linear_model(model: PyTree) -> TransferFunction | StateSpace:
     )
 
 
-def check_channels(plant: TransferFunction | StateSpace, record: Record) -> None:
-    """Raise ValueError for a model of other channels than the record has."""
+def check_plant(plant: Plant, record: Record) -> None:
+    """Raise ValueError for a model of other channels than the record's, or one too unstable."""
     inputs, outputs = 1, 1
     if isinstance(plant, StateSpace):
         inputs, outputs = plant.G.shape[1], len(plant.H0)
@@ -232,10 +231,6 @@ def check_channels(plant: TransferFunction | StateSpace, record: Record) -> None
                 "«pick channels with jq.records.select»"
             )
         )
-
-
-def check_growth(plant: TransferFunction | StateSpace, record: Record) -> None:
-    """Raise ValueError for an unstable model over a record too long to simulate it."""
     poles = np.asarray(plant.poles)
     fastest = np.max(np.real(poles), initial=0.0) * record.duration
     if not fastest < np.log(_OUTGROWN):
@@ -247,10 +242,7 @@ def check_growth(plant: TransferFunction | StateSpace, record: Record) -> None:
 
 
 def forced_response(
-    plant: TransferFunction | StateSpace,
-    u: Float[Numbers, "samples inputs"],
-    dt: float | Float[Array, ""],
-    hold: str,
+    plant: Plant, u: Float[Numbers, "samples inputs"], dt: float | Float[Array, ""], hold: str
 ) -> Float[Array, "samples outputs"]:
     """The outputs under inputs that stood at their first values before the record, from rest."""
     u = u - u[:1]
@@ -259,7 +251,7 @@ def forced_response(
     return simulate_linear(plant, u, dt, hold=hold)
 
 
-def unknown_motions(plant: TransferFunction | StateSpace, duration: float) -> Motions:
+def unknown_motions(plant: Plant, duration: float) -> Motions:
     """The invariant subspaces of all speeds; slow is what a fifth of the record does not damp."""
     A = np.asarray((explicit(plant) if isinstance(plant, StateSpace) else realise(plant))[0])
     if not len(A):
@@ -291,10 +283,7 @@ def unknown_motions(plant: TransferFunction | StateSpace, duration: float) -> Mo
 
 
 def free_response(
-    plant: TransferFunction | StateSpace,
-    motions: Motions,
-    samples: int,
-    dt: float | Float[Array, ""],
+    plant: Plant, motions: Motions, samples: int, dt: float | Float[Array, ""]
 ) -> Float[Array, "samples outputs unknowns"]:
     """The outputs of a unit shift of each output, of unit biases and of unit initial values."""
     outputs = len(plant.H0) if isinstance(plant, StateSpace) else 1
@@ -310,7 +299,7 @@ def free_response(
 
 @ft.partial(Jit, options=brief_options)
 def forced_and_free(
-    plant: TransferFunction | StateSpace,
+    plant: Plant,
     motions: Motions,
     u: Float[Numbers, "samples inputs"],
     dt: Float[Numbers, ""],

@@ -15,14 +15,16 @@ from ._noise import orthonormal, projected_noise
 from ._simulated import (
     band_filter,
     band_gain,
-    check_channels,
-    check_growth,
+    check_plant,
     forced_and_free,
     inputs_between_samples,
     linear_model,
     Motions,
     unknown_motions,
 )
+
+
+Outputs = Float[np.ndarray, "samples outputs"]
 
 
 class Agreement(eqx.Module):
@@ -93,8 +95,8 @@ class Verification(eqx.Module):
 def _agreement(
     name: str,
     unit: str,
-    measured: Float[np.ndarray, "samples outputs"],
-    simulated: Float[np.ndarray, "samples outputs"],
+    measured: Outputs,
+    simulated: Outputs,
     weights: Float[np.ndarray, " outputs"],
 ) -> Agreement:
     """J_rms and TIC with a diagonal weight W. Source: Tischler & Remple, sec. 14.2."""
@@ -153,10 +155,6 @@ def verify(
     - `weights`: of the squares of the outputs in the measures of all together; give them where
         units differ. 1 by default.
 
-    **Returns:**
-
-    `jq.identify.Verification`.
-
     **Raises:**
 
     - `ValueError`: a model of other channels, or one that is too unstable to be simulated.
@@ -173,7 +171,7 @@ def verify(
             raise UndeterminedError(f"a verification needs a model: {model.verdict.summary}")
         model, band = model.model, model.used_band if band is None else band
     plant = linear_model(model)
-    check_channels(plant, record)
+    check_plant(plant, record)
     gain, count = band_gain(band, record), len(record.output_names)
     shares = np.ones(count) if weights is None else np.asarray(weights, float)
     if shares.shape != (count,) or not np.all(np.isfinite(shares) & (shares > 0)):
@@ -182,7 +180,6 @@ def verify(
             f"{', '.join(record.output_names)}"
         )
     u, between = inputs_between_samples(record, hold)
-    check_growth(plant, record)
     motions = unknown_motions(plant, record.duration)
     # One program serves records of about this length.
     step = max(2 ** (record.samples.bit_length() - 1) // _PER_OCTAVE, 1)
@@ -225,9 +222,7 @@ def verify(
 
 
 def _significant_unknowns(
-    rest: Float[np.ndarray, "samples outputs"],
-    columns: Float[np.ndarray, "samples outputs unknowns"],
-    motions: Motions,
+    rest: Outputs, columns: Float[np.ndarray, "samples outputs unknowns"], motions: Motions
 ) -> Float[np.ndarray, " significant"]:
     """Least squares without the fast transients that do not stand out, the fastest first.
 
@@ -307,8 +302,6 @@ def compare(
     - `models`: by name, or a list, or one: models as `jq.verify` takes them, or fits.
     - `record`: with their inputs and outputs.
     - `band`, `hold`: as in `jq.verify`.
-
-    **Returns:** a `jq.identify.Comparison`.
 
     **Raises:** what `jq.verify` raises; ValueError for no model, and for a fit that found none.
     """

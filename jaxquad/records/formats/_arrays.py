@@ -69,10 +69,7 @@ def load_numpy(path: Path) -> Log:
 def _read_array(
     name: str, stream: io.BufferedIOBase | IO[bytes], size: int
 ) -> dict[str, np.ndarray]:
-    """The array of a .npy stream of `size` bytes, which holds at least what its header declares.
-
-    A structured array is a table, and its fields are the channels.
-    """
+    """The array of a .npy stream of `size` bytes; the fields of a structured one are channels."""
     read = np.lib.format.read_array_header_1_0, np.lib.format.read_array_header_2_0
     try:
         version = np.lib.format.read_magic(stream)
@@ -148,10 +145,7 @@ class _Element(NamedTuple):
 
 @dataclasses.dataclass
 class _MatFile:
-    """The byte order of a file, its size, and how many bytes its variables unfold to so far.
-
-    They count in the type that they are stored in or in the wider one of their class.
-    """
+    """Byte order and size of a file, and how many bytes its variables unfold to so far."""
 
     order: str
     stored: int

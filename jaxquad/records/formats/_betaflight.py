@@ -37,11 +37,7 @@ def sniff(head: bytes, path: Path) -> bool:
 
 
 def load(path: Path) -> Log:
-    """All logs of a file that have frames.
-
-    A single log has the tables `""`, `slow` and `gps`; of several, the second is `log2`,
-    `log2.slow`, `log2.gps`. Raises ReadError where no log has frames.
-    """
+    """All logs of a file that have frames: the tables `slow` and `gps`, of several `log2.slow`."""
     data = path.read_bytes()
     tables, remarks, settings, failures = {}, [], {}, []
     logs = headers(data)
@@ -130,10 +126,7 @@ def _table(
 def _slow_tables(
     content: Payload, main: Frames, time: Float[np.ndarray, " samples"], header: Header
 ) -> dict[str, Table]:
-    """The tables `slow` (flight modes) and `gps`, stamped with the last main frame before.
-
-    GPS frames that no home position precedes are left out, as they are relative to it.
-    """
+    """Flight modes and positions, stamped with the last main frame before; relative to a home."""
     tables = {}
     for letter, name in (("S", "slow"), ("G", "gps")):
         frames = content.slow.get(letter)
@@ -205,8 +198,7 @@ def _segments(main: Frames, header: Header, damage: list[tuple[int, int]]) -> _S
 def _add_predictions(main: Frames, header: Header, parts: _Segments) -> None:
     """Turn the coded numbers of all usable rows into values, in place.
 
-    Frame after frame, but for all segments at once: the average of the last two values is
-    rounded, so that no cumulative sum can stand for it.
+    Frame after frame, for all segments at once: the average of two values is rounded.
     """
     frame, interval = header.frames["P"], header.interval
     constant = _constants(frame, header)
@@ -277,8 +269,7 @@ def _trusted_rows(
 ) -> tuple[Rows, bool]:
     """The rows that are in order, and whether frames come as the intervals of the header say.
 
-    A segment that ends at another iteration than the next key frame says has lost frames
-    somewhere, if not part of its key frame: it is left out, unless most segments are like that.
+    A segment that ends elsewhere than the next key frame says is left out, unless most are so.
     """
     begin, most = parts.begin, header.scheduled.size
     in_order = _in_order(main, begin)
@@ -314,8 +305,7 @@ def _trusted_rows(
 def _in_order(main: Frames, begin: np.ndarray) -> Bool[np.ndarray, " segments"]:
     """Key frames whose iteration and time go on together from those before.
 
-    Neighbours that agree on the time per iteration form a run. A key frame that agrees with
-    neither neighbour is damaged, if others do agree; a run that goes back is left out.
+    Neighbours that agree on the time per iteration form a run; a run that goes back is left out.
     """
     iteration, time = main.coded[begin, 0], main.coded[begin, 1]
     steps, spans = _elapsed(iteration).astype(np.float64), _elapsed(time).astype(np.float64)

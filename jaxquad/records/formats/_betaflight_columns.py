@@ -44,11 +44,7 @@ def sniff(head: bytes, path: Path) -> bool:
 
 
 def load(path: Path) -> Log:
-    """The columns with numbers under their names, the units taken off.
-
-    Cells that are missing or hold text are NaN; rows without a time are left out. Flight modes,
-    which are text, become the table `slow`, as a native log has it.
-    """
+    """The columns with numbers, NaN where there is none; flight modes become the table `slow`."""
     settings, lines, texts, numbers = {}, 0, {}, []
     with path.open(encoding="utf-8-sig", errors="replace") as file:
         while True:
@@ -143,10 +139,7 @@ _FEWEST_TURNS = 3
 
 
 def scaled(names: tuple[str, ...], settings: dict[str, str]) -> dict[str, tuple[float, str]]:
-    """Factor and unit of the fields for which the header gives them.
-
-    Where `blackbox_high_resolution` is set, gyro, set-points and sticks are tenths.
-    """
+    """Factor and unit of the fields for which the header gives them; tenths in high resolution."""
     fine = 0.1 if settings.get("blackbox_high_resolution", "0").strip() == "1" else 1.0
     text = settings.get("gyro_scale", settings.get("gyro.scale", "")).strip()
     try:  # deg/s per count

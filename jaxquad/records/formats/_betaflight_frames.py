@@ -182,10 +182,7 @@ def _numbers(raw: np.ndarray) -> _Numbers:
 
 
 def _decode(data: _Numbers, frame: Frame, starts: Positions) -> tuple[np.ndarray, Positions]:
-    """What the frames whose letters stand at `starts` would hold, as coded, and their ends.
-
-    An end is -1 where a number is too long.
-    """
+    """What frames with letters at `starts` would hold, as coded, and their ends, -1 for none."""
     out = np.zeros((starts.size, len(frame.names)), np.int32)
     at, worst = starts + 1, np.zeros(starts.size, np.uint8)
     for encoding, first, count in frame.groups:
@@ -225,11 +222,7 @@ def _decode(data: _Numbers, frame: Frame, starts: Positions) -> tuple[np.ndarray
 
 
 def _three(raw: np.ndarray, at: Positions, out: np.ndarray, *, variable: bool) -> Positions:
-    """TAG2_3S32 or TAG2_3SVARIABLE.
-
-    Three fields of 2, of 4, of 6 bits, or of 1 to 4 bytes each. In the second they have 2 bits, 5,
-    5, 4 bits, 8, 7, 7 bits, or 1 to 4 bytes.
-    """
+    """TAG2_3S32 or TAG2_3SVARIABLE: three fields of 2 bits, of some, or of 1 to 4 bytes each."""
     widths = ((5, 5, 4), (8, 7, 7)) if variable else ((4, 4, 4), (6, 6, 6))
     begins = ((2, 7, 12), (2, 10, 17)) if variable else ((4, 8, 12), (2, 10, 18))
     tags = raw[at]
@@ -346,8 +339,7 @@ def _walk(
 ) -> tuple[int, list[int]]:  # fmt: skip
     """Where the walk leaves the piece, and the numbers of the places it came through.
 
-    A frame that may begin at one of the places ends where it `reach`es, which is `good` where the
-    letter of another one follows.
+    A frame at a place ends at its `reach`, which is `good` where another letter follows.
     """
     places, ends = begins.tolist(), reach.tolist()
     following = np.where(good, np.searchsorted(begins, reach), -1).tolist() + [-1]

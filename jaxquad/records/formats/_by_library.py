@@ -1,8 +1,8 @@
 """Formats that other libraries decode: HDF5, Parquet and ROS 2 bags, in a process of their own.
 
-`_readers` runs this file as a script, without the package: `_by_library.py FORMAT PATH LIMIT`. It
-reads PATH and writes to stdout a line of JSON (names, dtypes, shapes, units, remarks; or what was
-wrong), then the bytes of the arrays.
+The face of this folder runs it as a script, without the package: `_by_library.py FORMAT PATH
+LIMIT`. It reads PATH and writes to stdout a line of JSON (names, dtypes, shapes, units, remarks; or
+what was wrong), then the bytes of the arrays.
 """
 
 import dataclasses
@@ -13,13 +13,10 @@ import sys
 from collections.abc import Callable, Iterator, Mapping
 from operator import attrgetter
 from pathlib import Path
-from typing import Any, BinaryIO, TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 
-
-if TYPE_CHECKING:
-    import h5py
 
 _SPARE = 512 * 2**20  # bytes of address space beside three times the numbers
 Check = Callable[[str, int], None]  # of how many bytes something declares
@@ -40,40 +37,58 @@ def sniff_hdf5(head: bytes, path: Path) -> bool:
 
 
 def _hdf5_tables(path: str, check: Check) -> Content:
-    """The numeric datasets as `group.name` with their units, and what was left out.
+    """The numeric datasets as `group.name`; those of MATLAB v7.3 have its rows and columns.
 
-    MATLAB v7.3 files, which are HDF5 with the axes reversed, keep the rows and columns that they
-    have in MATLAB. Datasets whose values lie in other files are left out.
+    By the lower layer of h5py: its upper one takes five times as long for many small datasets.
     """
     import h5py
+    from h5py import h5o  # pyright: ignore[reportAttributeAccessIssue]  # h5py has no stubs of it
+
+    names: list[bytes] = []  # soft and external links are not followed
+
+    def visit(name: bytes) -> None:
+        if len(names) >= _MOST_OBJECTS:
+            raise ValueError(f"more than {_MOST_OBJECTS} objects")
+        names.append(name)
 
     columns: dict[str, tuple[np.ndarray, str]] = {}
     remarks: list[str] = []
     size = 0
     with h5py.File(path, "r") as file:
-        for name, item, dtype in _datasets(file.id):
+        h5o.visit(file.id, visit)
+        for raw in names:
+            item = h5o.open(file.id, raw)
+            if not isinstance(item, h5py.h5d.DatasetID) or raw.startswith(b"#"):
+                continue
+            shape, dtype = item.shape, item.dtype
+            if shape is None or not 1 <= len(shape) <= 2 or 0 in shape:
+                continue
+            if not (dtype.kind in "fiub" or (dtype.names and len(shape) == 1)):
+                continue
+            attributes = h5py.Dataset(item).attrs if h5py.h5a.get_num_attrs(item) else {}
+            kind = _text(attributes.get("MATLAB_class"))
+            matlab = kind.startswith(("int", "uint")) or kind in _MATLAB_NUMBERS
+            if (kind and not matlab) or "MATLAB_empty" in attributes:
+                continue
+            name = raw.decode("utf-8", "replace").replace("/", ".")
             layout = item.get_create_plist()
-            kind = layout.get_layout()
-            if layout.get_external_count() or kind == h5py.h5d.VIRTUAL:
+            stored = layout.get_layout()
+            if layout.get_external_count() or stored == h5py.h5d.VIRTUAL:
                 remarks.append(f"{name!r} lies in another file and was left out")
                 continue
-            size += math.prod(item.shape) * dtype.itemsize
+            size += math.prod(shape) * dtype.itemsize
             check("the file", size)
-            if kind == h5py.h5d.CHUNKED:
+            if stored == h5py.h5d.CHUNKED:
                 check(f"a chunk of {name!r}", math.prod(layout.get_chunk()) * dtype.itemsize)
-            unit = ""
-            if h5py.h5a.get_num_attrs(item):
-                attributes = h5py.Dataset(item).attrs
-                named = (attributes.get(key) for key in ("units", "unit"))
-                unit = next((_text(text) for text in named if text is not None), "")
+            unit = _unit(attributes, "units", "unit")
             if dtype.names:
                 records = np.asarray(h5py.Dataset(item)[()])
                 arrays = {f"{name}.{field}": records[field] for field in dtype.names}
             else:
-                values = np.empty(item.shape, dtype)
+                values = np.empty(shape, dtype)
                 item.read(h5py.h5s.ALL, h5py.h5s.ALL, values)
-                values = values.T if h5py.h5a.exists(item, b"MATLAB_class") else values
-                arrays = {name: values.reshape(-1) if 1 in values.shape else values}
+                values = values.T if "MATLAB_class" in attributes else values
+                arrays = {name: values.reshape(-1) if 1 in shape else values}
             for full, values in arrays.items():
                 if full in columns:
                     remarks.append(f"two datasets are called {full!r}: the later one is used")
@@ -81,44 +96,15 @@ def _hdf5_tables(path: str, check: Check) -> Content:
     return {"": columns}, remarks
 
 
-def _datasets(file: "h5py.h5f.FileID") -> Iterator[tuple[str, "h5py.h5d.DatasetID", np.dtype]]:
-    """Those of numbers or records, and their types; soft and external links are not followed.
-
-    By the lower layer of h5py: its upper one takes five times as long for many small datasets.
-    """
-    import h5py
-    from h5py import h5o  # pyright: ignore[reportAttributeAccessIssue]  # h5py has no stubs of it
-
-    names: list[bytes] = []
-
-    def visit(name: bytes) -> None:
-        if len(names) >= _MOST_OBJECTS:
-            raise ValueError(f"more than {_MOST_OBJECTS} objects")
-        names.append(name)
-
-    h5o.visit(file, visit)
-    for name in names:
-        item = h5o.open(file, name)
-        if not isinstance(item, h5py.h5d.DatasetID) or name.startswith(b"#"):
-            continue
-        shape, dtype = item.shape, item.dtype
-        if shape is None or not 1 <= len(shape) <= 2 or 0 in shape:
-            continue
-        if not (dtype.kind in "fiub" or (dtype.names and len(shape) == 1)):
-            continue
-        if h5py.h5a.get_num_attrs(item):
-            attributes = h5py.Dataset(item).attrs
-            kind = _text(attributes.get("MATLAB_class", b""))
-            matlab = kind.startswith(("int", "uint")) or kind in _MATLAB_NUMBERS
-            if not (matlab or not kind) or "MATLAB_empty" in attributes:
-                continue
-        yield name.decode("utf-8", "replace").replace("/", "."), item, dtype
-
-
 def _text(value: object) -> str:
     if isinstance(value, bytes):
         return value.decode("utf-8", "replace")
     return value if isinstance(value, str) else ""
+
+
+def _unit(attributes: Mapping, *keys: str | bytes) -> str:
+    logged = (attributes.get(key) for key in keys)
+    return next((_text(text) for text in logged if text is not None), "")
 
 
 _PER_SECOND = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}
@@ -129,10 +115,7 @@ def sniff_parquet(head: bytes, path: Path) -> bool:
 
 
 def _parquet_tables(path: str, check: Check) -> Content:
-    """The numeric columns with their units; time stamps and durations in s.
-
-    Where values are missing, integers become floats with NaN.
-    """
+    """The numeric columns, with NaN where values are missing; time stamps and durations in s."""
     import pyarrow.parquet
 
     types = pyarrow.types
@@ -152,10 +135,7 @@ def _parquet_tables(path: str, check: Check) -> Content:
             seconds = column.cast(pyarrow.int64()).to_numpy() / _PER_SECOND[field.type.unit]
             columns[field.name] = seconds, "s"
         else:
-            metadata = field.metadata or {}
-            units = (metadata.get(key) for key in (b"units", b"unit"))
-            unit = next((text.decode("utf-8", "replace") for text in units if text is not None), "")
-            columns[field.name] = column.to_numpy(), unit
+            columns[field.name] = column.to_numpy(), _unit(field.metadata or {}, b"units", b"unit")
     return {"": columns}, []
 
 
@@ -173,11 +153,9 @@ def sniff_bag(head: bytes, path: Path) -> bool:
 
 
 def _bag_tables(path: str, check: Check) -> Content:
-    """The numbers of each topic with their units and a column `time` (s), and what was left out.
+    """The numbers of each topic, `/imu/data` with `angular_velocity.x`; its time begins at 0.
 
-    The table `/imu/data` has the columns `angular_velocity.x`, ... Its time is that of the
-    message's header, else that of recording, in s from the beginning of the bag. Covariances are
-    left out.
+    It is that of the message's header, else that of recording. Covariances are left out.
     """
     from rosbags.highlevel import AnyReader
     from rosbags.typesys import get_typestore, Stores
@@ -269,43 +247,16 @@ LIBRARIES: Mapping[str, tuple[tuple[str, ...], Callable[[str, Check], Content]]]
 }  # the modules that a format needs, and the function that returns its tables and remarks
 
 
-def answer(kind: str, path: str, limit: int, stream: BinaryIO) -> None:
-    """Write the tables of a file, which may declare up to `limit` bytes."""
-
-    def check(what: str, declared: int) -> None:
-        if declared > limit:
-            raise Oversize(what, declared)
-
-    try:
-        tables, remarks = LIBRARIES[kind][1](path, check)
-    except Oversize as error:
-        stream.write(json.dumps({"oversize": error.args}).encode() + b"\n")
-        return
-    # On damaged files the libraries raise almost anything.
-    except Exception as error:
-        reason = f"{type(error).__name__}: {error}"
-        stream.write(json.dumps({"error": reason[:500]}).encode() + b"\n")
-        return
-    arrays = [
-        (table, name, np.asarray(values), unit)
-        for table, columns in tables.items()
-        for name, (values, unit) in columns.items()
-        if values.dtype.kind in "fiub" and values.ndim in (1, 2)
-    ]
-    listed = [(table, name, a.dtype.str, a.shape, unit) for table, name, a, unit in arrays]
-    stream.write(json.dumps({"arrays": listed, "remarks": remarks}).encode() + b"\n")
-    for _, _, array, _ in arrays:
-        stream.write(np.ascontiguousarray(array).data.cast("B") if array.size else b"")
-
-
 def main() -> None:
     kind, path, limit = sys.argv[1], sys.argv[2], int(sys.argv[3])
+    stream = sys.stdout.buffer
+    say = lambda what: stream.write(json.dumps(what).encode() + b"\n")
     try:
         # Before memory is limited: some libraries reserve gigabytes of addresses.
         for module in LIBRARIES[kind][0]:
             importlib.import_module(module)
     except ImportError as error:
-        sys.stdout.buffer.write(json.dumps({"missing": str(error)}).encode() + b"\n")
+        say({"missing": str(error)})
         return
     if sys.platform == "linux":
         import resource
@@ -315,7 +266,30 @@ def main() -> None:
         most = used + 3 * limit + _SPARE
         resource.setrlimit(resource.RLIMIT_AS, (most, most))
         resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
-    answer(kind, path, limit, sys.stdout.buffer)
+
+    def check(what: str, declared: int) -> None:
+        if declared > limit:
+            raise Oversize(what, declared)
+
+    try:
+        tables, remarks = LIBRARIES[kind][1](path, check)
+    except Oversize as error:
+        say({"oversize": error.args})
+        return
+    # On damaged files the libraries raise almost anything.
+    except Exception as error:
+        say({"error": f"{type(error).__name__}: {error}"[:500]})
+        return
+    arrays = [
+        (table, name, np.asarray(values), unit)
+        for table, columns in tables.items()
+        for name, (values, unit) in columns.items()
+        if values.dtype.kind in "fiub" and values.ndim in (1, 2)
+    ]
+    listed = [(table, name, a.dtype.str, a.shape, unit) for table, name, a, unit in arrays]
+    say({"arrays": listed, "remarks": remarks})
+    for _, _, array, _ in arrays:
+        stream.write(np.ascontiguousarray(array).data.cast("B") if array.size else b"")
 
 
 if __name__ == "__main__":

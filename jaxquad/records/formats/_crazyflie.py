@@ -37,10 +37,7 @@ def sniff(head: bytes, path: Path) -> bool:
 
 
 def load(path: Path) -> Log:
-    """The events of a file, a table for each type; one type alone is the table `""`.
-
-    Raises ReadError where the head of the file is damaged.
-    """
+    """The events of a file, a table for each type; one type alone is the table `""`."""
     data = path.read_bytes()
     version, count = struct.unpack_from("<HH", data, 1) if len(data) >= 9 else (0, 0)
     if version not in _STAMP or data[0] != MAGIC:
@@ -130,9 +127,7 @@ def _events(
 ) -> tuple[dict[int, list[int]], list[tuple[int, int]]]:
     """Where the events of each type begin, and the stretches (offset, bytes) in between.
 
-    Walks from event to event up to `end`; after damage, on to the next two that fit together, whose
-    stamps go on by at most the `window`. The event before a place where none of a known type begins
-    has lost or gained bytes itself, and is left out.
+    After damage it goes on with the next two whose stamps fit; the event before it is left out.
     """
     sizes = {number: layout.itemsize for number, layout in layouts.items()}
     offsets: dict[int, list[int]] = {number: [] for number in layouts}

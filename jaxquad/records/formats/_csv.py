@@ -75,9 +75,9 @@ def load(path: Path) -> Log:
     # The columns by the names in their titles, with the units that stand behind these.
     parts = columns_of(list(columns))
     table = Table(
-        columns={parts[title].name: values for title, values in columns.items()},
+        columns={parts[title][0]: values for title, values in columns.items()},
         units={name: unit for name, unit in parts.values() if unit},
-        rows={parts[title].name: there for title, there in rows.items()},
+        rows={parts[title][0]: there for title, there in rows.items()},
         titles={title: name for title, (name, _) in parts.items() if title != name},
     )
     return Log({"": table}, remarks)
@@ -100,11 +100,7 @@ class _BlankCell(ReadError):
 def _topics(
     content: bytes, header: _Header, error: _BlankCell
 ) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray], tuple[str, ...]]:
-    """Of a table of several topics the columns, the rows that they have a value in, and remarks.
-
-    A row has the values of one topic, or each topic rows of its own. Raises `error` where a few
-    cells are blank only: those are missing values.
-    """
+    """Of a table of several topics the columns, the rows that they have a value in, and remarks."""
     table = _parse_rows(content[header.place :], header.number, header, blank=np.nan).T
     rows = table.shape[1]
     filled = dict(zip(header.names, ~np.isnan(table), strict=True))
@@ -185,10 +181,7 @@ def _parse(block: bytes, header: _Header) -> Float[np.ndarray, "rows columns"] |
 def _parse_rows(
     block: bytes, first: int, header: _Header, *, blank: float | None = None
 ) -> Float[np.ndarray, "rows columns"]:
-    """Row by row, which finds what is wrong, and takes comments and quotes.
-
-    The lines count from `first`; a cell without a number is `blank`.
-    """
+    """Row by row, with comments and quotes; lines count from `first`, blank cells are `blank`."""
     rows = []
     for number, text in enumerate(block.decode().split("\n"), start=first):
         if not text.strip() or text.lstrip().startswith("#"):

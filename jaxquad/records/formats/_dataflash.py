@@ -152,17 +152,19 @@ def _find_rate_unit(tables: dict[str, Table]) -> list[str]:
     return [f"the log does not say the unit of RATE: taken as {unit}{hundredths}, {why}"]
 
 
-class _Extent(NamedTuple):
-    """A part of a file from definitions of its messages to the next ones.
-
-    One of `other_layout` begins anew, and defines messages otherwise than the part before.
-    """
+@dataclasses.dataclass
+class _Part:
+    """A part of a file, from definitions of its messages to the next ones."""
 
     begin: int  # its first byte
-    end: int  # the one after its last
-    span: tuple[float, float] | None  # first and last time in s; None where nothing has a time
-    chirped: bool  # whether it holds a SystemID chirp
-    other_layout: bool = False
+    formats: dict[int, _Format] = dataclasses.field(default_factory=dict)  # by message type
+    offsets: Offsets = dataclasses.field(default_factory=lambda: collections.defaultdict(list))
+    defined: set[int] = dataclasses.field(default_factory=set)  # types that it defines itself
+    # Place, old and new format of those that the part before defined otherwise.
+    redefined: list[tuple[int, _Format, _Format]] = dataclasses.field(default_factory=list)
+    end: int = 0  # the byte after its last
+    span: tuple[float, float] | None = None  # first and last time in s
+    chirped: bool = False  # whether it holds a SystemID chirp
 
 
 _MOST_PARTS = 100  # of one file
@@ -178,16 +180,14 @@ def _span(times: np.ndarray) -> tuple[float, float] | None:
     return float(np.median(times[:_ENDS])), float(np.median(times[-_ENDS:]))
 
 
-def _choose_log(parts: Sequence[_Extent]) -> tuple[list[int], list[str]]:
-    """The numbers of the parts of the log to read, and a remark on those that are left out.
-
-    It is the longest one with a chirp, else the longest.
-    """
+def _choose_log(parts: Sequence[_Part]) -> tuple[list[int], list[str]]:
+    """The numbers of the parts of the longest log, with a chirp if any; a remark on the others."""
     logs: list[list[int]] = [[]]
     last = -np.inf
     for i, part in enumerate(parts):  # a log begins where the clock goes back, or definitions do
         restarted = part.span is not None and part.span[0] < last - _BACKWARD
-        if i and (restarted or part.other_layout):
+        anew = bool(part.redefined) and _FORMAT_TYPE in part.defined
+        if i and (restarted or anew):
             logs.append([])
         logs[-1].append(i)
         last = last if part.span is None else part.span[1]
@@ -279,27 +279,9 @@ def _rows(
     return rows, odd
 
 
-@dataclasses.dataclass(frozen=True)
-class _Part:
-    """From definitions of messages to the next ones: formats by message type, offsets of each.
-
-    `defined` are the types that it defines itself, and `redefined` place, old and new format of
-    those that the part before defined otherwise.
-    """
-
-    begin: int
-    formats: dict[int, _Format]
-    offsets: Offsets = dataclasses.field(default_factory=lambda: collections.defaultdict(list))
-    defined: set[int] = dataclasses.field(default_factory=set)
-    redefined: list[tuple[int, _Format, _Format]] = dataclasses.field(default_factory=list)
-
-
 def _scan(data: bytes) -> tuple[list[_Part], list[str]]:
-    """The parts of a file, and what was skipped.
-
-    A log ends within a message, wherever the writer's buffer did, which is no damage.
-    """
-    parts = [part := _Part(0, {})]
+    """The parts of a file, and what was skipped. A log may end within a message."""
+    parts = [part := _Part(0)]
     lengths = [0] * 256
     lengths[_FORMAT_TYPE] = _FMT_LENGTH
     skipped: list[tuple[int, int]] = []
@@ -367,21 +349,18 @@ def _one_log(
 ) -> tuple[Mapping[int, _Format], Offsets, list[str]]:
     """Formats and offsets of one of the logs that a file holds, and a remark on the others."""
     ends = [*(part.begin for part in parts[1:]), len(data)]
-    extents = []
     for part, end in zip(parts, ends, strict=True):
+        part.end = end
         stored = [x for kind, x in part.formats.items() if part.offsets.get(kind)]
+        part.chirped = any(layout.name == "SIDD" for layout in stored)
         timed = [x for x in stored if x.columns[0] in _CLOCKS and x.name not in _ABOUT]
         timed = [layout for layout in timed if layout.dtype() is not None]
-        span = None
         if timed:
             most = max(timed, key=lambda layout: len(part.offsets[layout.kind]))
             rows, _ = _rows(data, {most.kind: most}, part.offsets)
             clock = most.columns[0]
-            span = _span(_CLOCKS[clock] * rows[most.name][clock].astype(np.float64))
-        chirped = any(layout.name == "SIDD" for layout in stored)
-        anew = bool(part.redefined) and _FORMAT_TYPE in part.defined
-        extents.append(_Extent(part.begin, end, span, chirped, anew))
-    numbers, remarks = _choose_log(extents)
+            part.span = _span(_CLOCKS[clock] * rows[most.name][clock].astype(np.float64))
+    numbers, remarks = _choose_log(parts)
     offsets: Offsets = collections.defaultdict(list)
     for i in numbers:
         if parts[i].redefined and (i == 0 or i - 1 in numbers):
@@ -427,10 +406,7 @@ def sniff_text(head: bytes, path: Path) -> bool:
 
 
 def load_text(path: Path) -> Log:
-    """The same of a text log.
-
-    Numbers stand in the units of their format letters; those of FMTU remain to be multiplied.
-    """
+    """The same of a text log, in the units of its format letters; those of FMTU are applied."""
     content = path.read_bytes()
     begins = [hit.start() for hit in _BEGIN.finditer(content)][1:]
     if len(begins) >= _MOST_PARTS:
@@ -442,13 +418,12 @@ def load_text(path: Path) -> Log:
         lines, _ = _lines(content[begin:end])
         timed = [x for x in _text_formats(lines) if x.name not in _ABOUT and x.name in lines]
         timed = [layout for layout in timed if layout.columns[0] in _CLOCKS]
-        span = None
+        parts.append(part := _Part(begin, end=end, chirped=bool(timed) and "SIDD" in lines))
         if timed:
             most = max(timed, key=lambda layout: len(lines[layout.name]))
             cells = (line.partition(b",")[0] for line in lines[most.name])
             stamps = np.array([number_in(cell.decode("latin-1")) for cell in cells])
-            span = _span(_CLOCKS[most.columns[0]] * stamps)
-        parts.append(_Extent(begin, end, span, bool(timed) and "SIDD" in lines))
+            part.span = _span(_CLOCKS[most.columns[0]] * stamps)
     numbers, remarks = _choose_log(parts)
     if begins:
         content = b"".join(content[parts[i].begin : parts[i].end] for i in numbers)

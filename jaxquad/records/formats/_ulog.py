@@ -4,9 +4,8 @@ import bisect
 import dataclasses
 import re
 import struct
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
@@ -21,15 +20,8 @@ _WIDEST = 5000  # columns of one topic; the widest of PX4 has some 400
 _MOST_NOTES = 100
 
 
-class Field(NamedTuple):
-    """One field of a format: a basic type or another format, alone or `count` times."""
-
-    kind: str
-    count: int | None
-    name: str
-
-
-Formats = Mapping[str, tuple[Field, ...]]
+# The fields of a format: a basic type or another format, alone (None) or so many times, a name.
+Formats = dict[str, tuple[tuple[str, int | None, str], ...]]
 
 
 @dataclasses.dataclass
@@ -48,7 +40,7 @@ class _Topic:
 class _Messages:
     """What the messages of a log have said so far."""
 
-    formats: dict[str, tuple[Field, ...]] = dataclasses.field(default_factory=dict)
+    formats: Formats = dataclasses.field(default_factory=dict)
     current: dict[int, _Topic] = dataclasses.field(default_factory=dict)  # by message number
     topics: dict[str, _Topic] = dataclasses.field(default_factory=dict)  # by label
     layouts: dict[str, np.dtype] = dataclasses.field(default_factory=dict)  # by format
@@ -176,42 +168,21 @@ _BASIC = {
 _FIELD = re.compile(r"(\w+)(?:\[(\d{1,9})\])? (\w+)", re.ASCII)
 
 
-def _layout(name: str, formats: Formats, offset: int, most: int) -> np.dtype:
-    """The bytes of a message as at most so many columns, those of a nested one `field.column`."""
-    fields: list[tuple[str, str]] = []
-    size = 0
-    for column, kind in _columns(name, "", formats, offset, 0):
-        fields.append((column, kind))
-        size += np.dtype(kind).itemsize
-        if size > _LARGEST or len(fields) > most:
-            raise ReadError(f"the format {name!r} is implausibly long", offset=offset)
-    while fields and fields[-1][0].rpartition(".")[2].startswith("_padding"):
-        fields.pop()  # as the logger leaves it out
-    if len({column for column, _ in fields}) < max(1, len(fields)):
-        raise ReadError(
-            f"the format {name!r} has no field, or two with the same name", offset=offset
-        )
-    return np.dtype(fields)
-
-
 def _columns(
     name: str, prefix: str, formats: Formats, offset: int, depth: int
 ) -> Iterator[tuple[str, str]]:
     if name not in formats or depth > _DEEPEST:
         why = "contains itself" if name in formats else "is not defined"
         raise ReadError(f"the format {name!r} {why}", offset=offset)
-    for field in formats[name]:
-        if (field.count or 0) > _LARGEST:
-            raise ReadError(f"{name}.{field.name} has {field.count} elements", offset=offset)
-        column = prefix + field.name
-        if field.kind in _BASIC:
-            shape = "" if field.count is None else f"({field.count},)"
-            yield column, shape + _BASIC[field.kind]
-        elif field.count is None:
-            yield from _columns(field.kind, f"{column}.", formats, offset, depth + 1)
+    for kind, count, field in formats[name]:
+        if (count or 0) > _LARGEST:
+            raise ReadError(f"{name}.{field} has {count} elements", offset=offset)
+        column = prefix + field
+        if kind in _BASIC:
+            yield column, ("" if count is None else f"({count},)") + _BASIC[kind]
         else:
-            for i in range(field.count):
-                yield from _columns(field.kind, f"{column}[{i}].", formats, offset, depth + 1)
+            for i in [""] if count is None else (f"[{k}]" for k in range(count)):
+                yield from _columns(kind, f"{column}{i}.", formats, offset, depth + 1)
 
 
 _UNITS = {
@@ -258,9 +229,7 @@ def _interpret(kind: int, body: bytes, place: int, messages: _Messages) -> None:
             matches = [_FIELD.fullmatch(part) for part in parts]
             if not name or not colon or not parts or not all(matches):
                 raise ReadError(f"{text[:60]!r} is not a definition of a format", offset=place)
-            fields = tuple(
-                Field(m[1], None if m[2] is None else int(m[2]), m[3]) for m in matches if m
-            )
+            fields = tuple((m[1], int(m[2]) if m[2] else None, m[3]) for m in matches if m)
             if messages.formats.setdefault(name, fields) != fields:
                 raise ReadError(f"the format {name!r} is defined twice, differently", offset=place)
         elif letter == "A":
@@ -270,8 +239,21 @@ def _interpret(kind: int, body: bytes, place: int, messages: _Messages) -> None:
             if name in messages.formats and name not in messages.layouts:
                 most = min(_WIDEST, messages.columns_left)
                 messages.columns_left -= most  # What fails has cost as much time as a wide one.
-                messages.layouts[name] = _layout(name, messages.formats, place, most)
-                messages.columns_left += most - len(messages.layouts[name].names or ())
+                fields: list[tuple[str, str]] = []
+                size = 0
+                for column, code in _columns(name, "", messages.formats, place, 0):
+                    fields.append((column, code))
+                    size += np.dtype(code).itemsize
+                    if size > _LARGEST or len(fields) > most:
+                        raise ReadError(f"the format {name!r} is implausibly long", offset=place)
+                while fields and fields[-1][0].rpartition(".")[2].startswith("_padding"):
+                    fields.pop()  # as the logger leaves it out
+                if len({column for column, _ in fields}) < max(1, len(fields)):
+                    raise ReadError(
+                        f"the format {name!r} has no field, or two with the same name", offset=place
+                    )
+                messages.layouts[name] = np.dtype(fields)
+                messages.columns_left += most - len(fields)
             if name not in messages.layouts:
                 raise ReadError(f"the format {name!r} is not defined", offset=place)
             dtype = messages.layouts[name]
