@@ -156,16 +156,13 @@ def allowance(stored: int) -> int:
 
 def check_size(what: str, declared: int, stored: int, *, offset: int | None = None) -> None:
     """Raise ReadError where `stored` bytes declare that they unfold to too many."""
-    if declared > allowance(stored):
-        raise ReadError(oversize(what, declared, stored), offset=offset)
-
-
-def oversize(what: str, declared: int, stored: int) -> str:
-    """What the error says."""
-    return (
-        f"{what} declares {declared:.4g} bytes of numbers in {stored:.4g} bytes of file (limit "
-        f"{allowance(stored):.4g}): it is probably damaged; if it is not, cut it into parts"
-    )
+    limit = allowance(stored)
+    if declared > limit:
+        raise ReadError(
+            f"{what} declares {declared:.4g} bytes of numbers in {stored:.4g} bytes of file (limit "
+            f"{limit:.4g}): it is probably damaged; if it is not, cut it into parts",
+            offset=offset,
+        )
 
 
 def describe_skips(skipped: list[tuple[int, int]], place: int, end: int) -> list[str]:
