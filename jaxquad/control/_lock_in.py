@@ -5,7 +5,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
 from jaxquad._core import require_all_positive, signal_shape
 
@@ -81,98 +81,6 @@ class WindowSums(NamedTuple):
     index: Int[Array, ""]  # sample within the first window
 
 
-class LockInWindows(eqx.Module):
-    """Two staggered Hann windows and the sines that they correlate with, by counted samples."""
-
-    frequencies: tuple[float, ...] = eqx.field(static=True)  # Hz
-    window: float = eqx.field(static=True)  # s
-    dt: float = eqx.field(static=True)  # s
-
-    def __check_init__(self):
-        samples = self.window / self.dt
-        if abs(samples - round(samples)) > 1e-6 * samples or not 100 <= samples <= 40000:
-            raise ValueError(
-                f"A window of {self.window} s holds {samples:g} samples of {self.dt} s: give it "
-                "a whole number of samples from 100 to 40000."
-            )
-        for frequency in self.frequencies:
-            periods = frequency * self.window
-            if abs(periods - round(periods)) > 1e-6 * periods:
-                raise ValueError(
-                    f"A tone of {frequency} Hz has {periods:g} periods in a window of "
-                    f"{self.window} s: give a whole number, such as "
-                    f"{max(round(periods), 5) / self.window:g} Hz."
-                )
-            if not 5 <= round(periods) <= self.samples / 10:
-                raise ValueError(
-                    f"A tone of {frequency} Hz has {periods:g} periods in a window of "
-                    f"{self.window} s: give it from 5 to {self.samples // 10}."
-                )
-        spacing = np.diff(sorted(self.periods))
-        if np.any(spacing < 2 * BESIDE):
-            raise ValueError(
-                f"Tones of {self.frequencies} Hz are closer than {2 * BESIDE / self.window:g} Hz, "
-                f"the resolution of a window of {self.window} s: give a longer window."
-            )
-
-    @property
-    def samples(self) -> int:
-        return round(self.window / self.dt)
-
-    @property
-    def periods(self) -> np.ndarray:
-        """Of each tone in a window."""
-        return np.array([round(f * self.window) for f in self.frequencies])
-
-    def phase(self, index: Int[Array, ""]) -> Float[Array, " tones"]:
-        """Of the tones in cycles."""
-        return _cycles(self.periods, index, self.samples)
-
-    def square(self, signal: Signal) -> Float[Array, " tones *ones"]:
-        """w^2 in (rad/s)^2, as the second difference of a sampled sine shows it."""
-        w = 2 / self.dt * np.sin(np.pi * self.periods / self.samples)
-        return jnp.asarray(w**2, signal.dtype).reshape((-1,) + (1,) * signal.ndim)
-
-    def init(self, like: Signal) -> WindowSums:
-        lines = 3 * len(self.frequencies)
-        correlations = jnp.zeros((2, 2, lines, 2, *like.shape), like.dtype)
-        valid = jnp.zeros((2, *like.shape), like.dtype)
-        return WindowSums(correlations, valid, jnp.zeros((), jnp.int32))
-
-    def add(
-        self, sums: WindowSums, signals: Float[Array, " signals axes *ensemble"], counts: Signal
-    ) -> WindowSums:
-        """One more sample, `counts` 0 where its window is not to count."""
-        place = self._place(sums.index)
-        going = _over((place > 0).astype(signals.dtype), sums.correlations)
-        weights = self._weights(sums.index, place).astype(signals.dtype)
-        weights = weights.reshape(weights.shape + (1,) * signals.ndim)
-        correlations = going * sums.correlations + weights * signals[None, None, None]
-        valid = jnp.where(_over(place == 0, sums.valid), 1, sums.valid) * counts[None]
-        return WindowSums(correlations, valid, (sums.index + 1) % self.samples)
-
-    def ends(self, sums: WindowSums) -> Bool[Array, ""]:
-        """Whether the last sample ended one of the windows."""
-        return jnp.any(self._place(sums.index) == 0)
-
-    def ended(self, sums: WindowSums) -> tuple[Array, Array]:
-        """Its correlations [parts, tones, places, signals, ...] and whether it counts."""
-        first = sums.index == 0
-        chosen, valid = (jnp.where(first, x[0], x[1]) for x in (sums.correlations, sums.valid))
-        return chosen.reshape(2, len(self.frequencies), 3, *chosen.shape[2:]), valid
-
-    def _place(self, index):
-        """Of the sample within each window."""
-        return (index + jnp.array([0, self.samples // 2], jnp.int32)) % self.samples
-
-    def _weights(self, index, place):
-        """Hann windows times cosine and sine of every line: [windows, parts, lines]."""
-        lines = (self.periods[:, None] + np.array([-BESIDE, 0, BESIDE])).reshape(-1)
-        angle = 2 * jnp.pi * _cycles(lines, index, self.samples)
-        hann = jnp.sin(jnp.pi * _ratio(place, self.samples)) ** 2
-        return hann[:, None, None] * jnp.stack([jnp.cos(angle), jnp.sin(angle)])[None]
-
-
 def _cycles(periods, index, samples):
     """Phases in cycles, exact however long the flight."""
     return _ratio((jnp.asarray(periods, jnp.int32) * index) % samples, samples)
@@ -241,38 +149,92 @@ class LockInInertia(AbstractInertia):
                 f"One tone, {self.tones.frequencies} Hz, cannot separate stiffness from inertia: "
                 "give ProbeTones two frequencies, or leave the nuisance 'angle' out."
             )
-        self._windows()
+        samples = self.window / self.dt
+        if abs(samples - round(samples)) > 1e-6 * samples or not 100 <= samples <= 40000:
+            raise ValueError(
+                f"A window of {self.window} s holds {samples:g} samples of {self.dt} s: give it "
+                "a whole number of samples from 100 to 40000."
+            )
+        for frequency in self.tones.frequencies:
+            periods = frequency * self.window
+            if abs(periods - round(periods)) > 1e-6 * periods:
+                raise ValueError(
+                    f"A tone of {frequency} Hz has {periods:g} periods in a window of "
+                    f"{self.window} s: give a whole number, such as "
+                    f"{max(round(periods), 5) / self.window:g} Hz."
+                )
+            if not 5 <= round(periods) <= self.samples / 10:
+                raise ValueError(
+                    f"A tone of {frequency} Hz has {periods:g} periods in a window of "
+                    f"{self.window} s: give it from 5 to {self.samples // 10}."
+                )
+        spacing = np.diff(sorted(self.periods))
+        if np.any(spacing < 2 * BESIDE):
+            raise ValueError(
+                f"Tones of {self.tones.frequencies} Hz are closer than "
+                f"{2 * BESIDE / self.window:g} Hz, the resolution of a window of {self.window} s: "
+                "give a longer window."
+            )
 
-    def _windows(self) -> LockInWindows:
-        return LockInWindows(self.tones.frequencies, self.window, self.dt)
+    @property
+    def samples(self) -> int:
+        """Of a window."""
+        return round(self.window / self.dt)
+
+    @property
+    def periods(self) -> np.ndarray:
+        """Of each tone in a window."""
+        return np.array([round(f * self.window) for f in self.tones.frequencies])
 
     def init(self, like: Signal) -> LockInState:
         """Before the first sample; shaped as the measurement `like` and as the ensemble."""
         like = zero = jnp.zeros(signal_shape(like, self.ensemble), like.dtype)
-        sums = self._windows().init(like)
+        lines = 3 * len(self.tones.frequencies)
+        correlations = jnp.zeros((2, 2, lines, 2, *like.shape), like.dtype)
+        valid = jnp.zeros((2, *like.shape), like.dtype)
+        sums = WindowSums(correlations, valid, jnp.zeros((), jnp.int32))
         return LockInState(empty_past(like), sums, self._start(like), zero, zero + 1)
 
     def update(self, state: LockInState, command: Signal, measurement: Signal) -> LockInState:
         """Add the command held during the last sample and the angle at its end."""
         past, now = motion(state.past, self.torque_gain, command, measurement, self.dt)
-        windows = self._windows()
-        pair = now.valid * jnp.stack([now.acceleration, now.torque])
-        sums = windows.add(state.sums, pair, state.exciting)
+        pair, sums = now.valid * jnp.stack([now.acceleration, now.torque]), state.sums
+        place = self._place(sums.index)
+        going = _over((place > 0).astype(pair.dtype), sums.correlations)
+        # Hann windows times cosine and sine of every line: [windows, parts, lines].
+        lines = (self.periods[:, None] + np.array([-BESIDE, 0, BESIDE])).reshape(-1)
+        angle = 2 * jnp.pi * _cycles(lines, sums.index, self.samples)
+        hann = jnp.sin(jnp.pi * _ratio(place, self.samples)) ** 2
+        weights = hann[:, None, None] * jnp.stack([jnp.cos(angle), jnp.sin(angle)])[None]
+        weights = weights.astype(pair.dtype)
+        weights = weights.reshape(weights.shape + (1,) * pair.ndim)
+        correlations = going * sums.correlations + weights * pair[None, None, None]
+        valid = jnp.where(_over(place == 0, sums.valid), 1, sums.valid) * state.exciting[None]
+        sums = WindowSums(correlations, valid, (sums.index + 1) % self.samples)
         aged = state.last._replace(age=state.last.age + self.drift**2 * self.dt)
         last, stiffness = jax.lax.cond(
-            windows.ends(sums),
-            ft.partial(self._renew, windows),
+            jnp.any(self._place(sums.index) == 0),  # the last sample ended one of the windows
+            lambda *parts: self._renew(*parts),
             lambda sums, *unchanged: unchanged,
             sums, aged, state.stiffness,
         )  # fmt: skip
         exciting = self.tones.switch(state.exciting, self._assess(last))
         return LockInState(past, sums, last, stiffness, exciting)
 
-    def _renew(self, windows, sums, last, stiffness):
+    def _place(self, index):
+        """Of the sample within each window."""
+        return (index + jnp.array([0, self.samples // 2], jnp.int32)) % self.samples
+
+    def _renew(self, sums, last, stiffness):
         """The estimate of the window that has just ended, where it shows one."""
-        done, valid = windows.ended(sums)
+        first = sums.index == 0
+        done, valid = (jnp.where(first, x[0], x[1]) for x in (sums.correlations, sums.valid))
+        done = done.reshape(2, len(self.tones.frequencies), 3, *done.shape[2:])
+        # w^2 in (rad/s)^2, as the second difference of a sampled sine shows it.
+        square = (2 / self.dt * np.sin(np.pi * self.periods / self.samples)) ** 2
+        square = jnp.asarray(square, valid.dtype).reshape((-1,) + (1,) * valid.ndim)
         solved = solve(
-            done[:, :, :, 0], done[:, :, :, 1], windows.square(valid),
+            done[:, :, :, 0], done[:, :, :, 1], square,
             contrast=self.contrast, stiff=bool(self.nuisance),
         )  # fmt: skip
         new = LastEstimate(solved.inertia, solved.variance, jnp.zeros_like(valid), solved.informed)
@@ -285,5 +247,5 @@ class LockInInertia(AbstractInertia):
 
     def probe(self, state: LockInState) -> Signal:
         """The test signal to add to the next command."""
-        phase = self._windows().phase(state.sums.index).astype(state.exciting.dtype)
-        return self.tones.wave(phase, state.exciting)
+        phase = _cycles(self.periods, state.sums.index, self.samples)
+        return self.tones.wave(phase.astype(state.exciting.dtype), state.exciting)

@@ -50,30 +50,6 @@ def empty_sums(signals: int, like: Signal) -> Sums:
     return Sums(jnp.zeros((signals, signals, *like.shape), like.dtype), zero, zero)
 
 
-def _eliminate(products, terms, nuisance):
-    """What no nuisance term explains: of the acceleration the sum of squares and of products with
-    the torque, and at this sample acceleration and torque.
-
-    Gauss' elimination without pivoting, as the matrix is definite; entry by entry, which compiles
-    to one pass over the ensemble.
-    """
-    a, u = len(terms) - 2, len(terms) - 1
-    left = {(i, j): products[i, j] for i in range(len(terms)) for j in range(i, len(terms))}
-    now = list(terms)
-    pivots = [NUISANCES.index(name) for name in nuisance]
-    for n, k in enumerate(pivots):
-        row = {j: left[min(j, k), max(j, k)] for j in (*pivots[n + 1 :], a, u)}
-        solid = left[k, k] > 64 * jnp.finfo(terms.dtype).eps * products[k, k]
-        inverse = _inverse(left[k, k], solid)
-        ratio = {j: x * inverse for j, x in row.items()}
-        for i in row:
-            now[i] = now[i] - ratio[i] * now[k]
-        for i, j in left:
-            if i in row and j in row:
-                left[i, j] = left[i, j] - ratio[i] * row[j]
-    return left[a, a], left[a, u], now[a], now[u]
-
-
 def _inverse(x, safe):
     return jnp.where(safe, 1 / jnp.where(safe, x, 1), 0)
 
@@ -116,9 +92,24 @@ class AbstractRegression(AbstractInertia):
         variance of their sum weighs pairs of samples by (1 - dt / correlation)^|k - l|.
         """
         products = keep[None, None] * sums.products + terms[:, None] * terms[None]
-        square, product, acceleration, torque = _eliminate(products, terms, self.nuisance)
+        # Gauss' elimination of the nuisance terms, without pivoting, as the matrix is definite;
+        # entry by entry, which compiles to one pass over the ensemble.
+        a, u, eps = len(terms) - 2, len(terms) - 1, 64 * jnp.finfo(terms.dtype).eps
+        left = {(i, j): products[i, j] for i in range(len(terms)) for j in range(i, len(terms))}
+        now, pivots = list(terms), [NUISANCES.index(name) for name in self.nuisance]
+        for n, k in enumerate(pivots):
+            row = {j: left[min(j, k), max(j, k)] for j in (*pivots[n + 1 :], a, u)}
+            inverse = _inverse(left[k, k], left[k, k] > eps * products[k, k])
+            ratio = {j: x * inverse for j, x in row.items()}
+            for i in row:
+                now[i] = now[i] - ratio[i] * now[k]
+            for i, j in left:
+                if i in row and j in row:
+                    left[i, j] = left[i, j] - ratio[i] * row[j]
+        # What no nuisance term explains.
+        square, product, acceleration, torque = left[a, a], left[a, u], now[a], now[u]
         weight = products[0, 0]
-        floor = 64 * jnp.finfo(terms.dtype).eps * products[-2, -2]
+        floor = eps * products[-2, -2]
         informed = square > jnp.maximum(weight * self.excitation**2, floor)
         inverse = _inverse(square, informed)
         inertia = jnp.where(informed, product * inverse, last.inertia)

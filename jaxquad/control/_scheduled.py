@@ -254,9 +254,9 @@ def _log_gain(torque_gain: Gain, nominal: Gain, factor: Float[Array, ""]) -> Gai
     return jnp.log(factor * multiply_gains(torque_gain, 1 / nominal))
 
 
-class _ScheduledByMap(eqx.Module):
-    ladrc: eqx.AbstractVar[LADRC | LADRCLaw]
-    map: eqx.AbstractVar[InertiaToGain]
+class _ScheduledByMap:
+    ladrc: LADRC | LADRCLaw
+    map: InertiaToGain
 
     @property
     def dt(self) -> float:
@@ -298,7 +298,7 @@ class _ScheduledByMap(eqx.Module):
         return self.ladrc.observer_barrier(names)
 
 
-class ScheduledLADRC(_ScheduledByMap):
+class ScheduledLADRC(_ScheduledByMap, eqx.Module):
     """A `LADRC` whose b0 is `map(inertia)` of an inertia in kg m^2 that it is given.
 
     The `ladrc`'s own b0 has no effect. A loop flies and analyses `scheduled_at(inertia)`; exported
@@ -384,7 +384,7 @@ class AdaptiveLADRCState(NamedTuple):
     estimator: PyTree
 
 
-class AdaptiveLADRC(_ScheduledByMap):
+class AdaptiveLADRC(_ScheduledByMap, eqx.Module):
     """A `LADRC` of order 2 whose b0 follows the inertia that an estimator finds in flight.
 
     b0 starts as the `ladrc`'s. While the estimate is trusted, b0 moves towards `map(inertia)` by a

@@ -12,8 +12,17 @@ from jaxquad._core import require_all_positive, require_x64, whole_samples
 from jaxquad.excitation import check_lines, Excitation, harmonics
 from jaxquad.identify import Free, select_parameters
 
-from ._powers import certify_powers, Criterion, DOptimal, optimal_powers, Powers
-from ._prediction import check_distinct, Noise, Prediction, unit_information
+from ._information import (
+    certify_powers,
+    check_distinct,
+    Criterion,
+    DOptimal,
+    Noise,
+    optimal_powers,
+    Powers,
+    Prediction,
+    unit_information,
+)
 
 
 _NORMS = (4, 16, 64, 256)  # one the start of the next; the last is almost the peak

@@ -84,7 +84,8 @@ class Batch(NamedTuple):
 
 
 Active = Bool[Array, " members"]
-Evaluate = Callable[[Float[Array, "parameters members"], Active], Normal]
+Places = Float[Array, "parameters members"]
+Evaluate = Callable[[Places, Active], Normal]
 
 
 def normal_equations_of(batch: Batch, member: Member) -> Evaluate:
@@ -139,7 +140,7 @@ def _one_by_one(batch: Batch, member: Member) -> Evaluate:
         skip = lambda *_: jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
         return jax.lax.cond(active, normal, skip, z, member)
 
-    def evaluate(z: Float[Array, "parameters members"], active: Active) -> Normal:
+    def evaluate(z: Places, active: Active) -> Normal:
         normals = jax.lax.map(one, (active, z.T, members))
         return jax.tree.map(lambda x: jnp.moveaxis(x, 0, -1), normals)
 
@@ -186,8 +187,13 @@ def _columns(
     """
 
     def response(z):
-        model = behind_hold(_insert(batch.model, batch.parameters, z), batch.hold)
-        return evaluate_response(model, omega[None])[0]
+        # As `Parameters.insert`, but without a vector that would make each depend on all.
+        logs, scale = batch.parameters.logarithmic, batch.parameters.scale
+        values = [scale[k] * (jnp.exp(x) if logs[k] else x) for k, x in enumerate(z)]
+        model = _write(batch.model, batch.parameters.places, values)
+        for place, tie in batch.parameters.ties:
+            model = _write(model, (place,), [jnp.asarray(tie(model))])
+        return evaluate_response(behind_hold(model, batch.hold), omega[None])[0]
 
     here, columns = response(z), []
     for k in range(len(z)):
@@ -199,16 +205,6 @@ def _columns(
     size = jnp.real(ratio) ** 2 + jnp.imag(ratio) ** 2
     phase = jnp.arctan2(jnp.imag(ratio), jnp.real(ratio))
     return [*columns, (0.5 * jnp.log(size) * weights[..., 0], phase * weights[..., 1])]
-
-
-def _insert(model: PyTree, parameters: Parameters, z: list[Float[Array, ""]]) -> PyTree:
-    """As `Parameters.insert`, but without a vector that would make each depend on all."""
-    logs, scale = parameters.logarithmic, parameters.scale
-    values = [scale[k] * (jnp.exp(x) if logs[k] else x) for k, x in enumerate(z)]
-    model = _write(model, parameters.places, values)
-    for place, tie in parameters.ties:
-        model = _write(model, (place,), [jnp.asarray(tie(model))])
-    return model
 
 
 def _write(model: PyTree, places: tuple[Place, ...], values: list[Array]) -> PyTree:
@@ -292,20 +288,6 @@ def _pad(array: np.ndarray, axis: int = 0) -> np.ndarray:
 def _both_ways(model, omega):
     single = jax.vmap(lambda w: evaluate_response(model, w[None])[0])(omega)
     return evaluate_response(model, omega), single
-
-
-def _check_pointwise(where: Batch, shape: tuple[int, ...]) -> None:
-    together, single = (np.asarray(part) for part in _both_ways(where.model, where.omega))
-    if together.shape != (*where.omega.shape, *shape):
-        raise ValueError(
-            f"the model's response has shape {together.shape[1:]}, the measured ones {shape} "
-            "(outputs, inputs): pick channels with jq.records.select, or extend the model"
-        )
-    if not np.allclose(together, single, rtol=1e-9, atol=1e-12 * np.max(np.abs(together))):
-        raise ValueError(
-            "the model's response at one frequency depends on the other frequencies that are asked "
-            "for: a batch evaluates it frequency by frequency; fit the responses with jq.fit"
-        )
 
 
 def _places(batch: int, chunk: int) -> Int[np.ndarray, "chunks chunk"]:
@@ -494,7 +476,18 @@ def fit_batch(
     # Without a floor on the errors, they do not depend on the weights.
     mixings = mixings_of(points, list(weights)) if mixed else ()
     where = Batch(model, parameters, holds[0], _pad(omega))
-    _check_pointwise(where, measured.shape[2:])
+    together, single = (np.asarray(part) for part in _both_ways(model, where.omega))
+    if together.shape != (*where.omega.shape, *measured.shape[2:]):
+        raise ValueError(
+            f"the model's response has shape {together.shape[1:]}, the measured ones "
+            f"{measured.shape[2:]} (outputs, inputs): pick channels with jq.records.select, or "
+            "extend the model"
+        )
+    if not np.allclose(together, single, rtol=1e-9, atol=1e-12 * np.max(np.abs(together))):
+        raise ValueError(
+            "the model's response at one frequency depends on the other frequencies that are asked "
+            "for: a batch evaluates it frequency by frequency; fit the responses with jq.fit"
+        )
     start = parameters.start[: parameters.count]
     start = np.array(np.broadcast_to(start, (len(measured), parameters.count)))
     solution = _solve(where, _members(measured, weights, mixings), start, max_steps)

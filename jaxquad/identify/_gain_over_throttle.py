@@ -128,8 +128,9 @@ def gain_over_throttle(
         print(found, found.adrc_b0(hover=0.3), sep="\\n")
         ```
     """
-    records = [record] if isinstance(record, Record) else list(record)
-    _check(records, throttle_range, flown_curve, width, shortest)
+    records = _require_records(record)
+    if not -1 <= flown_curve <= 1:
+        raise ValueError(f"flown_curve is {flown_curve}: give -1 to 1; thrust_linear over 100")
     fastest = records[0].sample_rate
     high = 2 * np.pi * min(45.0, fastest / 8) if band is None else band[1]
     rate = min(fastest, _OVERSAMPLED * high / (2 * np.pi))
@@ -175,10 +176,14 @@ def throttle_levels(
 
     Arguments and errors are those; the result is a `jq.identify.ThrottleLevels`.
     """
-    records = [record] if isinstance(record, Record) else list(record)
-    _check(records, throttle_range, 0.0, width, shortest)
     options = (throttle, throttle_range, _SLOW_RATE, width, shortest)
-    return _extent(_find_levels(records, *options)[0])
+    return _extent(_find_levels(_require_records(record), *options)[0])
+
+
+def _require_records(record: Record | Sequence[Record]) -> list[Record]:
+    if not (records := [record] if isinstance(record, Record) else list(record)):
+        raise ValueError("gain_over_throttle needs a jq.Record or several, and got none")
+    return records
 
 
 def _extent(levels: Sequence[_Level]) -> ThrottleLevels:
@@ -189,56 +194,6 @@ def _extent(levels: Sequence[_Level]) -> ThrottleLevels:
         np.array([values.max() for values in throttle]),
         np.array([sum(segment.seconds for segment in level) for level in levels]),
     )
-
-
-def _check(
-    records: Sequence[Record],
-    span: tuple[float, float],
-    curve: float,
-    width: float,
-    shortest: float,
-) -> None:
-    """Raise ValueError for options that make no sense."""
-    if not records:
-        raise ValueError("gain_over_throttle needs a jq.Record or several, and got none")
-    if span[0] == span[1]:
-        raise ValueError(f"throttle_range is {span}: give the values at no and at full throttle")
-    if not -1 <= curve <= 1:
-        raise ValueError(f"flown_curve is {curve}: give -1 to 1; thrust_linear over 100")
-    if not (0 < width <= 0.5 and shortest > 0):
-        raise ValueError(
-            f"width is {width} and shortest {shortest} s: give a part of full throttle up to 0.5, "
-            "and a time above 0"
-        )
-
-
-def _on_one_clock(
-    record: Record, throttle: str, span: tuple[float, float], rate: float
-) -> tuple[Record, Float[np.ndarray, " samples"]]:
-    """Command, rate and reference without the throttle at a lower sample rate, and the throttle."""
-    level = (record.channel(throttle) - span[0]) / (span[1] - span[0])
-    if not (-0.05 <= level.min() and level.max() <= 1.05):
-        raise ValueError(
-            f"the throttle {throttle!r} runs from {level.min():.4g} to {level.max():.4g}: give "
-            "throttle_range=, its values at no and at full throttle, such as (0.0, 1000.0)"
-        )
-    without = lambda names: tuple(name for name in names if name != throttle)
-    sides = [without(names) for names in (record.input_names, record.output_names)]
-    references = without(record.reference_names)
-    if len(sides[0]) != 1 or len(sides[1]) != 1 or len(references) > 1:
-        raise ValueError(
-            f"gain_over_throttle needs one input, one output and at most one reference beside "
-            f"{throttle!r}, but the record has {sides[0]}, {sides[1]} and {references}: choose "
-            "channels with jq.records.select"
-        )
-    axis = select(record, inputs=sides[0], outputs=sides[1], references=references)
-    axis = _with_columns(axis, axis.time, _columns(axis), record.hold)
-    if record.sample_rate <= 1.2 * rate:
-        return axis, level
-    columns = [*_columns(axis).T, level]
-    channels = [Channel(str(k), axis.time, column) for k, column in enumerate(columns)]
-    time, values = resample(channels, rate)
-    return _with_columns(axis, time, values[:, :-1], record.hold), values[:, -1]
 
 
 def _columns(record: Record) -> Float[np.ndarray, "samples channels"]:
@@ -268,20 +223,47 @@ def _with_columns(
 
 
 def _find_levels(
-    records: Sequence[Record],
-    throttle: str,
-    span: tuple[float, float],
-    rate: float,
-    width: float,
+    records: Sequence[Record], throttle: str, span: tuple[float, float], rate: float, width: float,
     shortest: float,
-) -> tuple[list[_Level], tuple[str, ...]]:
+) -> tuple[list[_Level], tuple[str, ...]]:  # fmt: skip
     """Segments of nearly the same mean together, in the order of throttle; and what is left out.
 
-    A segment lasts at least `shortest` s, and the throttle moves by at most `width` within it.
+    A segment lasts at least `shortest` s, and the throttle moves by at most `width` within it. Its
+    record has command, rate and reference without the throttle, at no more than `rate`.
     """
+    if span[0] == span[1]:
+        raise ValueError(f"throttle_range is {span}: give the values at no and at full throttle")
+    if not (0 < width <= 0.5 and shortest > 0):
+        raise ValueError(
+            f"width is {width} and shortest {shortest} s: give a part of full throttle up to 0.5, "
+            "and a time above 0"
+        )
     segments: list[_Segment] = []
     for record in records:
-        axis, values = _on_one_clock(record, throttle, span, rate)
+        values = (record.channel(throttle) - span[0]) / (span[1] - span[0])
+        if not (-0.05 <= values.min() and values.max() <= 1.05):
+            raise ValueError(
+                f"the throttle {throttle!r} runs from {values.min():.4g} to {values.max():.4g}: "
+                "give throttle_range=, its values at no and at full throttle, such as (0.0, 1000.0)"
+            )
+        names = (record.input_names, record.output_names, record.reference_names)
+        sides = [tuple(name for name in side if name != throttle) for side in names]
+        if len(sides[0]) != 1 or len(sides[1]) != 1 or len(sides[2]) > 1:
+            raise ValueError(
+                f"gain_over_throttle needs one input, one output and at most one reference beside "
+                f"{throttle!r}, but the record has {sides[0]}, {sides[1]} and {sides[2]}: choose "
+                "channels with jq.records.select"
+            )
+        axis = select(record, inputs=sides[0], outputs=sides[1], references=sides[2])
+        axis = _with_columns(axis, axis.time, _columns(axis), record.hold)
+        if record.sample_rate > 1.2 * rate:
+            columns = [*_columns(axis).T, values]
+            channels = [Channel(str(k), axis.time, column) for k, column in enumerate(columns)]
+            time, resampled = resample(channels, rate)
+            axis, values = (
+                _with_columns(axis, time, resampled[:, :-1], record.hold),
+                resampled[:, -1],
+            )
         first, low, high = 0, values[0], values[0]
         for k, value in enumerate(values):
             low, high = min(low, value), max(high, value)

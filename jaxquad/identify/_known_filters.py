@@ -187,7 +187,24 @@ def measured_chain(
         )
     omega, weight = 2 * np.pi * hertz, 1 / error**2
     left = ratio / filter_response(filters, omega)
-    delay, lag = _fit_correction(omega, np.log(np.abs(left)), np.angle(left), weight)
+    level, phase = np.log(np.abs(left)), np.angle(left)
+
+    # Delay by linear least squares for each lag, and the lag on a grid that is refined once. The
+    # lag is 0 where none shows.
+    def delay_for(lag: float) -> float:
+        late = phase + np.arctan(omega * lag)
+        return -float(np.sum(weight * omega * late) / np.sum(weight * omega**2))
+
+    def cost(lag: float) -> float:
+        rest = phase + np.arctan(omega * lag) + omega * delay_for(lag)
+        return float(np.sum(weight * (rest**2 + (level + np.log1p((omega * lag) ** 2) / 2) ** 2)))
+
+    trials = np.linspace(0.0, _LONGEST, _FINEST)
+    best = trials[int(np.argmin([cost(lag) for lag in trials]))]
+    near = np.linspace(max(best - trials[1], 0.0), best + trials[1], 201)
+    best = near[int(np.argmin([cost(lag) for lag in near]))]
+    lag = float(best) if cost(0.0) - cost(best) > _SIGNIFICANT else 0.0
+    delay = delay_for(lag)
     rest = left / _correction(omega, delay, lag) - 1
     misfit = float(np.sqrt(np.sum(weight * np.abs(rest) ** 2) / (2 * omega.size - 2)))
     slopes = _slopes(omega, lag)
@@ -251,27 +268,3 @@ def _phase_delay(filters: tuple[KnownFilter, ...], omega: Frequencies) -> Freque
     """In s, of the phase of filters one by one: that of each stays within half a turn."""
     phases = (np.angle(filter_response([one], omega)) for one in filters)
     return -sum(phases, np.zeros(omega.size)) / omega
-
-
-def _fit_correction(
-    omega: Frequencies, level: Frequencies, phase: Frequencies, weight: Frequencies
-) -> tuple[float, float]:
-    """Delay by linear least squares for each lag, and the lag on a grid that is refined once.
-
-    The lag is 0 where none shows.
-    """
-
-    def delay_for(lag: float) -> float:
-        late = phase + np.arctan(omega * lag)
-        return -float(np.sum(weight * omega * late) / np.sum(weight * omega**2))
-
-    def cost(lag: float) -> float:
-        rest = phase + np.arctan(omega * lag) + omega * delay_for(lag)
-        return float(np.sum(weight * (rest**2 + (level + np.log1p((omega * lag) ** 2) / 2) ** 2)))
-
-    trials = np.linspace(0.0, _LONGEST, _FINEST)
-    best = trials[int(np.argmin([cost(lag) for lag in trials]))]
-    near = np.linspace(max(best - trials[1], 0.0), best + trials[1], 201)
-    best = near[int(np.argmin([cost(lag) for lag in near]))]
-    lag = float(best) if cost(0.0) - cost(best) > _SIGNIFICANT else 0.0
-    return delay_for(lag), lag

@@ -26,6 +26,7 @@ from ._response import arctan2, sincos
 Vector = Float[Array, " 3 *ensemble"]  # of each member of an ensemble
 PerAxis = Float[Array, "3 ..."]  # or `[3, *ensemble]`
 Axes = Float[Array, "axes ..."]
+AxisValues = Float[Array, " axes *ensemble"]
 Four = Float[Array, " 4 *ensemble"]  # of a quaternion, or of four motors
 
 
@@ -121,9 +122,7 @@ def rotation_matrix(quaternion: Four) -> Float[Array, " 3 3 *ensemble"]:
 _CREEP = 0.01  # rad/s, at which the torque reaches 76 % of its level
 
 
-def _friction(
-    coulomb: Float[Array, "..."], rate: Float[Array, " axes *ensemble"]
-) -> Float[Array, " axes *ensemble"]:
+def _friction(coulomb: Float[Array, "..."], rate: AxisValues) -> AxisValues:
     """Dry-friction torque in N m at `rate` in rad/s, smoothed so that it has a gradient."""
     return -align(coulomb, rate) * jnp.tanh(rate / _CREEP)
 
@@ -215,9 +214,9 @@ class LinearAxis(eqx.Module):
 class AxesState(eqx.Module):
     """The state of `DecoupledAxes`, or its time derivative."""
 
-    angle: Float[Array, " axes *ensemble"]  # rad
-    rate: Float[Array, " axes *ensemble"]  # rad/s
-    motor: Float[Array, " axes *ensemble"] | None  # effective command; None without a lag
+    angle: AxisValues  # rad
+    rate: AxisValues  # rad/s
+    motor: AxisValues | None  # effective command; None without a lag
 
 
 class DecoupledAxes(eqx.Module):
@@ -278,7 +277,7 @@ class DecoupledAxes(eqx.Module):
             ) from None
 
     @property
-    def gain(self) -> Float[Array, " axes *ensemble"]:
+    def gain(self) -> AxisValues:
         """b, the acceleration that a unit of command causes: rad/s^2 per unit."""
         return _align_to(self.torque_gain, self.inertia) / _align_to(self.inertia, self.torque_gain)
 
@@ -298,10 +297,7 @@ class DecoupledAxes(eqx.Module):
         return AxesState(angle, still, None if self.lag is None else still)
 
     def derivative(
-        self,
-        state: AxesState,
-        inputs: Float[Array, " axes *ensemble"],
-        disturbance: Float[Array, " axes *ensemble"],
+        self, state: AxesState, inputs: AxisValues, disturbance: AxisValues
     ) -> AxesState:
         """Time derivative of `state` under the command `inputs` and a `disturbance` in N m."""
         angle, rate = state.angle, state.rate
@@ -313,7 +309,7 @@ class DecoupledAxes(eqx.Module):
         lagging = None if self.lag is None else (inputs - motor) / align(self.lag, rate)
         return AxesState(rate, torque / align(self.inertia, rate), lagging)
 
-    def measure(self, state: AxesState) -> Float[Array, " axes *ensemble"]:
+    def measure(self, state: AxesState) -> AxisValues:
         """The angles in rad."""
         return state.angle
 

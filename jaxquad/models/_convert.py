@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 
 from jaxquad._core import is_concrete
 
-from ._state_space import dot, explicit, StateSpace
+from ._state_space import dot, explicit, Realisation, StateSpace
 from ._transfer_function import (
     coefficients_of,
     Convertible,
@@ -23,14 +23,7 @@ from ._transfer_function import (
 
 
 @eqx.filter_jit  # one compilation instead of one for each small operation
-def realise(
-    model: TransferFunction,
-) -> tuple[
-    Float[Array, "states states"],
-    Float[Array, "states 1"],
-    Float[Array, "1 states"],
-    Float[Array, "1 1"],
-]:
+def realise(model: TransferFunction) -> Realisation:
     """A, B, C, D of dx/dt = A x + B u, y = C x + D u: the model without its delay.
 
     The controllable canonical form, in a time measured in units of the fastest pole: written in
@@ -133,16 +126,12 @@ class HasMatrices(Protocol):
 
     @property
     def A(self) -> np.ndarray: ...
-
     @property
     def B(self) -> np.ndarray: ...
-
     @property
     def C(self) -> np.ndarray: ...
-
     @property
     def D(self) -> np.ndarray: ...
-
     @property
     def dt(self) -> float | int | bool | None: ...  # s; None or 0 where it is continuous
 

@@ -31,6 +31,9 @@ from ._attitude import (
 )
 
 
+Motors = Float[Array, " motors *ensemble"]
+
+
 class _Frame(NamedTuple):
     signs: np.ndarray  # of roll, pitch and yaw torque (rows) under more of each motor's input
     lever: float  # of a rotor about the roll and pitch axes, in arms
@@ -161,18 +164,11 @@ class MotorLag(eqx.Module):
         remedy = "to model a motor without lag, leave the lag out (motor=None, lag=None)"
         require_positive("time_constant", self.time_constant, remedy)
 
-    def derivative(
-        self, state: Float[Array, " motors *ensemble"], command: Float[Array, " motors *ensemble"]
-    ) -> Float[Array, " motors *ensemble"]:
+    def derivative(self, state: Motors, command: Motors) -> Motors:
         """Rate of change of the effective input, in units of `command` per s."""
         return (command - state) / align(self.time_constant[None], state)
 
-    def step(
-        self,
-        state: Float[Array, " motors *ensemble"],
-        command: Float[Array, " motors *ensemble"],
-        dt: float | Float[Array, ""],
-    ) -> Float[Array, " motors *ensemble"]:
+    def step(self, state: Motors, command: Motors, dt: float | Float[Array, ""]) -> Motors:
         """The effective input after `dt` seconds of a held `command`, exactly."""
         return command + (state - command) * jnp.exp(-dt / align(self.time_constant[None], state))
 

@@ -15,6 +15,9 @@ from jaxquad._compile import no_fuse
 
 
 Numbers = Array | np.ndarray  # constants of a traced function are NumPy's
+Angles = Float[Numbers, "*shape"]
+Omega = Float[Array, " frequencies"]  # rad/s
+ByState = Float[Array, "states frequencies"]
 
 # sin x = x + x^3 (c0 + c1 x^2 + ...) on -pi/2 to pi/2, minimax in the relative error: 3e-19, and
 # 6e-9 in single precision. pi as a sum of terms of so few bits that whole multiples are exact.
@@ -42,9 +45,7 @@ _PER_PI = 0.3183098861837907
 
 
 @jax.custom_jvp
-def sincos(
-    x: Float[Numbers, "*shape"],
-) -> tuple[Float[Numbers, "*shape"], Float[Numbers, "*shape"]]:
+def sincos(x: Angles) -> tuple[Angles, Angles]:
     """Sine and cosine of angles in rad, by short polynomials that a CPU computes 8 at a time.
 
     For loops of many small steps, where the library functions cost several times as much. Within
@@ -64,7 +65,7 @@ def _sincos_jvp(primals, tangents):
     return (sine, cosine), (cosine * dx, -sine * dx)
 
 
-def _near(x: Float[Numbers, "*shape"], turns: Float[Numbers, "*shape"]) -> Float[Numbers, "*shape"]:
+def _near(x: Angles, turns: Angles) -> Angles:
     """The sine of x - turns pi, which is a quarter turn at most."""
     single = x.dtype == jnp.float32
     terms, coefficients = (_PI_SINGLE, _SINGLE) if single else (_PI_DOUBLE, _DOUBLE)
@@ -77,7 +78,7 @@ def _near(x: Float[Numbers, "*shape"], turns: Float[Numbers, "*shape"]) -> Float
     return x + x * series
 
 
-def _sign(turns: Float[Numbers, "*shape"]) -> Float[Numbers, "*shape"]:
+def _sign(turns: Angles) -> Angles:
     """1 for even numbers, -1 for odd ones."""
     half = 0.5 * turns
     return 1 - 4 * (half - jnp.floor(half))
@@ -103,7 +104,7 @@ _BELOW = (
 _EIGHTH = 0.4142135623730951  # tan(pi / 8)
 
 
-def arctan2(y: Float[Numbers, "*shape"], x: Float[Numbers, "*shape"]) -> Float[Numbers, "*shape"]:
+def arctan2(y: Angles, x: Angles) -> Angles:
     """The angle of (x, y) in rad, within 4e-16 of `jnp.arctan2` in double precision.
 
     0 at the origin and nan where both are infinite; the sign of a zero does not count.
@@ -123,7 +124,7 @@ def arctan2(y: Float[Numbers, "*shape"], x: Float[Numbers, "*shape"]) -> Float[N
     return jnp.where(y < 0, -angle, angle)
 
 
-def _polynomial(coefficients: tuple[float, ...], x: Float[Numbers, "*s"]) -> Float[Numbers, "*s"]:
+def _polynomial(coefficients: tuple[float, ...], x: Angles) -> Angles:
     value = jnp.full_like(x, coefficients[0])
     for coefficient in coefficients[1:]:
         value = value * x + coefficient
@@ -137,7 +138,7 @@ class Split(NamedTuple):
     imag: Float[Array, "rows columns frequencies"]
 
 
-Scales = tuple[Float[Array, "states frequencies"], Float[Array, "states frequencies"]]
+Scales = tuple[ByState, ByState]
 
 
 def _product(a: Split, b: Split) -> Split:
@@ -171,9 +172,7 @@ def _inverse_jvp(primals, tangents):
     return result, Split(-change.real, -change.imag)
 
 
-def equilibrium(
-    size: Float[Array, "states states frequencies"],
-) -> tuple[Float[Array, "states frequencies"], Float[Array, "states frequencies"]]:
+def equilibrium(size: Float[Array, "states states frequencies"]) -> tuple[ByState, ByState]:
     # Ruiz: divide rows and columns by the square root of their largest element, several times.
     log = jnp.log2(size)
     rows = columns = jnp.zeros_like(size[0])
@@ -253,7 +252,7 @@ class Matrices(NamedTuple):
 
 
 @jax.custom_jvp
-def response(matrices: Matrices, omega: Float[Array, " frequencies"]) -> Split:
+def response(matrices: Matrices, omega: Omega) -> Split:
     """(H0 + s H1) (s M - F)^-1 G exp(-s late); rows are outputs and columns inputs.
 
     Infinite, with an undefined phase, where a pole lies so near that more than a hundredth of the
@@ -271,7 +270,7 @@ class Solved(NamedTuple):
     scales: Scales
 
 
-def _solve_states(matrices: Matrices, omega: Float[Array, " frequencies"]) -> Solved:
+def _solve_states(matrices: Matrices, omega: Omega) -> Solved:
     """The response without a look at its rounding error."""
     # Scales from the geometric mean of the frequencies: units know no frequency.
     middle = jnp.exp(jnp.mean(jnp.log(jnp.where(omega > 0, omega, 1.0))))[None]
@@ -287,9 +286,7 @@ def _solve_states(matrices: Matrices, omega: Float[Array, " frequencies"]) -> So
     return Solved(value, resolvent, states, scales)
 
 
-def _mark_rounding(
-    matrices: Matrices, omega: Float[Array, " frequencies"], solved: Solved
-) -> Split:
+def _mark_rounding(matrices: Matrices, omega: Omega, solved: Solved) -> Split:
     lost = _is_rounding(*jax.lax.stop_gradient((matrices, omega, solved)))
     real, imag = solved.value
     return Split(jnp.where(lost, jnp.inf, real), jnp.where(lost, jnp.nan, imag))
@@ -327,7 +324,7 @@ def _response_jvp(primals, tangents):
     return value, _add(Split(*(jnp.zeros_like(part) for part in value)), *moved)
 
 
-def _apply_delay(parts: Split, late: Array | None, omega: Float[Array, " frequencies"]) -> Split:
+def _apply_delay(parts: Split, late: Array | None, omega: Omega) -> Split:
     if late is None:
         return parts
     angle = late[:, :, None] * omega[None, None]
@@ -335,21 +332,21 @@ def _apply_delay(parts: Split, late: Array | None, omega: Float[Array, " frequen
     return Split(real * c + imag * s, imag * c - real * s)
 
 
-def _pencil(matrices: Matrices, omega: Float[Array, " frequencies"]) -> Split:
+def _pencil(matrices: Matrices, omega: Omega) -> Split:
     F, M = matrices.F, matrices.M
     M = jnp.eye(len(F), dtype=F.dtype) if M is None else M
     shape = (*F.shape, omega.size)
     return Split(jnp.broadcast_to(-F[:, :, None], shape), M[:, :, None] * omega[None, None])
 
 
-def _output_of(matrices: Matrices, omega: Float[Array, " frequencies"], states: Split) -> Split:
+def _output_of(matrices: Matrices, omega: Omega, states: Split) -> Split:
     """(H0 + s H1) times `states`, or times the resolvent."""
     rates = _multiply(matrices.H1, _derivative(states, omega))
     return _add(_multiply_real(matrices.H0, states), rates)
 
 
 def _is_rounding(
-    matrices: Matrices, omega: Float[Array, " frequencies"], solved: Solved
+    matrices: Matrices, omega: Omega, solved: Solved
 ) -> Bool[Array, "outputs inputs frequencies"]:
     # A first-order bound of the rounding error in the states, beside the largest state in the
     # units that make the equations alike; and what only a pivot of zero can make so large.
@@ -368,7 +365,7 @@ def _is_rounding(
     return ft.reduce(jnp.logical_or, by_state)
 
 
-def _derivative(states: Split, omega: Float[Array, " frequencies"]) -> Split:
+def _derivative(states: Split, omega: Omega) -> Split:
     factor = omega[None, None]
     return Split(-factor * states.imag, factor * states.real)
 

@@ -17,6 +17,7 @@ from ._transfer_function import TransferFunction
 
 
 Number = float | Float[Array, ""]
+Square = Float[Array, "states states"]
 
 _TERMS = 18  # of the series at a norm of 1: 1 / 19! is below the last bit
 _SQUARINGS = 30
@@ -37,9 +38,7 @@ def _small_dot(a: Array, b: Array) -> Array:
     return jnp.sum(a[:, :, None] * b[None], axis=1)
 
 
-def matrix_exponential(
-    matrix: Float[Array, "n n"], dot: Callable[[Array, Array], Array] = dot
-) -> Float[Array, "n n"]:
+def matrix_exponential(matrix: Square, dot: Callable[[Array, Array], Array] = dot) -> Square:
     """e to the `matrix`, by its series with scaling and squaring, and by products of `dot`.
 
     It compiles in a fraction of the time of `jax.scipy.linalg.expm`, and without LAPACK under vmap.
@@ -59,8 +58,8 @@ def matrix_exponential(
 
 @ft.partial(jax.custom_jvp, nondiff_argnums=(2,))
 def _squared(
-    power: Float[Array, "n n"], times: Float[Array, ""], dot: Callable[[Array, Array], Array]
-) -> Float[Array, "n n"]:
+    power: Square, times: Float[Array, ""], dot: Callable[[Array, Array], Array]
+) -> Square:
     """`power` squared so many times: of most matrices hardly one, of an ensemble's as the most."""
     more = lambda state: state[1] < times
     square = lambda state: (dot(state[0], state[0]), state[1] + 1)
@@ -94,12 +93,12 @@ def split_delay(
 
 
 def _propagation(
-    A: Float[Array, "states states"],
+    A: Square,
     B: Float[Array, "states inputs"],
     late: Float[Array, " inputs"],
     span: Float[Array, ""],
     dt: Number,
-) -> tuple[Float[Array, "states states"], Float[Array, "segments states"]]:
+) -> tuple[Square, Float[Array, "segments states"]]:
     """What the first `span` samples of a sample `dt` s long make of the state and of the inputs.
 
     Each input goes over from one straight segment to the next after `late` samples. The second
@@ -152,29 +151,7 @@ def _shift_samples(
     return jnp.where(index[:, None] >= 0, x[jnp.maximum(index, 0)], 0)
 
 
-def _recursion(
-    A: Float[Array, "states states"], drive: Float[Array, "samples states"]
-) -> Float[Array, "samples states"]:
-    """x[k] of x[k+1] = A x[k] + drive[k], from x[0] = 0."""
-    samples, states = drive.shape
-    length = _chunk(samples)
-    chunks = -(-samples // length)
-    padded = jnp.pad(drive, ((0, chunks * length - samples), (0, 0)))
-    by_place = jnp.swapaxes(padded.reshape(chunks, length, states), 0, 1)
-
-    def sample(x, w):
-        return dot(x, A.T) + w, x
-
-    ends, within = jax.lax.scan(sample, jnp.zeros((chunks, states), drive.dtype), by_place)
-    steps, over = _powers(A, length)
-    starts = jax.lax.scan(lambda x, w: (dot(over, x) + w, x), jnp.zeros_like(ends[0]), ends)[1]
-    carried = jnp.einsum("lij,cj->lci", steps, starts, precision="highest")
-    return jnp.swapaxes(within + carried, 0, 1).reshape(chunks * length, states)[:samples]
-
-
-def _powers(
-    A: Float[Array, "states states"], count: int
-) -> tuple[Float[Array, "count states states"], Float[Array, "states states"]]:
+def _powers(A: Square, count: int) -> tuple[Float[Array, "count states states"], Square]:
     """A^0 to A^(count - 1), and A^count."""
     one = jnp.eye(len(A), dtype=A.dtype)
     last, below = jax.lax.scan(lambda P, _: (dot(A, P), P), one, length=count)
@@ -306,7 +283,7 @@ def sample_rational(model: TransferFunction, dt: Number, hold: str) -> SampledRa
 
 
 class _Plant(NamedTuple):
-    A: Float[Array, "states states"]
+    A: Square
     B: Float[Array, "states inputs"]
     C: Float[Array, "outputs states"]
     D: Float[Array, "outputs inputs"] | None
@@ -333,7 +310,19 @@ def _simulate(
     acting = jnp.swapaxes(jnp.concatenate(parts, axis=2), 0, 1)
     acting = acting.reshape(segments.shape[1], 4 * len(segments))
     step, drive = _propagation(plant.A, plant.B, late, jnp.ones((), late.dtype), dt)
-    states = _recursion(step, dot(acting, drive))
+    # x[k] of x[k+1] = step x[k] + pushed[k], from x[0] = 0, by chunks.
+    pushed = dot(acting, drive)
+    samples, count = pushed.shape
+    length = _chunk(samples)
+    chunks = -(-samples // length)
+    padded = jnp.pad(pushed, ((0, chunks * length - samples), (0, 0)))
+    by_place = jnp.swapaxes(padded.reshape(chunks, length, count), 0, 1)
+    advance = lambda x, w: (dot(x, step.T) + w, x)
+    ends, within = jax.lax.scan(advance, jnp.zeros((chunks, count), pushed.dtype), by_place)
+    steps, over = _powers(step, length)
+    starts = jax.lax.scan(lambda x, w: (dot(over, x) + w, x), jnp.zeros_like(ends[0]), ends)[1]
+    carried = jnp.einsum("lij,cj->lci", steps, starts, precision="highest")
+    states = jnp.swapaxes(within + carried, 0, 1).reshape(chunks * length, count)[:samples]
 
     def late_output(row, delay):
         # An output that is late shows the state somewhere within an earlier sample.
@@ -375,7 +364,7 @@ def _free_outputs(
     return motion[:, :, :states], motion[:, :, states:]
 
 
-def _with_bias(A: Float[Array, "states states"]) -> Float[Array, "both both"]:
+def _with_bias(A: Square) -> Float[Array, "both both"]:
     """Of x' = A x + bias, for state and bias."""
     both = jnp.concatenate([A, jnp.eye(len(A), dtype=A.dtype)], axis=1)
     return jnp.concatenate([both, jnp.zeros_like(both)])

@@ -19,6 +19,14 @@ from ._response import Matrices, response
 from ._transfer_function import as_frequencies, Convertible, Frequencies
 
 
+Realisation = tuple[
+    Float[Array, "states states"],
+    Float[Array, "states inputs"],
+    Float[Array, "outputs states"],
+    Float[Array, "outputs inputs"],
+]
+
+
 class StateSpace(Convertible):
     """M x' = F x + G u(t - input_delay), y(t + output_delay) = H0 x + H1 x': CIFER's DERIVID form.
 
@@ -174,14 +182,7 @@ class StateSpace(Convertible):
         return rows[:, None] + columns[None]
 
 
-def explicit(
-    model: StateSpace,
-) -> tuple[
-    Float[Array, "states states"],
-    Float[Array, "states inputs"],
-    Float[Array, "outputs states"],
-    Float[Array, "outputs inputs"],
-]:
+def explicit(model: StateSpace) -> Realisation:
     """A, B, C, D of x' = A x + B u, y = C x + D u: the model without M, H1 and its delays."""
     A, B, C = model.F, model.G, model.H0
     if model.M is not None:

@@ -15,7 +15,7 @@ from jaxquad.spectra import FrequencyResponse
 from ..uncertainty._assess import assess, DOUBT, unfitted
 from ..uncertainty._error_budget import weighting_at
 from ..uncertainty._verdict import without_numbers
-from ..uncertainty._zero_bounds import settle_at_bounds, solve_within_bounds
+from ..uncertainty._zero_bounds import solve_within_bounds
 from ._cost import (
     Band,
     Cost,
@@ -30,7 +30,7 @@ from ._cost import (
     Weights,
     widen_band,
 )
-from ._parameters import Condition, Free, select_parameters, Tie
+from ._parameters import Condition, Free, Numbers, select_parameters, Tie
 from ._problem import (
     make_problem,
     Prior,
@@ -209,7 +209,7 @@ def _fit(model: PyTree, frfs: Sequence[FrequencyResponse], options: Options, rou
         """Only a likelihood knows what it would mean that points share noise."""
         return problem.weighted(weights, mixings_of(points, weights) if is_likelihood else None)
 
-    def are_close(old: Sequence[Weights], new: Sequence[Weights], share: float) -> bool:
+    def are_close(old: Sequence[Numbers], new: Sequence[Weights], share: float) -> bool:
         both = zip(map(np.asarray, old), new, strict=True)
         return all(np.all(np.abs(one - other) <= share * np.abs(other)) for one, other in both)
 
@@ -223,7 +223,7 @@ def _fit(model: PyTree, frfs: Sequence[FrequencyResponse], options: Options, rou
         fastest = max(float(one.frf.omega[-1]) for one in points)
         starts = spread_starts(parameters, options.starts, fastest=fastest)
         solution, minima = solve_from_many(problem, starts, solver, max_steps)
-        solution = settle_at_bounds(problem, solution, solver, max_steps)
+        solution = solve_within_bounds(problem, solution, solver, max_steps)
     again = weigh(points, solution)
     if not are_close(weights, again, 1e-4):
         problem = weighted(points, again)

@@ -2,7 +2,7 @@
 
 import functools as ft
 from collections.abc import Callable, Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -48,6 +48,11 @@ class Place(NamedTuple):
     leaf: int
     index: int
     path: str  # `F[1][1]`, which is the name too unless the model gives it one
+
+    def number(self, model: PyTree) -> Any:
+        """The number that is there in a model, of JAX or of NumPy as its array."""
+        leaves = [leaf for leaf in jax.tree.leaves(model) if eqx.is_inexact_array(leaf)]
+        return leaves[self.leaf].reshape(-1)[self.index]
 
 
 Tie = Callable[[PyTree], Float[Array, ""]]
@@ -133,16 +138,6 @@ def with_values(model: PyTree, places: Sequence[Place], values: Float[Numbers, "
     return jax.tree.unflatten(structure, all_leaves)
 
 
-def number_at(place: Place) -> Callable[[PyTree], Float[Array, ""]]:
-    """The function that picks this number of a model."""
-
-    def pick(model: PyTree) -> Float[Array, ""]:
-        leaves = [leaf for leaf in jax.tree.leaves(model) if eqx.is_inexact_array(leaf)]
-        return jnp.asarray(leaves[place.leaf]).reshape(-1)[place.index]
-
-    return pick
-
-
 def name_places(model: PyTree) -> list[Place]:
     """Every floating-point number of a model: `lag`, `numerator[0]`, `axis.inertia[2]`."""
     leaves, structure = jax.tree.flatten(model)
@@ -201,20 +196,40 @@ def select_parameters(
     """
     places = name_places(model)
     values, by_name = _numbers(model, places), _by_name(places)
+    ties = tuple((find_place(model, name, "to tie"), tie) for name, tie in (tied or {}).items())
     for name, tie in (tied or {}).items():
-        if name not in by_name:
-            raise ValueError(
-                f"no parameter {name!r} to tie; the model has: {', '.join(p.name for p in places)}"
-            )
         if not callable(tie):
             raise ValueError(
                 f"{name} is tied to {tie!r}: give a function of the model, "
                 "lambda m: -m.F[0, 1]; a plain number belongs in the model"
             )
-    ties = tuple((by_name[name], tie) for name, tie in (tied or {}).items())
     bound = {place.name for place, _ in ties}
-    chosen = [_scaled(item, by_name, values) for item in _expand(model, places, free, bound)]
-    names = [place.name for place, _, _ in chosen]
+    chosen, scales, logs = [], [], []
+    for item in _expand(model, places, free, bound):
+        name = item if isinstance(item, str) else item.name
+        if name not in by_name:
+            raise ValueError(f"no parameter {name!r} in the model; it has: {', '.join(values)}")
+        place = by_name[name]
+        name, value = place.name, values[place.name]
+        if not np.isfinite(value):
+            raise ValueError(f"parameter {name} starts at {value}: give a finite starting value")
+        scale = float(np.sign(value))
+        if isinstance(item, Real):
+            scale = item.scale or abs(value)
+            if not scale > 0:
+                raise ValueError(
+                    f"{name} starts at 0: give its typical size, "
+                    f"jq.identify.Real({name!r}, scale=...)"
+                )
+        elif value == 0:
+            raise ValueError(
+                f"{name} starts at 0, so its sign is unknown: give a starting value, or let it "
+                f"cross zero with jq.identify.Real({name!r}, scale=...)"
+            )
+        chosen.append(place)
+        scales.append(scale)
+        logs.append(not isinstance(item, Real))
+    names = [place.name for place in chosen]
     if len(set(names)) != len(names) or not names:
         raise ValueError(f"free={names}: name each free parameter once, and at least one")
     both = bound.intersection(names)
@@ -224,10 +239,9 @@ def select_parameters(
         )
     taken = bound.union(names)
     fixed = [place for place in places if place.name not in taken and values[place.name] != 0]
-    logs = tuple(log for _, log, _ in chosen) + (True,) * len(fixed)
-    scales = [scale for _, _, scale in chosen] + [np.sign(values[p.name]) for p in fixed]
-    ordered = tuple(place for place, _, _ in chosen) + tuple(fixed)
-    ratio = np.array([values[p.name] for p in ordered]) / np.array(scales)
+    ordered, logs = (*chosen, *fixed), (*logs, *(True for _ in fixed))
+    scales += [np.sign(values[place.name]) for place in fixed]
+    ratio = np.array([values[place.name] for place in ordered]) / np.array(scales)
     start = np.where(logs, np.log(np.where(logs, ratio, 1.0)), ratio)
     parameters = Parameters(ordered, ties, logs, len(chosen), np.asarray(scales, float), start)
     if not ties:
@@ -270,32 +284,6 @@ def _numbers(model: PyTree, places: list[Place]) -> dict[str, float]:
     arrays = (leaf for leaf in jax.tree.leaves(model) if eqx.is_inexact_array(leaf))
     leaves = [np.asarray(array).reshape(-1) for array in arrays]
     return {p.name: float(leaves[p.leaf][p.index]) for p in places}
-
-
-def _scaled(
-    item: str | Positive | Real, by_name: dict[str, Place], values: dict[str, float]
-) -> tuple[Place, bool, float]:
-    """Where a free parameter is, whether its logarithm is fitted, and its scale."""
-    name = item if isinstance(item, str) else item.name
-    if name not in by_name:
-        raise ValueError(f"no parameter {name!r} in the model; it has: {', '.join(values)}")
-    name = by_name[name].name
-    value = values[name]
-    if not np.isfinite(value):
-        raise ValueError(f"parameter {name} starts at {value}: give a finite starting value")
-    if isinstance(item, Real):
-        scale = item.scale or abs(value)
-        if not scale > 0:
-            raise ValueError(
-                f"{name} starts at 0: give its typical size, jq.identify.Real({name!r}, scale=...)"
-            )
-        return by_name[name], False, scale
-    if value == 0:
-        raise ValueError(
-            f"{name} starts at 0, so its sign is unknown: give a starting value, or let it cross "
-            f"zero with jq.identify.Real({name!r}, scale=...)"
-        )
-    return by_name[name], True, float(np.sign(value))
 
 
 Condition = Callable[[PyTree], PyTree]
@@ -362,8 +350,7 @@ class Changed:
     def __call__(self, model: PyTree) -> PyTree:
         """The model with the change."""
         place = find_place(model, self.parameter, "for a condition")
-        arrays = [leaf for leaf in jax.tree.leaves(model) if eqx.is_inexact_array(leaf)]
-        value = self.times * arrays[place.leaf].reshape(-1)[place.index] + self.plus
+        value = self.times * place.number(model) + self.plus
         return with_values(model, (place,), value[None])
 
 

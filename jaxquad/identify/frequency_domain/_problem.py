@@ -182,9 +182,6 @@ def _silent_pairs(
 _evaluate = eqx.filter_jit(evaluate_response)
 
 
-Part = Float[Array, "outputs inputs frequencies"]
-
-
 def _log_ratios(z: Float[Array, " n"], problem: Problem) -> list[tuple[Part, Part]]:
     """`ln|T/T^|` and wrapped phase of `T/T^` in rad, per record in its condition."""
     # Frequencies come last until all is done: derivatives are then fast loops over them.
@@ -273,9 +270,7 @@ class _Named(NamedTuple):
     name: str
 
     def __call__(self, model: PyTree) -> Float[Array, ""]:
-        place = find_place(model, self.name, "for a prior")
-        leaves = jax.tree.leaves(eqx.filter(model, eqx.is_inexact_array))
-        return leaves[place.leaf].reshape(-1)[place.index]
+        return find_place(model, self.name, "for a prior").number(model)
 
 
 def require_model(function: str, model: object) -> None:

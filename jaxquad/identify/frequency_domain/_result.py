@@ -18,13 +18,13 @@ from ..output_error._verify import Verification, verify
 from ..uncertainty._derived import (
     derive,
     draw_models,
-    fitted_response,
-    fitted_step_response,
-    pole_reach,
+    model_response,
     ResponseBand,
+    step_response,
     StepBand,
     Tied,
     tied_parameters,
+    with_reach,
 )
 from ..uncertainty._error_budget import Discrepancy, SHARES
 from ..uncertainty._verdict import (
@@ -179,7 +179,16 @@ class Fit:
         By first order, model error included; as the real and the imaginary part of the result.
         """
         self._require_model("an interval of the poles")
-        return pole_reach(self)
+        start = self.poles
+
+        def poles(model: PyTree) -> Complex[np.ndarray, " poles"]:
+            left, ordered = list(linear_model(model).poles), []
+            for pole in start:  # in the order of the fit's poles
+                ordered.append(left.pop(int(np.argmin(np.abs(np.array(left) - pole)))))
+            return np.array(ordered, complex)
+
+        reach = with_reach(self, poles)[1]
+        return reach(np.real) + 1j * reach(np.imag)
 
     def step_response(self, time: Float[ArrayLike, " samples"]) -> StepBand:
         """The answer to a unit step of each input, with its 95 % band, model error included.
@@ -190,7 +199,8 @@ class Fit:
         nothing was fitted.
         """
         self._require_model("a step response")
-        return fitted_step_response(self, time)
+        value, reach = with_reach(self, lambda model: step_response(model, time))
+        return StepBand(np.asarray(time, float), value, reach(lambda slopes: slopes))
 
     def response_band(self, omega: Float[ArrayLike, " frequencies"]) -> ResponseBand:
         """The response at `omega` (rad/s) with its 95 % band, model error included, to first order.
@@ -198,7 +208,15 @@ class Fit:
         **Raises:** ValueError where nothing was fitted.
         """
         self._require_model("a response")
-        return fitted_response(self, omega)
+        grid = np.asarray(omega, float)
+        if grid.ndim != 1:
+            raise ValueError(
+                f"omega has the shape {grid.shape}: give a list of frequencies in rad/s"
+            )
+        value, reach = with_reach(self, lambda model: model_response(model, grid))
+        decibels = 20 / np.log(10) * reach(lambda slopes: np.real(slopes / value))
+        degrees = np.degrees(reach(lambda slopes: np.imag(slopes / value)))
+        return ResponseBand(grid, value, decibels, degrees)
 
     def to_dict(self) -> dict[str, object]:
         """All numbers as JSON holds them, as in `result.json`: None for what is not finite."""
@@ -253,13 +271,9 @@ class Fit:
         - `name`: for messages and print.
         - `model_error`: as in `interval`.
 
-        **Returns:**
+        **Returns:** a `jq.identify.Combination`, by first-order propagation of the covariance.
 
-        A `jq.identify.Combination`, by first-order propagation of the covariance.
-
-        **Raises:**
-
-        - `UndeterminedError`: the quantity depends on what the record does not determine.
+        **Raises:** UndeterminedError where it depends on what the record does not determine.
         """
         if not self.verdict.fitted:
             raise UndeterminedError(f"{name} has no value: {self.verdict.summary}")
@@ -276,11 +290,7 @@ class Fit:
         Where the two disagree, the model does not hold over the whole band. The band is halved on
         a logarithmic scale; each half is fitted from where this fit stopped.
 
-        **Returns:** a `jq.identify.Bands`, a table in print.
-
-        **Raises:**
-
-        - `ValueError`: the fit is not one of `jq.fit`.
+        **Raises:** ValueError where the fit is not one of `jq.fit`.
         """
         return fit_bands(self)
 
@@ -290,11 +300,7 @@ class Fit:
         The model is fitted again with one more pole or zero, a pair of them, rate damping, or the
         slow pair of a hovering vehicle; the lowest information criterion (BIC) decides.
 
-        **Returns:** a `jq.identify.Explanation`, a table in print.
-
-        **Raises:**
-
-        - `ValueError`: the fit is not one of `jq.fit`.
+        **Raises:** ValueError where the fit is not one of `jq.fit`.
         """
         return explain_misfit(self)
 
@@ -318,14 +324,8 @@ class Fit:
             and let only the rest vary: right for quantities that `derived` accepts, and no spread
             at all for others.
 
-        **Returns:**
-
-        A model like `Fit.model`.
-
-        **Raises:**
-
-        - `UndeterminedError`: the record leaves parameters undetermined, and these are not held.
-        - `ValueError`: the fit found no minimum, or has no finite standard errors.
+        **Raises:** UndeterminedError where the record leaves parameters undetermined, and these are
+        not held; ValueError where the fit found no minimum, or has no finite standard errors.
         """
         if isinstance(n, bool) or not isinstance(n, int | np.integer) or n < 1:
             raise ValueError(f"n is {n}: give a whole number of models, 1 or more")
@@ -442,7 +442,8 @@ def _content(fit: Fit) -> dict[str, object]:
 
     parameters, per_parameter = [], (fit.values, fit.standard_errors, fit.determined)
     for k, name in enumerate(fit.names):
-        facts = (*(part[k] for part in per_parameter), fit.noise_standard_errors[k])
+        value, error, determined = (part[k] for part in per_parameter)
+        facts = value, error, determined, fit.noise_standard_errors[k]
         parameters.append(
             {
                 "name": name,

@@ -2,7 +2,7 @@
 
 import functools as ft
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -265,8 +265,9 @@ def _gauss_newton() -> Callable[..., PyTree]:
 
         def step(self, fn, y, args, options, state, tags):
             by_slopes = lambda z: normal_equations(lambda z, args: fn(z, args)[0], z, args)
-            normal = by_slopes if self.normal is None else lambda z: self.normal(z, args)
-            state = advance(normal, state, jnp.iinfo(jnp.int32).max, self.rtol)
+            faster = self.normal
+            at = by_slopes if faster is None else lambda z: faster(z, args)
+            state = advance(at, state, jnp.iinfo(jnp.int32).max, self.rtol)
             state = jax.lax.cond(state.status == STALLED, settle, lambda same: same, state)
             return state.z, state, None  # to ask `fn` for it would trace the residuals once more
 
@@ -324,7 +325,8 @@ def _descend(
 @ft.cache
 def _descent_by_solver(short: bool) -> Callable[..., Stop]:
     descend = lambda problem, z0, solver, max_steps: _descend(z0, problem, max_steps, solver)
-    return eqx.filter_jit(descend, **({"compiler_options": hasty_options()} if short else {}))
+    options: dict[str, Any] = {"compiler_options": hasty_options()} if short else {}
+    return eqx.filter_jit(descend, **options)
 
 
 def _solve_by_default(z0: Float[Array, " parameters"], problem: Problem, max_steps: int) -> tuple:
@@ -354,7 +356,7 @@ _KEPT = {
 
 
 @ft.lru_cache(maxsize=256)
-def _program(frame: Frame, kind: str, *options: int) -> Callable[[list[Numbers]], tuple]:
+def _program(frame: Frame, kind: str, *options: int) -> Callable[[list[Numbers]], Any]:
     fill = lambda arrays: (arrays[0], frame.filled(arrays[1:]), *options)
     return _KEPT[kind].of_arrays(fill)
 

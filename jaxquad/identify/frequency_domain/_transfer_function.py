@@ -163,10 +163,6 @@ def guess_transfer_function(
     - `frf`, `zeros`, `poles`, `delay`, `integrators`, `output`, `input`, `cost`, `band`,
         `min_coherence`: as in `jq.fit_transfer_function`.
 
-    **Returns:**
-
-    A `jq.TransferFunction`.
-
     **Raises:**
 
     - `UndeterminedError`: fewer frequencies are usable than the orders need.

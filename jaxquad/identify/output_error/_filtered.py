@@ -72,12 +72,6 @@ class Columns(NamedTuple):
         moving = self.filtered.shape[1]
         return np.concatenate([(x @ self.shift)[None], self.filtered @ x[..., :moving].T])
 
-    def taken_off(self, x: Samples, unknowns: Float[np.ndarray, " rows"]) -> Samples:
-        """The series without so much of each."""
-        left = x - unknowns[0] * self.shift
-        left[: self.filtered.shape[1]] -= unknowns[1:] @ self.filtered
-        return left
-
     @property
     def rows(self) -> Rows:
         """Shift and motions within the band, over all samples."""
@@ -106,9 +100,8 @@ def is_filtered(problem: OutputError) -> bool:
         return False
     plant = linear_model(base.model)
     rational = isinstance(plant, TransferFunction) and 2 <= plant.denominator.size <= _MOST + 1
-    return rational and all(
-        term.whitener is None and term.feedback is None for term in problem.terms
-    )
+    plain = (term.whitener is None and term.feedback is None for term in problem.terms)
+    return rational and all(plain)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -171,30 +164,31 @@ class FilteredPoint:
         return self.normal
 
     def moved(self, change: Values) -> "FilteredPoint":
-        if self._is_last(change):
-            return self._next_to(change)
-        return _point(self.problem, self.programs, self.z + change)
+        if np.max(np.abs(change) / (1 + np.abs(self.z))) <= _CLOSE and self.next_to is None:
+            gradient, hessian = self.normal
+            # After a step of Gauss and Newton the misfit is known by its slopes. A step that
+            # damping has shortened is none of these, and its cost has to be seen.
+            if np.allclose(hessian @ change, -gradient, rtol=0.1, atol=0.0):
+                pairs = [*zip(self.records, self.rows, strict=True)]
+                left = [_project_out(x.misfit + change @ rows, x.columns)[0] for x, rows in pairs]
+                return dataclasses.replace(
+                    self,
+                    z=self.z + change,
+                    records=[x._replace(misfit=y) for x, y in zip(self.records, left, strict=True)],
+                    prior_misfits=self.prior_misfits + self.prior_slopes @ change,
+                    next_to=self,
+                )
+        return FilteredPoint.at(self.problem, self.programs, self.z + change)
 
-    def _is_last(self, change: Values) -> bool:
-        """Whether the misfit after a step of Gauss and Newton is known by its slopes."""
-        if np.max(np.abs(change) / (1 + np.abs(self.z))) > _CLOSE or self.next_to is not None:
-            return False
-        gradient, hessian = self.normal
-        # A step that damping has shortened is none of these, and its cost has to be seen.
-        return np.allclose(hessian @ change, -gradient, rtol=0.1, atol=0.0)
-
-    def _next_to(self, change: Values) -> "FilteredPoint":
-        parts = zip(self.records, self.rows, strict=True)
-        misfits = [_project_out(one.misfit + change @ rows, one.columns)[0] for one, rows in parts]
-        return dataclasses.replace(
-            self,
-            z=self.z + change,
-            records=[
-                one._replace(misfit=left) for one, left in zip(self.records, misfits, strict=True)
-            ],
-            prior_misfits=self.prior_misfits + self.prior_slopes @ change,
-            next_to=self,
-        )
+    @staticmethod
+    def at(problem: OutputError, programs: list[Program], z: Values) -> "FilteredPoint":
+        parts = zip(problem.terms, programs, strict=True)
+        records = [_simulated(term, sample(z)) for term, sample in parts]
+        misfits, slopes = np.zeros(0), np.zeros((0, z.size))
+        if problem.base.quantities:
+            [priors] = evaluate(problem.base, z)
+            misfits, slopes = priors.misfits, priors.slopes.T[:, : z.size]
+        return FilteredPoint(problem, programs, z, records, misfits, slopes)
 
     @property
     def is_precise(self) -> bool:
@@ -233,17 +227,7 @@ def filtered_point(problem: OutputError, z: Values) -> FilteredPoint:
 
         return sample
 
-    return _point(problem, [sampler(term) for term in problem.terms], np.asarray(z))
-
-
-def _point(problem: OutputError, programs: list[Program], z: np.ndarray) -> FilteredPoint:
-    parts = zip(problem.terms, programs, strict=True)
-    records = [_simulated(term, sample(z)) for term, sample in parts]
-    misfits, slopes = np.zeros(0), np.zeros((0, z.size))
-    if problem.base.quantities:
-        [priors] = evaluate(problem.base, z)
-        misfits, slopes = priors.prior_misfits, priors.prior_slopes[:, : z.size]
-    return FilteredPoint(problem, programs, z, records, misfits, slopes)
+    return FilteredPoint.at(problem, [sampler(term) for term in problem.terms], np.asarray(z))
 
 
 @ft.lru_cache(maxsize=64)
@@ -342,4 +326,6 @@ def _project_out(misfit: Samples, columns: Columns) -> tuple[Samples, Float[np.n
     for _ in range(_REFINEMENTS):
         unknowns = unknowns + np.linalg.solve(columns.normal, aim - plain @ unknowns)
     unknowns = columns.scale * unknowns
-    return columns.taken_off(misfit, unknowns), unknowns
+    left = misfit - unknowns[0] * columns.shift
+    left[: columns.filtered.shape[1]] -= unknowns[1:] @ columns.filtered
+    return left, unknowns

@@ -371,9 +371,19 @@ def _verdict(
     solution, count = descent.solution, len(covariance)
 
     def information(reduced: Reduced) -> Information:
+        # Slopes of the output in units of their noise. The even rows tell the way of the response:
+        # the first one is the part along the measured output, zeros stand for the others.
+        ways, vectors = np.linalg.eigh(reduced.noise)
+        whitened = vectors / np.sqrt(np.maximum(ways, max(1e-12 * ways[-1], 1e-30)))
+        root, along = -whitened.T @ reduced.root, whitened.T @ reduced.output
+        turned = np.linalg.qr(np.column_stack([along, np.eye(along.size)]))[0]
+        turned[:, 0] *= np.sign(turned[:, 0] @ along) or 1.0
+        rows = turned.T @ root
+        spaced = np.zeros((2 * len(rows), rows.shape[1]))
+        spaced[0], spaced[1 : 2 * len(rows) - 2 : 2] = rows[0], rows[1:]
         places = descent.problem.base.parameters.places[: reduced.aim.size]
         return Information(
-            root=_signed_root(reduced),
+            root=spaced,
             covariance=covariance,
             by_noise=covariance,
             places=places,
@@ -388,23 +398,6 @@ def _verdict(
         return verdicts
     reduced = _reduce(descent, with_fixed_slopes(descent), rescale(solution, units))
     return identifiability_of(information(reduced), prior)
-
-
-def _signed_root(reduced: Reduced) -> Float[np.ndarray, "rows all"]:
-    """Slopes of the output in units of their noise, whose even rows tell the way of the response.
-
-    The first row is the part along the measured output; zeros stand for the other even ones.
-    """
-    values, vectors = np.linalg.eigh(reduced.noise)
-    values = np.maximum(values, max(1e-12 * values[-1], 1e-30))
-    whitened = vectors / np.sqrt(values)
-    root, along = -whitened.T @ reduced.root, whitened.T @ reduced.output
-    turned = np.linalg.qr(np.column_stack([along, np.eye(along.size)]))[0]
-    turned[:, 0] *= np.sign(turned[:, 0] @ along) or 1.0
-    rows = turned.T @ root
-    spaced = np.zeros((2 * len(rows), rows.shape[1]))
-    spaced[0], spaced[1 : 2 * len(rows) - 2 : 2] = rows[0], rows[1:]
-    return spaced
 
 
 def _same_outputs(descent: Descent, values: Float[np.ndarray, " parameters"]) -> bool:

@@ -14,7 +14,7 @@ from jaxquad._compile import hasty_options, Jit
 from jaxquad._core import as_array
 from jaxquad.models import evaluate_response, simulate_linear, TransferFunction
 
-from ..frequency_domain._parameters import number_at, Parameters
+from ..frequency_domain._parameters import Parameters
 from ..output_error._simulated import linear_model
 from ._error_budget import Matrix
 from ._verdict import Combination, LIMIT, NO_MINIMUM, reach_of_interval, UndeterminedError, USUAL
@@ -76,7 +76,7 @@ def tied_parameters(fit: "Fit") -> tuple[Tied, ...]:
     """The tied parameters, in the order of `tied=`; none where nothing was fitted."""
     ties = []
     for place, _ in fit.parameters.ties if fit.verdict.fitted else ():
-        value, slope, is_open = _propagate(fit, number_at(place))
+        value, slope, is_open = _propagate(fit, place.number)
         parts = (fit.relative_covariance, fit.relative_noise_covariance)
         error, by_noise = (float(np.sqrt(max(slope @ part @ slope, 0.0))) for part in parts)
         sharp = fit.identifiable or error <= LIMIT * abs(value)
@@ -179,18 +179,8 @@ def factors(fit: "Fit") -> Factors:
     Errors are propagated to first order: a change dc_j of a coefficient of the polynomial P moves
     its root r by -r^j dc_j / P'(r).
 
-    **Arguments:**
-
-    - `fit`: a fit of a `jq.TransferFunction`, as of `jq.fit_transfer_function`.
-
-    **Returns:**
-
-    `jq.identify.Factors`.
-
-    **Raises:**
-
-    - `ValueError`: the model is no `jq.TransferFunction`.
-    - `UndeterminedError`: no coefficient is determined.
+    **Raises:** ValueError where the model is no `jq.TransferFunction`; UndeterminedError where no
+    coefficient is determined.
     """
     model = fit.model
     if not isinstance(model, TransferFunction):
@@ -219,7 +209,7 @@ def factors(fit: "Fit") -> Factors:
     # Derivatives of the coefficients, free and tied, by the relative changes of the free ones.
     slopes = dict(zip(fit.names, np.diag(fit.units), strict=True))
     for place, _ in fit.parameters.ties:
-        slopes[place.name] = _propagate(fit, number_at(place))[1]
+        slopes[place.name] = _propagate(fit, place.number)[1]
     none = np.zeros(len(fit.names))
     rows = lambda field, count: np.array(
         [slopes.get(f"{field}[{k}]", none) for k in range(count)]
@@ -301,15 +291,10 @@ def step_response(
 ) -> Float[np.ndarray, "samples outputs inputs"]:
     """The answer of a linear model at rest to a unit step of each input at time 0.
 
-    **Arguments:**
+    The model is a `jq.TransferFunction`, a `jq.StateSpace`, or has `transfer_function()` or
+    `state_space()`.
 
-    - `model`: a `jq.TransferFunction`, a `jq.StateSpace`, or a model with `transfer_function()` or
-        `state_space()`.
-    - `time`: equally spaced, from 0, in s.
-
-    **Raises:**
-
-    - `ValueError`: the model has none of these forms, or `time` is not equally spaced from 0.
+    **Raises:** ValueError for other models, and where `time` is not equally spaced from 0, in s.
     """
     t, plant = np.asarray(time, float), linear_model(model)
     if t.ndim != 1:
@@ -341,36 +326,7 @@ def model_response(
     return np.concatenate(parts)[: omega.size]
 
 
-def fitted_step_response(fit: "Fit", time: Float[ArrayLike, " samples"]) -> StepBand:
-    value, reach = _with_reach(fit, lambda model: step_response(model, time))
-    return StepBand(np.asarray(time, float), value, reach(lambda slopes: slopes))
-
-
-def fitted_response(fit: "Fit", omega: Float[ArrayLike, " frequencies"]) -> ResponseBand:
-    grid = np.asarray(omega, float)
-    if grid.ndim != 1:
-        raise ValueError(f"omega has the shape {grid.shape}: give a list of frequencies in rad/s")
-    value, reach = _with_reach(fit, lambda model: model_response(model, grid))
-    decibels = 20 / np.log(10) * reach(lambda slopes: np.real(slopes / value))
-    return ResponseBand(
-        grid, value, decibels, np.degrees(reach(lambda slopes: np.imag(slopes / value)))
-    )
-
-
-def pole_reach(fit: "Fit") -> Complex[np.ndarray, " poles"]:
-    start = linear_model(fit.model).poles
-
-    def poles(model: PyTree) -> Complex[np.ndarray, " poles"]:
-        left, ordered = list(linear_model(model).poles), []
-        for pole in start:  # in the order of the fit's poles
-            ordered.append(left.pop(int(np.argmin(np.abs(np.array(left) - pole)))))
-        return np.array(ordered, complex)
-
-    reach = _with_reach(fit, poles)[1]
-    return reach(np.real) + 1j * reach(np.imag)
-
-
-def _with_reach(
+def with_reach(
     fit: "Fit", curve: Callable[[PyTree], Inexact[np.ndarray, "..."]]
 ) -> tuple[np.ndarray, Callable[[Callable[[np.ndarray], np.ndarray]], np.ndarray]]:
     """A curve of the model, and half of the 95 % band of what a function makes of its slopes.
