@@ -194,9 +194,9 @@ def _remarks(
     if plants is None:
         return
     ladrc, band, largest = find_ladrc(controller), plants.band, plants.largest_command
-    for name in ("wc", "wo") if ladrc is not None and band is not None else ():
-        value = float(np.max(np.asarray(vars(ladrc)[name])))
-        if value > _ROUNDED * band[1]:
+    for name in ("wc", "wo"):
+        value = 0.0 if ladrc is None else float(np.max(np.asarray(vars(ladrc)[name])))
+        if band is not None and value > _ROUNDED * band[1]:
             hertz = f"{band[0] / (2 * np.pi):.3g} to {band[1] / (2 * np.pi):.3g} Hz"
             yield (
                 f"{name} = {value:.4g} rad/s lies beyond the identified band of {band[0]:.3g} to "

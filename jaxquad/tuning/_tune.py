@@ -302,8 +302,10 @@ def tune(
             key=fresh_key, devices=devices, **tuner.span._asdict(),
         )  # fmt: skip
         certificates += 1
-        if isinstance(fresh, Members) or not any(tuner.searches) or certificates == _CERTIFICATES:
+        if isinstance(fresh, Members) or isinstance(ensemble, Members):
             break  # members that are given have one certificate
+        if not any(tuner.searches) or certificates == _CERTIFICATES:
+            break
         worst = certified_beyond(
             certificate, certified_members(loop, ensemble, fresh_key, flown=fresh)
         )

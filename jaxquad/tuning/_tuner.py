@@ -93,6 +93,7 @@ class Tuner:
     evaluations: np.ndarray  # of the second phase: flights and linear loops
     beyond: Float[np.ndarray, "problems limits"]  # greatest, as levels: above 0, violated
     result: CostResult
+    _slowest: Float[np.ndarray, " problems"]  # 1/s, of the last evaluation
     refusal = ""  # why the controller refused the last of the steps that it refused, if any
     tail = Tail()
 
@@ -165,7 +166,7 @@ class Tuner:
         enough = lambda k, value: float(self._slowest[k]) < self.rate
         first = minimise(self._evaluator(False), np.asarray(start, float), method, enough=enough)
         self.z, self.stabilising = first.z, first.evaluations
-        slowest = self._evaluate(everyone, False).numbers["abscissa"].max(axis=1)
+        slowest = np.max(np.asarray(self._evaluate(everyone, False).numbers["abscissa"]), axis=1)
         self.stable, self.stabilised = slowest < 0, slowest < self.rate
         self.evaluations = np.zeros(count, int)
         self._optimise(self.stable, MET)
@@ -453,8 +454,9 @@ def _merge(old: Descent | None, new: Descent, on: np.ndarray) -> Descent:
         return new
     pick = lambda a, b: np.where(on.reshape((-1,) + (1,) * (a.ndim - 1)), b, a)
     choose = lambda a, b: tuple(y if o else x for x, y, o in zip(a, b, on, strict=True))
-    both = zip(old, new, strict=True)
-    return Descent(*(choose(a, b) if isinstance(a, tuple) else pick(a, b) for a, b in both))
+    both = zip(Descent._fields, old, new, strict=True)
+    merge = lambda a, b: choose(a, b) if isinstance(a, tuple) else pick(a, b)
+    return new._replace(**{name: merge(a, b) for name, a, b in both})
 
 
 def tighten(limit: Limit, reserve: float) -> Limit:
