@@ -69,9 +69,6 @@ class Rows(NamedTuple):
         pairs = enumerate(names)
         return [f"if (is_member) {self.at(k, time)} = {name};" for k, name in pairs]
 
-    def parameter(self, access: str) -> str:
-        return f"{access}{type_of(memory_type(self.kind))} *__restrict__ {self.name}"
-
 
 def rows_of(
     loop: Loop, prefix: str, avals: Sequence[Shaped], *, all_wide: bool = False
@@ -105,14 +102,10 @@ class Tile(NamedTuple):
         """The lines that read it, and what the number at a place of the carry is called."""
         names = {place: f"{self.name}_{place}" for place in self.places}
         kind, test = type_of(self.kind), " != 0" if self.kind.kind == "b" else ""
-        lines = [
-            f"const {kind} {name} = {self._read(k)}{test};" for k, name in enumerate(names.values())
-        ]
-        return [self._now("const ", time), *lines], names
-
-    def _read(self, k: int) -> str:
-        place = f"{self.name}_now + {k * BLOCK}"
-        return f"*({place})" if self.shared else f"__ldcs({place})"
+        read, lines = "*" if self.shared else "__ldcs", [self._now("const ", time)]
+        for k, name in enumerate(names.values()):
+            lines.append(f"const {kind} {name} = {read}({self.name}_now + {k * BLOCK}){test};")
+        return lines, names
 
     def fetch_before(self) -> Lines:
         """Of the time before the one that was read, while that one is worked on."""
@@ -130,9 +123,6 @@ class Tile(NamedTuple):
         place = time if self.shared else f"blockIdx.x * {self.times}LL + {time}"
         first = f"({place}) * {len(self.places) * BLOCK} + threadIdx.x"
         return f"{access}{kind} *const {self.name}_now = {self.name} + {first};"
-
-    def parameter(self, access: str) -> str:
-        return f"{access}{type_of(memory_type(self.kind))} *__restrict__ {self.name}"
 
 
 def tiles_of(loop: Loop, prefix: str, times: int, *, shared: bool = False) -> list[Tile]:
@@ -233,7 +223,9 @@ def run(
     outputs: tuple[Sequence[Rows | Tile], Sequence[Shaped]], shared: int = 0,
 ) -> Flat:  # fmt: skip
     """What a kernel of these lines makes of arguments and writes to results."""
-    parameters = [x.parameter("const ") for x in inputs[0]] + [x.parameter("") for x in outputs[0]]
+    pairs = [("const ", x) for x in inputs[0]] + [("", x) for x in outputs[0]]
+    kind_of = lambda x: type_of(memory_type(x.kind))
+    parameters = [f"{access}{kind_of(x)} *__restrict__ {x.name}" for access, x in pairs]
     bounds = f"__launch_bounds__({BLOCK}, {BLOCKS})"
     head = f'extern "C" __global__ void {bounds} kernel({", ".join(parameters)})'
     begin = [

@@ -11,7 +11,7 @@ from jaxquad.records import Record
 from jaxquad.spectra import find_line, SpectralLine
 
 from ._filters import Filter, FilterChain
-from ._firmware import cutoff_of, FilterChoice, FilterOption, firmware_named, LowPass
+from ._firmware import cutoff_of, FilterChoice, FilterOption, firmware_named
 from ._flight_channels import FlightChannels, Samples
 from ._law import RateLoop
 from ._parameters import find_parameter, flown_loop, gains_of, store_parameters
@@ -219,42 +219,39 @@ def filter_choices(
     """
     kind, choices = firmware_named(firmware), []
     loop = flown_loop(firmware, values, version, throttle=throttle)
+    reach = np.linspace(0.0, np.log(change), _STEPS + 1)[1:]
+    factors = [*np.exp(-reach[::-1]), 1.0, *np.exp(reach)]
     for low_pass in kind.low_passes(loop, values, version, axis, throttle):
-        choices.append(_low_pass_choice(firmware, low_pass, change))
+        # Cutoffs that can be stored: whole numbers, or three digits in single precision.
+        stage, flown, filter, rate_hz, shared = low_pass
+        assert dataclasses.is_dataclass(filter) and not isinstance(filter, type)
+        options: dict[tuple[float, ...], FilterOption] = {}
+        for factor in factors:
+            stored, moved, scaled = dict(flown), filter, 0.0
+            if factor != 1:
+                wanted = {name: float(f"{factor * value:.3g}") for name, value in flown.items()}
+                stored = store_parameters(firmware, wanted)
+                scaled = sum(stored.values()) / sum(flown.values()) * cutoff_of(filter)
+                rows = {find_parameter(firmware, name): value for name, value in stored.items()}
+                inside = all(max(row.low, 1.0) <= value <= row.high for row, value in rows.items())
+                if not inside or scaled >= _HIGHEST * rate_hz:
+                    continue
+                moved = dataclasses.replace(filter, **{"cutoff_hz": scaled})
+            assert isinstance(moved, Filter)
+            options[tuple(stored.values())] = FilterOption(stored, moved)
+        at = [*options].index(tuple(flown.values()))
+        choices.append(FilterChoice(stage, shared, rate_hz, tuple(options.values()), at))
     flown = zip(kind.notches, kind.flown_notches(values), strict=False)
     free = [(names, second) for names, (centre, second) in flown if centre == 0]
     if line_hz is not None and free:
         line, rate_hz = float(np.rint(line_hz)), kind.notch_rate_hz(loop)
         names, second = free[0]
-        options = [FilterOption(dict(zip(names, (0.0, second), strict=True)), None)]
+        notches = [FilterOption(dict(zip(names, (0.0, second), strict=True)), None)]
         for half_width in _WIDTHS if line < _HIGHEST * rate_hz else ():
             pair = line, kind.notch_width(line, half_width)
-            options.append(FilterOption(dict(zip(names, pair, strict=True)), kind.notch(*pair)))
-        choices.append(FilterChoice("gyro", True, rate_hz, tuple(options), 0))
+            notches.append(FilterOption(dict(zip(names, pair, strict=True)), kind.notch(*pair)))
+        choices.append(FilterChoice("gyro", True, rate_hz, tuple(notches), 0))
     return tuple(choice for choice in choices if len(choice.options) > 1)
-
-
-def _low_pass_choice(firmware: str, low_pass: LowPass, change: float) -> FilterChoice:
-    """Cutoffs that the firmware can store: whole numbers, or three digits in single precision."""
-    stage, flown, filter, rate_hz, shared = low_pass
-    cutoff, reach = cutoff_of(filter), np.linspace(0.0, np.log(change), _STEPS + 1)[1:]
-    options: dict[tuple[float, ...], FilterOption] = {}
-    for factor in [*np.exp(-reach[::-1]), 1.0, *np.exp(reach)]:
-        if factor == 1:
-            options[tuple(flown.values())] = FilterOption(dict(flown), filter)
-            continue
-        wanted = {name: float(f"{factor * value:.3g}") for name, value in flown.items()}
-        stored = store_parameters(firmware, wanted)
-        scaled = sum(stored.values()) / sum(flown.values()) * cutoff
-        rows = {find_parameter(firmware, name): value for name, value in stored.items()}
-        inside = all(max(row.low, 1.0) <= value <= row.high for row, value in rows.items())
-        if inside and scaled < _HIGHEST * rate_hz:
-            assert dataclasses.is_dataclass(filter) and not isinstance(filter, type)
-            moved = dataclasses.replace(filter, **{"cutoff_hz": scaled})
-            assert isinstance(moved, Filter)
-            options[tuple(stored.values())] = FilterOption(dict(stored), moved)
-    at = [*options].index(tuple(flown.values()))
-    return FilterChoice(stage, shared, rate_hz, tuple(options.values()), at)
 
 
 class _OtherAxis(NamedTuple):

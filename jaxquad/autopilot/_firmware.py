@@ -84,9 +84,9 @@ class FilterChoice(NamedTuple):
     flown: int  # which of them flew
 
     @property
-    def names(self) -> tuple[str, ...]:
-        """Of its parameters."""
-        return tuple(self.options[self.flown].parameters)
+    def flown_parameters(self) -> Mapping[str, float]:
+        """What flew."""
+        return self.options[self.flown].parameters
 
 
 class LowPass(NamedTuple):

@@ -147,7 +147,13 @@ def read_channels_if_any(
         wanted = [*filtered, *unfiltered, *names.terms, *names.motors, setpoint, setup.reference]
         wanted += [*names.output, *names.stick, *names.mixed, *names.slewed, *injected]
         records = _read(path, logged, [*wanted, *setup.throttle], span)
-        tracked_hz = _tracked(path, logged, firmware.tracked_channels(), span)
+        tracked_hz: dict[int, tuple[float, ...]] = {}
+        for mode, pattern in firmware.tracked_channels().items():
+            turned = sorted(name for name in logged if re.fullmatch(pattern, name))
+            speeds = _read(path, logged, turned, (None, None)).items()
+            medians = [_median(record, name, span) / 60 for name, record in speeds]
+            if turning := tuple(speed for speed in medians if speed > 0):
+                tracked_hz[mode] = turning
     except (ReadError, RecordError):
         return None
     if rate not in records or setpoint not in records:
@@ -197,20 +203,6 @@ def _channel_prefix(proposal: Proposal) -> str:
     rate = log.rates[axis] if axis < len(log.rates) else ""
     full = proposal.setup.rate
     return full.removesuffix(rate) if rate and full.endswith(f".{rate}") else ""
-
-
-def _tracked(
-    path: Path, logged: frozenset[str], patterns: Mapping[int, str], span: Span
-) -> dict[int, tuple[float, ...]]:
-    """The median speeds in Hz that the log holds, of those that turn."""
-    tracked: dict[int, tuple[float, ...]] = {}
-    for mode, pattern in patterns.items():
-        names = sorted(name for name in logged if re.fullmatch(pattern, name))
-        records = _read(path, logged, names, (None, None)) if names else {}
-        medians = [_median(record, name, span) / 60 for name, record in records.items()]
-        if turning := tuple(speed for speed in medians if speed > 0):
-            tracked[mode] = turning
-    return tracked
 
 
 def _median(record: Record | None, name: str, span: Span) -> float:

@@ -26,7 +26,7 @@ from ._parameters import find_parameter, ParameterChange, propose_changes
 
 
 ReadBeside = Callable[[Mapping[str, Mapping[str, float]]], Sequence[Record]]
-_DRAWN, _SEED = 1000, 5  # of the ratio of gains
+_DRAWN, _SEED, _ENDS = 1000, 5, [2.5, 97.5]  # of the ratio of gains; in % of its draws
 _VAGUE = 0.4  # half of the relative 95 % interval of a gain from which plants are not drawn
 
 
@@ -155,10 +155,19 @@ def study_throttle(
         gains = gain_over_throttle(
             records, filters=flown.filters, flown_curve=flown_curve.curve, band=band
         )
-        span = float(gains.low.min()), float(gains.high.max())
-        ratio = value, least, most = _ratio(gains, span)
+        low, high = span = float(gains.low.min()), float(gains.high.max())
+        ends = gains.over(np.array(span))
+        reach = float(np.max((ends.high - ends.low) / 2 / np.abs(ends.value)))
+        if reach > _VAGUE:
+            raise ValueError(
+                f"it shows the gain at the ends of {low:.2f} .. {high:.2f} within +- "
+                f"{100 * reach:.0f} % (95 %). Excite more or longer at each"
+            )
+        drawn = gains.draw(np.array(span), _DRAWN, seed=_SEED).gain
     except (UndeterminedError, ValueError) as error:
         return ThrottleVerdict(f"{taken_together}, not for each: {error}")
+    value, (least, most) = ends.value[1] / ends.value[0], np.percentile(drawn[1] / drawn[0], _ENDS)
+    ratio = float(value), float(least), float(most)
     logged = shown(span[0]), shown(sum(span) / 2), shown(span[1])
     text = (
         f"gains hold from throttle {logged[0]:.2f} to {logged[2]:.2f}, of which the log has "
@@ -170,21 +179,6 @@ def study_throttle(
         text += ". Below, throttle is the thrust that the firmware makes of it, 0 to 1"
     curve = _curve_verdict(gains, flown.firmware, flown_curve)
     return ThrottleVerdict(text, gains, span, logged, ratio, curve)
-
-
-def _ratio(gains: GainOverThrottle, span: tuple[float, float]) -> tuple[float, float, float]:
-    """Of the gain at the highest throttle to that at the lowest, with its 95 % interval."""
-    ends = gains.over(np.array(span))
-    reach = float(np.max((ends.high - ends.low) / 2 / np.abs(ends.value)))
-    if reach > _VAGUE:
-        raise ValueError(
-            f"it shows the gain at the ends of {span[0]:.2f} .. {span[1]:.2f} within +- "
-            f"{100 * reach:.0f} % (95 %). Excite more or longer at each"
-        )
-    low, high = ends.value
-    drawn = gains.draw(np.array(span), _DRAWN, seed=_SEED).gain
-    least, most = np.percentile(drawn[1] / drawn[0], [2.5, 97.5])
-    return float(high / low), float(least), float(most)
 
 
 def _curve_verdict(

@@ -248,6 +248,7 @@ VERDICTS = {
     "cannot tell": ("bad", "THIS LOG CANNOT TELL"), "not to be flown": ("bad", "NOT TO BE FLOWN"),
 }  # fmt: skip
 Designs = Mapping[str, tuple[RateLoop, Float[np.ndarray, " gains"]]]
+Spectra = dict[str, Spectrum]
 Part = TypeVar("Part")
 
 
@@ -264,25 +265,23 @@ def pilot_page(proposal: "AutopilotProposal", origin: Provenance, overview: str)
             failures[section] = reason_of(error)
             return missing
 
-    def shown_noise() -> GyroNoise | None:
-        if proposal.noise is not None or flight is None:
-            return proposal.noise
-        try:
-            return gyro_noise(flight, law, axis, SLOWEST)
-        except NoNoise:
-            return None
+    def spectra() -> tuple[GyroNoise | None, Spectra, Spectra]:
+        noise = proposal.noise
+        if noise is None and flight is not None:
+            try:
+                noise = gyro_noise(flight, law, axis, SLOWEST)
+            except NoNoise:
+                pass
+        return noise, *(({}, {}) if noise is None else noise_spectra(noise, axis, designs))
 
     designs = {"flown": (law, gains_of(law, axis))}
     if new:
         changed = {} if filters is None else {name: new[name] for name in filters.flown}
         after = flown.with_filters(changed) if changed else law
         designs["proposed"] = (after, gains_in(law, axis, new))
-    noise = computed("noise", shown_noise, None)
-    spectra = lambda: ({}, {}) if noise is None else noise_spectra(noise, axis, designs)
-    gyro, derivative = computed("noise", spectra, ({}, {}))
-    steps = lambda: (
-        step_bands(proposal, designs) if proposal.identification.fit.identifiable else {}
-    )
+    noise, gyro, derivative = computed("noise", spectra, (None, {}, {}))
+    fitted = proposal.identification.fit.identifiable
+    steps = computed("steps", lambda: step_bands(proposal, designs) if fitted else {}, {})
     logged = flight is not None and {"P", "I"} <= set(flight.terms)
     compute_terms = lambda: (
         {} if flight is None else logged_terms(flight) if logged
@@ -319,7 +318,7 @@ def pilot_page(proposal: "AutopilotProposal", origin: Provenance, overview: str)
             f"Noise of {noise.source}, less what the set-point explains. Below "
             f"{noise.least_hz:.0f} Hz motion is taken for noise, so the level above is used."
         ),
-        steps=computed("steps", steps, {}),
+        steps=steps,
         terms=computed("balance", compute_terms, {}),
         terms_are="as logged" if logged else "computed by the law from set-point and rate",
         motors=[] if flight is None else motor_rows(flight),
@@ -346,9 +345,7 @@ def chains_of(law: RateLoop, axis: int) -> dict[str, tuple[FilterChain, ...]]:
     return chains
 
 
-def noise_spectra(
-    noise: GyroNoise, axis: int, designs: Designs
-) -> tuple[dict[str, Spectrum], dict[str, Spectrum]]:
+def noise_spectra(noise: GyroNoise, axis: int, designs: Designs) -> tuple[Spectra, Spectra]:
     """Of gyro and D term: before all filters, then behind those of each design."""
     inside = (noise.before.hertz > 1.0) & (noise.before.hertz <= noise.known_hz)
     hertz, before = noise.before.hertz[inside], noise.before.power[inside]

@@ -151,19 +151,17 @@ def _places(law: FirmwareLoop) -> Iterator[tuple[Parameter, Array]]:
             yield row, value
 
 
-def _value_at(law: object, field: str) -> object:
+def _value_at(law: FirmwareLoop, field: str) -> object:
     """Of the angle loop, the gyro's only low-pass, or the rate loop; None where there is none."""
+    part: object = _rate_loop(law)
     if field.startswith("angle."):
-        outer, field = law if isinstance(law, AngleLoop) else None, field.removeprefix("angle.")
-        return vars(outer).get(field) if outer is not None else None
-    if isinstance(law, FirmwareLoop):
-        law = _rate_loop(law)
-        if field == "gyro":
-            low_passes = [x for x in law.gyro.filters if isinstance(x, Butterworth)]
-            return low_passes[0].cutoff_hz if len(low_passes) == 1 else None
-    first, _, rest = field.partition(".")
-    part = vars(law).get(first)
-    return _value_at(part, rest) if rest and part is not None else part
+        part, field = (law if isinstance(law, AngleLoop) else None), field.removeprefix("angle.")
+    elif field == "gyro":
+        low_passes = [x for x in _rate_loop(law).gyro.filters if isinstance(x, Butterworth)]
+        return low_passes[0].cutoff_hz if len(low_passes) == 1 else None
+    for name in field.split("."):
+        part = None if part is None else vars(part).get(name)
+    return part
 
 
 def _replaced(law: Law, field: str, value: Array) -> Law:
@@ -173,10 +171,8 @@ def _replaced(law: Law, field: str, value: Array) -> Law:
     if isinstance(law, AngleLoop):
         return dataclasses.replace(law, rate=_replaced(law.rate, field, value))
     if field == "gyro" and isinstance(law, RateLoop):
-        filters = tuple(
-            dataclasses.replace(x, cutoff_hz=value) if isinstance(x, Butterworth) else x
-            for x in law.gyro.filters
-        )
+        moved = lambda x: dataclasses.replace(x, cutoff_hz=value)
+        filters = tuple(moved(x) if isinstance(x, Butterworth) else x for x in law.gyro.filters)
         return dataclasses.replace(law, gyro=dataclasses.replace(law.gyro, filters=filters))
     first, _, rest = field.partition(".")
     part = _replaced(vars(law)[first], rest, value) if rest else value

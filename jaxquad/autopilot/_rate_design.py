@@ -179,7 +179,7 @@ class _Design:
         """What flew of these filters."""
         flown = {}
         for choice in self.choices if names else ():
-            flown |= choice.options[choice.flown].parameters
+            flown |= choice.flown_parameters
         return {name: flown[name] for name in names}
 
     def filtered(self, loops: RateLoops, filters: Mapping[str, float]) -> RateLoops:
@@ -245,7 +245,7 @@ class _Design:
     ) -> tuple[_Certified, FilterVerdict]:
         """Gains alone beside gains and filters, on the same fresh plants."""
         alone, freed, law = plain.stages[-1], both.stages[-1], self.flown.law
-        names = ", ".join(name for choice in bank.choices for name in choice.names)
+        names = ", ".join(name for choice in bank.choices for name in choice.flown_parameters)
         heard = f"the noise is of {noise.source}"
         if not both.filters or freed.rejection > _FILTERS_WORTH * alone.rejection:
             text = (

@@ -130,7 +130,18 @@ class ErrorCovariance:
             begin, end = min(begin, int(driven[0])), max(end, int(driven[-1]) + 1)
         for low in range(begin, end, _ATOMS):
             part = np.zeros((min(_ATOMS, end - low), values.shape[2]), complex)
-            add_effects(part, low, effect, reach, values)
+            high = low + len(part)
+            if effect.shape[2] <= _NARROW and np.all(np.diff(reach.first) > 0):
+                for place in range(effect.shape[2]):  # no two frequencies have the same atom there
+                    atoms = reach.first + place
+                    here = (atoms >= low) & (atoms < high) & (atoms < reach.last)
+                    moving = np.einsum("fi,fip->fp", effect[here, :, place], values[here])
+                    part[atoms[here] - low] += moving
+            else:
+                for f in np.flatnonzero((reach.first < high) & (reach.last > low)):
+                    first, last = max(reach.first[f], low), min(reach.last[f], high)
+                    few = effect[f, :, first - reach.first[f] : last - reach.first[f]]
+                    part[first - low : last - low] += few.T @ values[f]
             if moved is not None:
                 taken = slice(*np.searchsorted(driven, (low, low + len(part))))
                 both = np.einsum("nac,np->acp", drive[:, taken], moved)
@@ -341,24 +352,3 @@ def sums_of_products(
         below = np.tril_indices(len(one), -1)
         total[below] = total.T[below].conj()
     return total
-
-
-def add_effects(
-    into: Complex[np.ndarray, "atoms columns"],
-    low: int,
-    effect: Effect,
-    reach: Reach,
-    values: Complex[np.ndarray, "frequencies inputs columns"],
-) -> None:
-    """Add effects times `values`, over frequencies and inputs, to the atoms from `low` on."""
-    high = low + len(into)
-    if effect.shape[2] <= _NARROW and np.all(np.diff(reach.first) > 0):
-        for place in range(effect.shape[2]):  # at which no two frequencies have the same atom
-            atoms = reach.first + place
-            here = (atoms >= low) & (atoms < high) & (atoms < reach.last)
-            into[atoms[here] - low] += np.einsum("fi,fip->fp", effect[here, :, place], values[here])
-        return
-    for f in np.flatnonzero((reach.first < high) & (reach.last > low)):
-        begin, end = max(reach.first[f], low), min(reach.last[f], high)
-        part = effect[f, :, begin - reach.first[f] : end - reach.first[f]]
-        into[begin - low : end - low] += part.T @ values[f]

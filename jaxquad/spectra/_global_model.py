@@ -3,6 +3,7 @@
 Local fits follow what it leaves, and the errors are those of both together.
 """
 
+import dataclasses
 import functools as ft
 import hashlib
 from collections.abc import Sequence
@@ -11,9 +12,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
 
+from ._error_covariance import ErrorCovariance
 from ._estimators import diagonal, Grid
 from ._local_fit import Bins, left_power, LocalFit, window_slices
-from ._local_windows import SharedErrors
 from ._noise import Noise
 from ._rational_fit import (
     Basis,
@@ -41,6 +42,7 @@ _LIKELIER = 10.0  # twice the logarithm of a ratio of likelihoods that chance se
 _NEAR, _AROUND = 0.05, 0.7  # a mode's neighbourhood and beyond, in ln(omega)
 _MOST_FOLLOWED = 0.8  # share of the residuals' freedom
 _PIECE = 8192  # bins whose slopes are taken at once
+_TOGETHER = 1024  # bins whose drives are taken at a time: those of a long record are many
 _MOVING, _LARGE = 4.0, 10.0  # ratios of powers to the noise's: of the end, and of what models leave
 
 Places = Int[np.ndarray, " places"]
@@ -341,20 +343,27 @@ def weighted_models(
     return models
 
 
-def shared_errors(
+def with_models(
+    errors: ErrorCovariance,
+    reached: Bool[np.ndarray, " bins"],
     rest: Rest,
     bins: Bins,
-    omega: Grid,
     fit: LocalFit,
     noise: Noise,
     left: Complex[np.ndarray, "frequencies outputs moved"],
     right: Complex[np.ndarray, "frequencies sources inputs"],
-) -> SharedErrors | None:
-    """Errors of models' parameters in left (models + `fit`) right, less what a fit follows."""
+) -> ErrorCovariance:
+    """The errors, which `reached` some bins, with those of models: left (models + `fit`) right.
+
+    A local fit follows what a wrong parameter leaves in its window: only the difference remains.
+    """
     used = [(c, model) for c, model in enumerate(rest.models) if model is not None]
     if not used:
-        return None
-    counts = [0 if model is None else len(model.drive) for model in rest.models]
+        return errors
+    omega, counts = (
+        errors.omega,
+        [0 if model is None else len(model.drive) for model in rest.models],
+    )
     ends, inputs = np.cumsum([0, *counts]).tolist(), fit.response.shape[2]
     slopes = np.zeros((omega.size, len(counts), inputs, ends[-1]), complex)
     effect = np.nan_to_num(fit.effect)
@@ -370,14 +379,37 @@ def shared_errors(
                 followed[f] += part @ at_bins[low - start : high - start]
         slopes[:, c, :, ends[c] : ends[c + 1]] = model.response(omega, inputs)[1] - followed
     slopes = np.einsum("foc,fcsp,fsi->foip", left, slopes, right, optimize=True)
-    places = used[0][1].places
+    slopes = np.nan_to_num(slopes)  # of what is not determined
+    # The drive is that of one noise times its share of the roots: all would fill the memory.
+    places, parameters = used[0][1].places, ends[-1]
     roots = noise.root_at(bins.omega[places])
     lines = roots / np.maximum(np.linalg.norm(roots, axis=2, keepdims=True), 1e-300)
     for c, model in enumerate(rest.models):
         lines[:, c] *= 0.0 if model is None else np.sqrt(model.noise)[:, None]
     line = np.repeat(np.arange(len(counts)), counts)
-    drive = np.concatenate([model.drive for _, model in used])
-    return SharedErrors(slopes, drive, lines, line, places)
+    single = np.concatenate([model.drive for _, model in used])
+
+    def drive_at(taken: np.ndarray) -> Complex[np.ndarray, "parameters taken roots"]:
+        return single[:, taken, None] * np.swapaxes(lines[taken], 0, 1)[line]
+
+    # Parameters of unit error; the bins that no local fit reaches are one more atom for each.
+    level = np.sum(np.abs(lines) ** 2, axis=2)
+    pairs = zip(single, line, strict=True)
+    size = np.sqrt(0.5 * np.array([np.abs(row) ** 2 @ level[:, k] for row, k in pairs]))
+    size = np.where(size > 0, size, 1.0)
+    gram, mine = np.zeros((parameters, parameters)), reached[places]
+    others = np.flatnonzero(~mine)
+    for start in range(0, others.size, _TOGETHER):
+        part = drive_at(others[start : start + _TOGETHER]).reshape(parameters, -1)
+        rows = np.ascontiguousarray(part).view(float)  # real and imaginary parts in turn
+        gram += rows @ rows.T
+    values, vectors = np.linalg.eigh(gram / np.outer(size, size))
+    drive = drive_at(np.flatnonzero(mine)) / size[:, None, None]
+    spare = np.zeros((parameters, parameters, drive.shape[2]), complex)
+    spare[:, :, 0] = vectors * np.sqrt(np.maximum(values, 0.0))
+    driven = np.concatenate([places[mine], reached.size + np.arange(parameters)])
+    drive = np.concatenate([drive, spare], axis=1)
+    return dataclasses.replace(errors, sensitivity=slopes * size, drive=drive, driven=driven)
 
 
 def highest_looked_at(highest: float, grid: Grid) -> float:

@@ -216,24 +216,19 @@ def _left_over(
     return _LeftOver(left[:, 0], left[:, 1:], leverage, weight, share, slope)
 
 
-class _Factors(NamedTuple):
-    value: Float[np.ndarray, " columns"]
-    covariance: Float[np.ndarray, "columns columns"]
+def _factors(left: _LeftOver, columns: Columns) -> tuple[np.ndarray, np.ndarray, float]:
+    """Real factors of columns in the residual, their covariance, and their size in standard errors.
 
-    @classmethod
-    def of(cls, left: _LeftOver, columns: Columns) -> "_Factors":
-        """Real factors of columns in the residual; covariance HC3 (MacKinnon and White, 1985)."""
-        weighted = np.conj(columns) * left.weight[:, None]
-        inverse = np.linalg.inv(np.real(weighted.T @ columns))
-        value = inverse @ np.real(weighted.T @ left.residual)
-        leverage = np.real(np.sum((weighted @ inverse) * columns, axis=1)) / 2
-        rest = (left.residual - columns @ value) / (1 - np.minimum(left.leverage + leverage, 0.9))
-        score = np.real(weighted * rest[:, None]) @ inverse
-        return cls(value, score.T @ score)
-
-    def size(self) -> float:
-        """In standard errors: the root of a chi-squared variable."""
-        return float(np.sqrt(self.value @ np.linalg.solve(self.covariance, self.value)))
+    The covariance is that of residuals of any variance (MacKinnon and White, 1985, HC3).
+    """
+    weighted = np.conj(columns) * left.weight[:, None]
+    inverse = np.linalg.inv(np.real(weighted.T @ columns))
+    value = inverse @ np.real(weighted.T @ left.residual)
+    leverage = np.real(np.sum((weighted @ inverse) * columns, axis=1)) / 2
+    rest = (left.residual - columns @ value) / (1 - np.minimum(left.leverage + leverage, 0.9))
+    score = np.real(weighted * rest[:, None]) @ inverse
+    covariance = score.T @ score
+    return value, covariance, float(np.sqrt(value @ np.linalg.solve(covariance, value)))
 
 
 def _say_static(left: _LeftOver, v: Signal) -> str:
@@ -244,14 +239,13 @@ def _say_static(left: _LeftOver, v: Signal) -> str:
         if np.min(left.share[columns]) < _DISTINCT_STATIC:
             return 1.0, 1.0, 0.0
         added = left.added[:, columns]
-        factors = _Factors.of(left, added)
-        clear = factors.size()
-        if clear < _CLEAR or clear < 2 * _Factors.of(left, 1j * added).size():
+        value, _, clear = _factors(left, added)
+        if clear < _CLEAR or clear < 2 * _factors(left, 1j * added)[2]:
             return 1.0, 1.0, 0.0
         powers = [_POWER[column] for column in columns]
         mean = [np.sum(x**power * v**2) / np.sum(v**2) for power in powers]
         ends = np.percentile(x, [low, high])[:, None] ** powers - mean
-        low_gain, high_gain = np.maximum(1 + ends @ factors.value, 0.0).tolist()
+        low_gain, high_gain = np.maximum(1 + ends @ value, 0.0).tolist()
         return low_gain, high_gain, clear
 
     # By v |v|, v^3, or both where these explain more.
@@ -307,14 +301,14 @@ def _say_change(left: _LeftOver, omega: Grid, method: Method) -> str:
     _, strength, turned = np.linalg.svd(real, full_matrices=False)
     distinct = strength > _DEPENDENT * strength[0]
     distinct = turned[distinct].T / strength[distinct]
-    factors = _Factors.of(left, columns @ distinct)
-    if not factors.size() > _CLEAR:
+    value, covariance, clear = _factors(left, columns @ distinct)
+    if not clear > _CLEAR:
         return ""
     # Of t, from -1 to 1, the mean in the second half is 1 more than that in the first.
     gains = np.stack([np.ones_like(left.slope), left.slope], axis=1)
     rows = np.hstack([gains, 1j * gains]) @ distinct
-    change = np.abs(rows @ factors.value)
-    doubt = np.real(np.sum((rows @ factors.covariance) * np.conj(rows), axis=1))
+    change = np.abs(rows @ value)
+    doubt = np.real(np.sum((rows @ covariance) * np.conj(rows), axis=1))
     at = int(np.argmax(change / np.sqrt(doubt)))
     if not change[at] > _SMALLEST:
         return ""

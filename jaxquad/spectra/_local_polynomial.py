@@ -31,10 +31,10 @@ from ._global_model import (
     left_moving,
     response_left,
     Rest,
-    shared_errors,
     subtract_models,
     take_off,
     weighted_models,
+    with_models,
 )
 from ._local_fit import (
     Bins,
@@ -107,8 +107,14 @@ def estimate_local_polynomial(
         width, rational = np.full(at.size, float(options.width)), np.zeros(at.size, bool)
     else:
         widest = reach(windows.grid, windows.narrow, windows.widest, rest.bins, rest.sources)
-        respond = setup.to_plant(rest, sources)
-        chosen = choose_widths(windows.grid, windows.least, widest, noise, respond)
+        to_moved = setup.to_moved(rest)
+
+        def to_plant(omega: Grid, half_width: Grid, shape: Shape) -> LocalFit:
+            moved = to_moved(omega, half_width, shape)
+            left = setup.factors(moved)[0]
+            return coloured_gain(setup.plant(moved), sources, left, omega, rest.bins)
+
+        chosen = choose_widths(windows.grid, windows.least, widest, noise, to_plant)
         width, rational = (part[at] for part in chosen)
     respond = setup.to_moved(rest)
     moved = respond(omega, width, "polynomial")
@@ -151,10 +157,11 @@ def estimate_local_polynomial(
         ends = [x[-max(int(_END * len(x)), _FEWEST) :].copy() for x in columns]
         ringing = left_moving(rest, ends, windows.grid, sources)[at]
     left, right = setup.factors(moved)
-    models = shared_errors(rest, bins, omega, moved, sources, left, right)
     edges, freedom = window_slices(windows.grid, windows.narrow, bins), narrow.freedom
     log_noise = smoothed(windows.grid, covariance_of_bands(*edges, freedom), freedom)
-    errors = error_covariance(omega, plant, noise, at, bins, back, sources, left, models)
+    parts = error_covariance(omega, plant, noise, at, bins, back, sources, left)
+    right = right * np.where(plant.determined[:, None, None], back, 0)
+    errors = with_models(*parts, rest, bins, moved, sources, left, right)
     response = plant.response * back
     with np.errstate(divide="ignore", invalid="ignore"):
         error = np.where(finite, np.sqrt(errors.variance() / 2) / np.abs(response), np.inf)
@@ -217,17 +224,6 @@ class Setup(NamedTuple):
                 omega, half_width, rest.bins, rest.sources, rest.moved, self.order, shape
             )
             return rest.add_models(omega, fit)
-
-        return respond
-
-    def to_plant(self, rest: Rest, sources: Noise) -> Respond:
-        """Fits from inputs to outputs, with the gain of the noise `sources` of what is moved."""
-        to_moved = self.to_moved(rest)
-
-        def respond(omega: Grid, half_width: Grid, shape: Shape) -> LocalFit:
-            moved = to_moved(omega, half_width, shape)
-            left = self.factors(moved)[0]
-            return coloured_gain(self.plant(moved), sources, left, omega, rest.bins)
 
         return respond
 

@@ -1,6 +1,5 @@
 """Local fits: how wide their windows may be, and the errors and coherence from what they leave."""
 
-import dataclasses
 from collections.abc import Callable
 from typing import Literal, NamedTuple
 
@@ -18,7 +17,6 @@ _FALSE_ALARM = 1e-3  # chance that noise alone leaves any of a record's response
 _HARMLESS = 1e-4  # share of the moved channel's power
 _FAR_OFF = 10.0  # residual power over that of the noise from which a response is unresolved
 _UNKNOWN = 1e60  # error of what is not determined: infinity, but products with zero are zero
-_TOGETHER = 1024  # bins whose drives are taken at a time: those of a long record are many
 _FREEDOM = 10  # complex degrees of freedom left over by the least window
 _NARROW = 0.15  # half-width, relative to the frequency, at which noise and powers are estimated
 WIDENED, WIDENINGS = 1.5, 6  # ratio and number of the steps from a window that is undetermined
@@ -206,48 +204,6 @@ def reach(omega: Grid, centre: Grid, widest: Grid, bins: Bins, columns: slice) -
     return far
 
 
-class SharedErrors(NamedTuple):
-    """Errors of real parameters that noise W of unit power has moved by Re(drive W), `roots` to a
-    bin.
-
-    The drive is that of one noise times its share of the roots: all at once would fill the memory.
-    """
-
-    slopes: Complex[np.ndarray, "frequencies outputs inputs parameters"]
-    single: Complex[np.ndarray, "parameters places"]
-    lines: Complex[np.ndarray, "places lines roots"]
-    line: Int[np.ndarray, " parameters"]  # that each parameter's noise has in `lines`
-    places: Int[np.ndarray, " places"]  # bins, rising
-
-    def drive_at(
-        self, taken: Int[np.ndarray, " taken"]
-    ) -> Complex[np.ndarray, "parameters taken roots"]:
-        """The drive by some of the `places`, numbers of which are `taken`."""
-        lines = np.swapaxes(self.lines[taken], 0, 1)
-        return self.single[:, taken, None] * lines[self.line]
-
-    def on_atoms(
-        self, reached: Bool[np.ndarray, " bins"]
-    ) -> tuple[np.ndarray, np.ndarray, Int[np.ndarray, " driven"]]:
-        """Slopes by errors of unit size, their drive by atoms, and these; others are one more."""
-        level = np.sum(np.abs(self.lines) ** 2, axis=2)
-        pairs = zip(self.single, self.line, strict=True)
-        size = np.sqrt(0.5 * np.array([np.abs(row) ** 2 @ level[:, k] for row, k in pairs]))
-        size = np.where(size > 0, size, 1.0)
-        mine, parameters = reached[self.places], size.size
-        gram, others = np.zeros((parameters, parameters)), np.flatnonzero(~mine)
-        for first in range(0, others.size, _TOGETHER):
-            part = self.drive_at(others[first : first + _TOGETHER]).reshape(parameters, -1)
-            rows = np.ascontiguousarray(part).view(float)  # real and imaginary parts in turn
-            gram += rows @ rows.T
-        values, vectors = np.linalg.eigh(gram / np.outer(size, size))
-        drive = self.drive_at(np.flatnonzero(mine)) / size[:, None, None]
-        spare = np.zeros((parameters, parameters, drive.shape[2]), complex)
-        spare[:, :, 0] = vectors * np.sqrt(np.maximum(values, 0.0))
-        driven = np.concatenate([self.places[mine], reached.size + np.arange(parameters)])
-        return self.slopes * size, np.concatenate([drive, spare], axis=1), driven
-
-
 def error_covariance(
     omega: Grid,
     fit: LocalFit,
@@ -257,9 +213,8 @@ def error_covariance(
     back: Complex[np.ndarray, "frequencies 1 1"],
     sources: Noise,
     left: Left,
-    models: SharedErrors | None,
-) -> ErrorCovariance:
-    """Errors of `fit`: atoms are bins, their noise `left` times `sources`, more where misfit."""
+) -> tuple[ErrorCovariance, Bool[np.ndarray, " bins"]]:
+    """Errors of `fit` by the noise `left` times `sources`, more where misfit; the bins in use."""
     colour = _colour_of_noise(sources, left, omega, bins, fit)
     effect = fit.effect * np.exp(0.5 * np.mean(np.log(colour), axis=2))[:, None, :]
     scale = fit.boost * np.sqrt(_misfit(fit, noise, at, colour, _CHANCE_OF_MISFIT))
@@ -274,12 +229,7 @@ def error_covariance(
     effect[~finite, :, 0] = _UNKNOWN
     first = np.where(finite, fit.first, 0)
     errors = ErrorCovariance(np.asarray(omega), effect, root, first=first)
-    if models is None:
-        return errors
-    slopes = np.where(finite[:, None, None, None], models.slopes * back[..., None], 0.0)
-    reached = reach.reached(bins.omega.size)
-    slopes, drive, driven = models._replace(slopes=slopes).on_atoms(reached)
-    return dataclasses.replace(errors, sensitivity=slopes, drive=drive, driven=driven)
+    return errors, reach.reached(bins.omega.size)
 
 
 def _colour_of_noise(

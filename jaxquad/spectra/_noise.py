@@ -8,10 +8,8 @@ to these: poles outlast any series in the slopes of G, but with them w y' = (w y
 transform that is linear in Y_1.
 """
 
-import functools as ft
-import inspect
-from collections.abc import Callable, Sequence
-from typing import NamedTuple, TypeVar
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Complex, Float
@@ -30,13 +28,10 @@ from ._estimators import (
 from ._fourier_sums import coefficients
 
 
-Function = TypeVar("Function", bound=Callable)
-
 _BANDWIDTH = 0.2  # of the smoothing, in ln(omega)
 _WIDE = 2.0  # that of the correlations between outputs in open loop
 _UNLIKELY = 1e-4  # chance at which a residual counts as a misfit, or a line in the noise
 _NEAR = 1e-2  # of a pole: its neighbourhood's rounding is below 1e-13
-_KEPT = 256  # frequencies, of which a square takes half a megabyte
 _FLOOR = 1e-26  # of the output's power: below it lies rounding
 _RIDGE = 1e-12  # of the columns' size, so that empty ones do no harm
 _ROUNDING = 1e-7  # of a residual: the square is below rounding
@@ -136,18 +131,8 @@ def smooth_noise(
     return Noise(omega, np.exp(smooth), correlation, counts)
 
 
-def kept_if_few(function: Function, frequencies: int) -> Function:
-    """The function with its `ft.lru_cache` for few frequencies, else without: squares are large."""
-    return function if frequencies <= _KEPT else inspect.unwrap(function)
-
-
 def kernels(omega: Grid) -> Float[np.ndarray, "3 frequencies frequencies"]:
     """Weights of neighbours, times 1, the distance in ln(omega) and its square."""
-    return kept_if_few(_kernels_of, omega.size)(tuple(omega.tolist()))
-
-
-@ft.lru_cache(maxsize=4)
-def _kernels_of(omega: tuple[float, ...]) -> Float[np.ndarray, "3 frequencies frequencies"]:
     place = np.log(omega)
     offset = place[None, :] - place[:, None]
     kernel = np.exp(-0.5 * (offset / _BANDWIDTH) ** 2)
@@ -189,32 +174,25 @@ def covariance_of_windows(
     lengths: tuple[int, ...],
 ) -> Square:
     """Of the logarithm of residual powers of all lengths, whose standard errors are `levels`."""
-    angles, shared = tuple(angle.tolist()), kept_if_few(_shared_power, angle.size)
-    pairs = zip(levels.T, lengths, strict=True)
-    parts = (shared(shape, length, angles) * level * level[:, None] for level, length in pairs)
-    return ft.reduce(np.add, parts)
-
-
-@ft.lru_cache(maxsize=12)
-def _shared_power(shape: str, length: int, angle: tuple[float, ...]) -> Square:
-    """Squared correlation of white noise behind windows of this length at two frequencies (rad)."""
-    places = np.array(angle)
-    level, cosine = coefficients(shape)
-    cycles = (places[:, None] - places) * length / (2 * np.pi)
+    total, (level, cosine) = np.zeros((angle.size, angle.size)), coefficients(shape)
     terms = level**2 + cosine**2 / 2, level * cosine, cosine**2 / 4  # of the squared window
-    # sinc(c - k) + sinc(c + k) for k = 0, 1, 2 have one sine in common, but poles at whole cycles.
-    square = cycles**2
-    poles = square * (square - 1) * (square - 4)
-    near = np.abs(poles) < _NEAR
-    poles = np.where(near, 1.0, poles)
-    ratio = terms[0] * (square - 1) * (square - 4)
-    ratio += 2 * square * (terms[2] * (square - 1) - terms[1] * (square - 4))
-    correlation = np.sin(np.pi * cycles) * cycles * ratio / (np.pi * poles)
-    close = cycles[near]
-    correlation[near] = terms[0] * np.sinc(close)
-    for k in (1, 2):
-        correlation[near] += terms[k] * (np.sinc(close - k) + np.sinc(close + k))
-    return (correlation / terms[0]) ** 2
+    for error, length in zip(levels.T, lengths, strict=True):
+        # The squared correlation of white noise behind windows at two frequencies:
+        # sinc(c - k) + sinc(c + k) for k = 0, 1, 2 have one sine in common, but poles at whole c.
+        cycles = (angle[:, None] - angle) * length / (2 * np.pi)
+        square = cycles**2
+        poles = square * (square - 1) * (square - 4)
+        near = np.abs(poles) < _NEAR
+        poles = np.where(near, 1.0, poles)
+        ratio = terms[0] * (square - 1) * (square - 4)
+        ratio += 2 * square * (terms[2] * (square - 1) - terms[1] * (square - 4))
+        correlation = np.sin(np.pi * cycles) * cycles * ratio / (np.pi * poles)
+        close = cycles[near]
+        correlation[near] = terms[0] * np.sinc(close)
+        for k in (1, 2):
+            correlation[near] += terms[k] * (np.sinc(close - k) + np.sinc(close + k))
+        total += (correlation / terms[0]) ** 2 * error * error[:, None]
+    return total
 
 
 class Rest(NamedTuple):

@@ -412,10 +412,9 @@ class ArduPilot(Firmware):
         letter = "RPY"[axis]
         return Channels(
             terms=[f"PID{letter}.{x}" for x in ("P", "I", "D", "FF")],
-            motors=[f"RCOU.C{k}" for k in range(1, 5)],
-            output={f"RATE.{letter}Out": 1.0},
+            motors=[f"RCOU.C{k}" for k in range(1, 5)], output={f"RATE.{letter}Out": 1.0},
             slewed={f"PID{letter}.Dmod": 1.0},
-        )
+        )  # fmt: skip
 
     def what_to_fly(self, axis: str) -> str:
         rate = 7 + AXES.index(axis)

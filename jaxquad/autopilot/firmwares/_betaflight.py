@@ -339,10 +339,9 @@ class Betaflight(Firmware):
             unfiltered=[f"{prefix}gyroUnfilt[{k}]" for k in range(3)],
             terms=[f"{prefix}axis{x}[{axis}]" for x in "PIDF"],
             motors=[f"{prefix}motor[{k}]" for k in range(8)],
-            output={f"{prefix}axisSum[{axis}]": 1.0},
-            stick={f"{prefix}rcCommand[3]": 1.0},
+            output={f"{prefix}axisSum[{axis}]": 1.0}, stick={f"{prefix}rcCommand[3]": 1.0},
             mixed={f"{prefix}axisMixed[{axis}]": 1.0},
-        )
+        )  # fmt: skip
 
     def what_to_fly(self, axis: str) -> str:
         return (
