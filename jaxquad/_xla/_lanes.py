@@ -438,14 +438,13 @@ def _scan(lanes: Lanes, equation: JaxprEqn, *args: Cells) -> list[Cells]:
     return [*carry, *(np.stack(column) for column in zip(*rows, strict=True))]
 
 
-Axes = Sequence[int | np.integer]
-
-
-def _other_axes(lanes: Lanes, equation: JaxprEqn, axes: Axes) -> tuple[int | np.integer, ...]:
+def _other_axes(
+    lanes: Lanes, equation: JaxprEqn, axes: Sequence[int | np.integer]
+) -> tuple[int, ...]:
     """The axes, none of which is that of the members."""
     shape, name = _shape(equation), equation.primitive.name
     _require(not any(lanes.is_members(shape, axis) for axis in axes), f"{name} over the members")
-    return tuple(axes)
+    return tuple(map(int, axes))
 
 
 def _require(condition: bool, otherwise: str) -> None:

@@ -263,10 +263,6 @@ class Division:
             if moves and outside:
                 self.light[k] = False
             kept[k] = not moves and outside
-        self._keep_expensive(kept, uses)
-        return kept
-
-    def _keep_expensive(self, kept: list[bool], uses: list[int]) -> None:
         price = [0] * len(self.ops)  # of what a loop computes up to here
         for k, op in enumerate(self.ops):
             if not self.light[k] or self.fixed[k]:
@@ -276,6 +272,7 @@ class Division:
             if not self._moves(k):
                 price[k] += _PRICE if kind_of(op) in _SLOW else 1
                 kept[k] |= price[k] * (uses[k] - 1) >= _DEAR
+        return kept
 
     def _moves(self, k: int) -> bool:
         return self.light[k] and kind_of(self.ops[k]) in FREE

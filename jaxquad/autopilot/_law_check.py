@@ -282,10 +282,8 @@ class LoopCheck:
                 f"{self.law.text}; the excitation is too weak to fly the loop again: it is "
                 f"coherent at {int(self.used.sum())} frequencies"
             )
-        numbers = (
-            "law and plant, flown on the logged set-point, miss the rate by "
-            f"{100 * self.misfit:.2g} %"
-        )
+        missed = f"miss the rate by {100 * self.misfit:.2g} %"
+        numbers = f"law and plant, flown on the logged set-point, {missed}"
         limited = f"{100 * self.limited:.1f} % of the flight"
         if self.kind == "flown":
             often = self.limited > _SATURATED

@@ -1,4 +1,4 @@
-"""A logged flight again, sample by sample at the loop's rate: the law's terms, and the whole loop.
+"""A logged flight again: the law's terms, the whole loop in time, and its response to set-points.
 
 What is not linear in a law, such as a relaxed or limited integral, is in its equations and so in
 its replay. Source: docs/autopilots.md, "Which gains flew".
@@ -115,7 +115,7 @@ def fly_again(
     added = np.zeros_like(setpoint) if injected is None else injected
     forward = None if feed_forward is None else column(feed_forward)
     rows = grid.rows(column(setpoint), throttle, late, forward, grid.fine(column(added), late))
-    # Exactly over a sample, with its part by which the command comes late: torque, rate, command.
+    # Torque and rate over a sample, exactly: by the state, the command before and the one now.
     lag, late_part = max(plant.lag, 1e-3 * dt_loop), plant.delay % dt_loop
     generator = np.zeros((3, 3))
     generator[0, 0], generator[0, 2] = -1 / lag, plant.gain / lag
@@ -123,7 +123,7 @@ def fly_again(
     over = lambda span: expm(span * generator)
     rest = over(dt_loop - late_part)
     before = rest[:2, :2] @ over(late_part)[:2, 2]
-    step = _Step(over(dt_loop)[:2, :2], before, rest[:2, 2])
+    step = over(dt_loop)[:2, :2], before, rest[:2, 2]
     wait = max(int(np.floor(plant.delay / dt_loop + 1e-9)), 0)
     return grid.coarse(np.asarray(_flown_again(flown, step, wait, rows))[:, 0])
 
@@ -191,16 +191,8 @@ def _replayed(flown: FlownLoop, rows: _Row):
     return jax.lax.scan(sample, flown.law.rest(zero), rows)[1]
 
 
-class _Step(NamedTuple):
-    """The held plant over a sample: the state's matrix, and those of the command before and now."""
-
-    state: Float[np.ndarray, "2 2"]
-    before: Float[np.ndarray, " 2"]
-    now: Float[np.ndarray, " 2"]
-
-
 @eqx.filter_jit
-def _flown_again(flown: FlownLoop, step: _Step, wait: int, rows: _Row):
+def _flown_again(flown: FlownLoop, step: tuple[np.ndarray, ...], wait: int, rows: _Row):
     zero = jnp.zeros_like(rows.setpoint[0])
     queue = jnp.zeros((wait + 1, *zero.shape))
     matrix, before, now = map(jnp.asarray, step)

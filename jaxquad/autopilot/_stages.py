@@ -5,10 +5,9 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Literal, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Float
 
 from ._firmware import OuterLoop
-from ._rate_loops import delay_margin, is_stable, RateLoops, together
+from ._rate_loops import delay_margin, is_stable, OneGains, RateLoops, together
 
 
 Kind = Literal["proposed", "kept", "cannot tell", "not to be flown"]
@@ -82,9 +81,7 @@ class Stage(NamedTuple):
         return {**self._asdict(), "angle": None if self.angle is None else self.angle._asdict()}
 
 
-def certify_angle(
-    loops: RateLoops, gains: Float[np.ndarray, " gains"], angle: OuterLoop, value: float
-) -> OuterStage:
+def certify_angle(loops: RateLoops, gains: OneGains, angle: OuterLoop, value: float) -> OuterStage:
     """The angle loop with a value of its parameter around the rate loop with these gains."""
     around = loops.outer_loops(gains, angle.unit * value)
     distance = 1 + around
@@ -96,9 +93,7 @@ def certify_angle(
     return OuterStage(angle.name, value, angle.closed, *numbers)
 
 
-def certify_gains(
-    loops: Sequence[RateLoops], designs: Sequence[Float[np.ndarray, " gains"]]
-) -> list[Stage]:
+def certify_gains(loops: Sequence[RateLoops], designs: Sequence[OneGains]) -> list[Stage]:
     """What each of the designs gives under its own law, the first of which is what flew."""
     rms, stages, flown = lambda x: float(np.sqrt(np.mean(x**2))), [], None
     for loop, gains in zip(loops, designs, strict=True):

@@ -1,11 +1,15 @@
-"""Probability distributions for uncertain parameters."""
+"""Probability distributions for uncertain parameters, and points to draw from them at."""
 
 import abc
 from collections.abc import Sequence
+from typing import Any
 
 import equinox as eqx
+import jax
 import numpy as np
-from jaxtyping import ArrayLike, Float
+from jaxtyping import Array, ArrayLike, Float, Key
+
+from jaxquad._core import as_array, is_concrete
 
 
 Numbers = Float[np.ndarray, "..."]  # [] or [axes]
@@ -53,22 +57,6 @@ def check_axes(**values: Numbers) -> None:
             f"the numbers of a distribution have the shapes {text}: give one for all axes, or "
             "one for each axis"
         )
-
-
-def check_ends(low: Numbers, high: Numbers) -> None:
-    """Raise ValueError unless low < high, both finite."""
-    check_axes(low=low, high=high)
-    check_finite(low=low, high=high)
-    if not np.all(low < high):
-        raise ValueError(
-            f"a distribution from {number(low)} to {number(high)} is empty: give low < high, or a "
-            "plain number for a quantity that does not vary"
-        )
-
-
-def _from_end_to_end(count: int) -> Float[np.ndarray, " count"]:
-    """Probabilities for a grid that holds both ends of a range."""
-    return np.linspace(0.0, 1.0, count) if count > 1 else np.array([0.5])
 
 
 Shares = Float[np.ndarray, "rows members"]  # of the probability, 0 to 1
@@ -208,7 +196,13 @@ class Uniform(Distribution):
     high: Numbers = eqx.field(converter=as_numbers)
 
     def __check_init__(self):
-        check_ends(self.low, self.high)
+        check_axes(low=self.low, high=self.high)
+        check_finite(low=self.low, high=self.high)
+        if not np.all(self.low < self.high):
+            raise ValueError(
+                f"a distribution from {number(self.low)} to {number(self.high)} is empty: give low "
+                "< high, or a plain number for a quantity that does not vary"
+            )
 
     def quantile(self, u: Shares) -> Values:
         low, high = row(self.low), row(self.high)
@@ -219,30 +213,21 @@ class Uniform(Distribution):
         return self.low, self.high
 
     def grid_levels(self, count: int) -> Float[np.ndarray, " count"]:
-        return _from_end_to_end(count)
+        return np.linspace(0.0, 1.0, count) if count > 1 else np.array([0.5])  # with both ends
 
     @property
     def text(self) -> str:
         return f"uniform {number(self.low)} .. {number(self.high)}"
 
 
-class LogUniform(Distribution):
+class LogUniform(Uniform):
     """Uniform in the logarithm, for quantities that are known up to a factor.
 
-    **Arguments:**
-
-    - `low`, `high`: the ends, scalars or one for each axis.
-
-    **Raises:**
-
-    - `ValueError`: unless 0 < low < high, both finite.
+    **Arguments:** and **Raises:** as of `jq.ensembles.Uniform`; both ends are above 0.
     """
 
-    low: Numbers = eqx.field(converter=as_numbers)
-    high: Numbers = eqx.field(converter=as_numbers)
-
     def __check_init__(self):
-        check_ends(self.low, self.high)
+        Uniform.__check_init__(self)  # what it says comes first
         check_above_zero(
             "a ratio needs it; use jq.ensembles.Uniform for a range with 0", low=self.low
         )
@@ -250,13 +235,6 @@ class LogUniform(Distribution):
     def quantile(self, u: Shares) -> Values:
         low, high = row(self.low), row(self.high)
         return np.clip(low * (high / low) ** u, low, high)
-
-    @property
-    def support(self) -> tuple[Numbers, Numbers]:
-        return self.low, self.high
-
-    def grid_levels(self, count: int) -> Float[np.ndarray, " count"]:
-        return _from_end_to_end(count)
 
     @property
     def text(self) -> str:
@@ -357,3 +335,62 @@ def normal_scores(u: Shares) -> Shares:
     from scipy.special import ndtri
 
     return ndtri(_TAIL + (1 - 2 * _TAIL) * u)
+
+
+SAMPLINGS = ("latin", "random", "sobol", "grid")
+
+
+def make_generator(key: Key[Array, ""]) -> np.random.Generator:
+    """Random numbers of a key, outside JAX: nothing is compiled, and both precisions get the same.
+
+    Raise ValueError under jit.
+    """
+    if not is_concrete(key):
+        raise ValueError("members are drawn outside jit, vmap and grad: pass drawn members in")
+    return np.random.default_rng(np.asarray(jax.random.key_data(key)).ravel())
+
+
+def make_member_keys(key: Key[Array, ""], members: int) -> Key[Array, " members"]:
+    """A key for each member; more members leave the first ones' as they are."""
+    random = make_generator(jax.random.fold_in(key, 1))
+    words = random.integers(0, 2**32, (members, 2), dtype=np.uint32)
+    # Other generators draw numbers under vmap that depend on how many members there are.
+    return jax.random.wrap_key_data(as_array(words), impl="threefry2x32")
+
+
+def draw_unit_points(sampling: str, key: Key[Array, ""], rows: int, members: int) -> Shares:
+    """Probabilities, one row for each number that a member draws."""
+    random = make_generator(key)
+    if sampling == "sobol":
+        from scipy.stats import qmc
+
+        if not rows:
+            return np.zeros((0, members))
+        # Powers of two are balanced; what is cut off is the end of a scrambled sequence.
+        seeded: Any = {"seed": random}  # the name in SciPy 1.13, taken by those that call it rng
+        return qmc.Sobol(rows, **seeded).random_base2((members - 1).bit_length())[:members].T
+    inside = random.random((rows, members))
+    if sampling == "random":
+        return inside
+    cells = np.stack([random.permutation(members) for _ in range(rows)]) if rows else inside
+    return (cells + inside) / members
+
+
+def make_grid(distributions: Sequence[Distribution], members: int) -> Shares:
+    """Every combination of equally many levels of each; the last one changes fastest.
+
+    Raise ValueError where `members` is no such number.
+    """
+    if not distributions:
+        return np.zeros((0, members))
+    count = round(members ** (1 / len(distributions)))
+    if count ** len(distributions) != members:
+        below = int(members ** (1 / len(distributions)))
+        near = " or ".join(str(k ** len(distributions)) for k in (below, below + 1))
+        raise ValueError(
+            f"a grid over {len(distributions)} quantities has equally many levels of each, so "
+            f"{members} members do not fill one: draw {near}, or use "
+            'sampling="latin" for any number'
+        )
+    levels = np.meshgrid(*(one.grid_levels(count) for one in distributions), indexing="ij")
+    return np.stack([level.ravel() for level in levels])

@@ -1,25 +1,40 @@
-from collections.abc import Sequence
+"""What varies between the members of an ensemble, and how they are drawn."""
+
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Key
+from jaxtyping import Array, Key
 
-from jaxquad._core import require_all_positive
+from jaxquad._core import as_float, require_all_positive
 from jaxquad.loops import Loop
 from jaxquad.models import DecoupledAxes, Multirotor
 
-from ._distributions import as_distribution, Distribution, distribution_or_none, number
-from ._draw import draw_members, SAMPLINGS
+from ._distributions import (
+    as_distribution,
+    Distribution,
+    distribution_or_none,
+    draw_unit_points,
+    make_grid,
+    make_member_keys,
+    normal_scores,
+    number,
+    SAMPLINGS,
+)
 from ._members import (
     count_axes,
     FACTORS,
+    MemberPayload,
     Members,
+    multiply,
     nominal_value,
     Payload,
+    plant_inertia,
     QUANTITIES,
     VariablePlant,
+    vary_plant,
 )
 from ._posterior import Posterior
 
@@ -41,26 +56,6 @@ _UNITS = {
 }
 
 
-def describe(ensemble: "Ensemble") -> str:
-    """What varies, how and in which unit; then what is the same in all members."""
-    distributions = ensemble.distributions
-    varies = {name: one for name, one in distributions.items() if one.varies}
-    same = {
-        name: one
-        for name, one in distributions.items()
-        if name not in varies and not (name in FACTORS and np.all(one.support[0] == 1))
-    }
-    corner = f", gusts of {ensemble.gust_corner:.4g} rad/s" if ensemble.gust is not None else ""
-    lines = [f"ensemble, {ensemble.sampling} sampling{corner}"]
-    lines += [f"  plants {ensemble.plants}"] if ensemble.plants is not None else []
-    for name, one in (varies | same).items():
-        relative = one.relative and name not in FACTORS
-        unit = "times the nominal" if relative else _UNITS[name]
-        alone = ", each axis by itself" if name in ensemble.independent else ""
-        lines.append(f"  {name:<15} {one.text:<32} {unit}{alone}")
-    return "\n".join(lines)
-
-
 _POSITIVE = {
     "inertia": "factors of the plant's inertia",
     "torque_gain": "factors of the plant's torque gain",
@@ -79,49 +74,6 @@ _ONE_FOR_ALL = ("delay", "payload at", "payload width")  # axes
 _OF_ROTORS = ("torque_gain", "lag")  # of a multirotor: they act on all axes alike
 
 
-def _check_ensemble(ensemble: "Ensemble") -> None:
-    """Raise ValueError for an ensemble that cannot be drawn around any loop."""
-    if not (ensemble.plants is None or isinstance(ensemble.plants, Posterior)):
-        raise ValueError(
-            f"plants is a {type(ensemble.plants).__name__}: an ensemble says what varies, and the "
-            "nominal plant belongs to jq.Loop(plant, controller). Give a "
-            "jq.ensembles.Posterior(fit, ...), or only distributions, such as "
-            "inertia=jq.ensembles.LogUniform(0.5, 3.0)"
-        )
-    if not (ensemble.payload is None or isinstance(ensemble.payload, Payload)):
-        raise ValueError(
-            f"payload is {ensemble.payload!r}: give a jq.ensembles.Payload(added, at=...)"
-        )
-    require_all_positive(gust_corner=ensemble.gust_corner)
-    distributions = ensemble.distributions
-    if ensemble.sampling not in SAMPLINGS:
-        raise ValueError(f"sampling is {ensemble.sampling!r}: use one of {', '.join(SAMPLINGS)}")
-    if ensemble.sampling == "grid" and ensemble.plants is not None:
-        raise ValueError('a posterior has no grid to draw on: use sampling="latin"')
-    varying = [name for name, one in distributions.items() if one.varies]
-    names = ensemble.independent
-    if isinstance(names, str) or any(name not in varying for name in names):
-        raise ValueError(
-            f"independent is {names!r}: name quantities that vary, in brackets; here "
-            f"{', '.join(varying) or 'none does'}"
-        )
-    for name, one in distributions.items():
-        if name in ensemble.independent and name in _ONE_FOR_ALL:
-            raise ValueError(f"{name} is the same for all axes: leave it out of independent=")
-        if name in FACTORS or not one.relative:
-            _check_support(name, one)
-    if ensemble.payload is not None:
-        least = [distributions[name].support[0] for name in ("inertia", "payload added")]
-        if not sum(np.min(x) for x in least) > 0:
-            raise ValueError(
-                f"the payload adds {number(least[1])} and a member can start from "
-                f"{number(least[0])} times the nominal inertia, whose sum is not above 0: remove "
-                "less inertia"
-            )
-    if ensemble.plants is not None:
-        ensemble.plants.require_determined(ensemble.replaced)
-
-
 def _check_support(name: str, one: Distribution) -> None:
     least = float(np.min(one.support[0]))
     if name in _POSITIVE and not least > 0:
@@ -137,45 +89,7 @@ def _check_support(name: str, one: Distribution) -> None:
         )
 
 
-def _require_single_loop(ensemble: "Ensemble", loop: Loop) -> VariablePlant:
-    """The nominal plant. Raise ValueError for a loop that an ensemble cannot be drawn around."""
-    if not isinstance(loop, Loop):
-        raise ValueError(f"loop is a {type(loop).__name__}: give jq.Loop(plant, controller, ...)")
-    plant = loop.plant
-    if not isinstance(plant, DecoupledAxes | Multirotor):
-        raise ValueError(
-            f"the loop's plant is a {type(plant).__name__}, but an ensemble needs a "
-            "jq.DecoupledAxes or jq.models.Multirotor. For an identified model use "
-            "jq.Ensemble(jq.ensembles.Posterior(fit, ...)), with plant= for one of your own. To "
-            "fly any other plant, draw its "
-            "arrays yourself, with the members on the last axis and fields made by "
-            "jq.loops.per_member, and fly them with jq.evaluate(jq.Loop(plant, ...), scenario)"
-        )
-    shape = plant.shape[1:] if isinstance(plant, DecoupledAxes) else plant.ensemble
-    if shape or loop.delay.ndim:
-        raise ValueError(
-            f"the loop already is an ensemble of {shape or loop.delay.shape}: give one plant and "
-            "one delay, and describe what varies by distributions"
-        )
-    if ensemble.plants is not None:
-        ensemble.plants.require_nominal(plant)
-    return plant
-
-
-def _check_axes(name: str, one: Distribution, plant: VariablePlant) -> None:
-    sizes = {x.size for x in one.support} - {1}
-    rotors = isinstance(plant, Multirotor) and name in _OF_ROTORS
-    if sizes and (name in _ONE_FOR_ALL or rotors):
-        raise ValueError(f"{name} is the same for all axes: give it numbers, not rows of them")
-    if sizes and sizes != {count_axes(plant)}:
-        raise ValueError(
-            f"the distribution of {name} is for {max(sizes)} axes, but the plant has "
-            f"{count_axes(plant)}: give one number for all axes, or one for each"
-        )
-
-
-def _check_request(n: int, key: Key[Array, ""]) -> None:
-    """Raise ValueError for a draw of no members, or without a key."""
+def _require_key(n: int, key: Key[Array, ""]) -> None:
     if isinstance(n, bool) or not isinstance(n, int | np.integer) or n < 1:
         raise ValueError(f"n is {n}: draw a whole number of members, 1 or more")
     if not (isinstance(key, jax.Array) and jnp.issubdtype(key.dtype, jax.dtypes.prng_key)):
@@ -184,7 +98,9 @@ def _check_request(n: int, key: Key[Array, ""]) -> None:
 
 _FRESH = 0x5EED  # folded into the key of members that certify what was tuned on others
 
-Given = Distribution | ArrayLike | Sequence[float]
+
+def _optional() -> Any:
+    return eqx.field(converter=distribution_or_none, default=None, kw_only=True)
 
 
 class Ensemble(eqx.Module):
@@ -236,34 +152,58 @@ class Ensemble(eqx.Module):
     inertia: Distribution = eqx.field(converter=as_distribution, default=1.0, kw_only=True)
     torque_gain: Distribution = eqx.field(converter=as_distribution, default=1.0, kw_only=True)
     assumed_inertia: Distribution = eqx.field(converter=as_distribution, default=1.0, kw_only=True)
-    lag: Distribution | None = eqx.field(
-        converter=distribution_or_none, default=None, kw_only=True
-    )  # s
-    delay: Distribution | None = eqx.field(
-        converter=distribution_or_none, default=None, kw_only=True
-    )  # s
-    damping: Distribution | None = eqx.field(
-        converter=distribution_or_none, default=None, kw_only=True
-    )  # N m s/rad
-    stiffness: Distribution | None = eqx.field(
-        converter=distribution_or_none, default=None, kw_only=True
-    )  # N m/rad
-    coulomb: Distribution | None = eqx.field(
-        converter=distribution_or_none, default=None, kw_only=True
-    )  # N m
-    noise: Distribution | None = eqx.field(
-        converter=distribution_or_none, default=None, kw_only=True
-    )  # rad
-    gust: Distribution | None = eqx.field(
-        converter=distribution_or_none, default=None, kw_only=True
-    )  # N m
+    lag: Distribution | None = _optional()
+    delay: Distribution | None = _optional()
+    damping: Distribution | None = _optional()
+    stiffness: Distribution | None = _optional()
+    coulomb: Distribution | None = _optional()
+    noise: Distribution | None = _optional()
+    gust: Distribution | None = _optional()
     gust_corner: float = eqx.field(static=True, default=2.0, kw_only=True)  # rad/s
     payload: Payload | None = eqx.field(default=None, kw_only=True)
     sampling: str = eqx.field(static=True, default="latin", kw_only=True)
     independent: tuple[str, ...] = eqx.field(static=True, default=(), kw_only=True)
 
     def __check_init__(self):
-        _check_ensemble(self)
+        if not (self.plants is None or isinstance(self.plants, Posterior)):
+            raise ValueError(
+                f"plants is a {type(self.plants).__name__}: an ensemble says what varies, and the "
+                "nominal plant belongs to jq.Loop(plant, controller). Give a "
+                "jq.ensembles.Posterior(fit, ...), or only distributions, such as "
+                "inertia=jq.ensembles.LogUniform(0.5, 3.0)"
+            )
+        if not (self.payload is None or isinstance(self.payload, Payload)):
+            raise ValueError(
+                f"payload is {self.payload!r}: give a jq.ensembles.Payload(added, at=...)"
+            )
+        require_all_positive(gust_corner=self.gust_corner)
+        distributions = self.distributions
+        if self.sampling not in SAMPLINGS:
+            raise ValueError(f"sampling is {self.sampling!r}: use one of {', '.join(SAMPLINGS)}")
+        if self.sampling == "grid" and self.plants is not None:
+            raise ValueError('a posterior has no grid to draw on: use sampling="latin"')
+        varying = [name for name, one in distributions.items() if one.varies]
+        names = self.independent
+        if isinstance(names, str) or any(name not in varying for name in names):
+            raise ValueError(
+                f"independent is {names!r}: name quantities that vary, in brackets; here "
+                f"{', '.join(varying) or 'none does'}"
+            )
+        for name, one in distributions.items():
+            if name in self.independent and name in _ONE_FOR_ALL:
+                raise ValueError(f"{name} is the same for all axes: leave it out of independent=")
+            if name in FACTORS or not one.relative:
+                _check_support(name, one)
+        if self.payload is not None:
+            least = [distributions[name].support[0] for name in ("inertia", "payload added")]
+            if not sum(np.min(x) for x in least) > 0:
+                raise ValueError(
+                    f"the payload adds {number(least[1])} and a member can start from "
+                    f"{number(least[0])} times the nominal inertia, whose sum is not above 0: "
+                    "remove less inertia"
+                )
+        if self.plants is not None:
+            self.plants.require_determined(self.replaced)
 
     @property
     def distributions(self) -> dict[str, Distribution]:
@@ -285,11 +225,42 @@ class Ensemble(eqx.Module):
 
         Raise ValueError for a loop that they do not fit.
         """
-        plant = _require_single_loop(self, loop)
+        if not isinstance(loop, Loop):
+            raise ValueError(
+                f"loop is a {type(loop).__name__}: give jq.Loop(plant, controller, ...)"
+            )
+        plant = loop.plant
+        if not isinstance(plant, DecoupledAxes | Multirotor):
+            raise ValueError(
+                f"the loop's plant is a {type(plant).__name__}, but an ensemble needs a "
+                "jq.DecoupledAxes or jq.models.Multirotor. For an identified model use "
+                "jq.Ensemble(jq.ensembles.Posterior(fit, ...)), with plant= for one of your own. "
+                "To fly any other plant, draw its arrays yourself, with the members on the last "
+                "axis and fields made by jq.loops.per_member, and fly them with "
+                "jq.evaluate(jq.Loop(plant, ...), scenario)"
+            )
+        shape = plant.shape[1:] if isinstance(plant, DecoupledAxes) else plant.ensemble
+        if shape or loop.delay.ndim:
+            raise ValueError(
+                f"the loop already is an ensemble of {shape or loop.delay.shape}: give one plant "
+                "and one delay, and describe what varies by distributions"
+            )
+        if self.plants is not None:
+            self.plants.require_nominal(plant)
         resolved = {}
         for name, one in self.distributions.items():
-            _check_axes(name, one, plant)
-            if name in self.independent and isinstance(plant, Multirotor) and name in _OF_ROTORS:
+            sizes = {x.size for x in one.support} - {1}
+            rotors = isinstance(plant, Multirotor) and name in _OF_ROTORS
+            if sizes and (name in _ONE_FOR_ALL or rotors):
+                raise ValueError(
+                    f"{name} is the same for all axes: give it numbers, not rows of them"
+                )
+            if sizes and sizes != {count_axes(plant)}:
+                raise ValueError(
+                    f"the distribution of {name} is for {max(sizes)} axes, but the plant has "
+                    f"{count_axes(plant)}: give one number for all axes, or one for each"
+                )
+            if name in self.independent and rotors:
                 raise ValueError(f"{name} is the same for all axes: leave it out of independent=")
             resolved[name] = (
                 one if name in FACTORS else one.about(self._nominal(loop, plant, name), name)
@@ -317,8 +288,8 @@ class Ensemble(eqx.Module):
 
         - `ValueError`: `n` is below 1, or does not fill a grid, or the loop does not fit.
         """
-        _check_request(n, key)
-        return draw_members(self, loop, n, key, self.sampling)
+        _require_key(n, key)
+        return self._draw(loop, n, key, self.sampling)
 
     def fresh(self, loop: Loop, n: int, key: Key[Array, ""]) -> Members:
         """Draw members to certify on, independent of those of `draw` for the same key.
@@ -328,8 +299,77 @@ class Ensemble(eqx.Module):
 
         **Arguments:** and **Raises:** as for `draw`.
         """
-        _check_request(n, key)
-        return draw_members(self, loop, n, jax.random.fold_in(key, _FRESH), "random")
+        _require_key(n, key)
+        return self._draw(loop, n, jax.random.fold_in(key, _FRESH), "random")
+
+    def _draw(self, loop: Loop, n: int, key: Key[Array, ""], sampling: str) -> Members:
+        nominal, distributions = self.resolve(loop)
+        axes = count_axes(nominal)
+        # How many numbers each distribution draws for a member.
+        varying = {name: one for name, one in distributions.items() if one.varies}
+        rows = {name: axes if name in self.independent else 1 for name in varying}
+        # Probabilities: of the distributions first, then of the posterior.
+        if sampling == "grid":
+            points = make_grid([varying[name] for name in rows for _ in range(rows[name])], n)
+        else:
+            deviates = 0 if self.plants is None else self.plants.deviates
+            points = draw_unit_points(sampling, key, sum(rows.values()) + deviates, n)
+        drawn, first = {}, 0  # [axes] where it is known and [axes, members] where it varies
+        for name, one in distributions.items():
+            if not one.varies:
+                drawn[name] = np.broadcast_to(one.support[0], (axes,))
+                continue
+            value = one.quantile(points[first : first + rows[name]])
+            drawn[name] = np.broadcast_to(value, (axes, n))
+            first += rows[name]
+        wide = lambda x: np.broadcast_to(x if x.ndim > 1 else x[:, None], (axes, n))
+        latest = lambda name: float(np.max(distributions[name].support[1]))
+        plant, delay = nominal, np.atleast_1d(np.asarray(loop.delay))
+        longest = loop.longest_delay or float(np.max(delay))
+        if self.plants is not None:
+            scores = normal_scores(points[sum(rows.values()) :])
+            plant, delay, longest = self.plants.draw(scores, loop.dt)
+        if "delay" in distributions:
+            delay, longest = drawn["delay"], latest("delay")
+        payload = None
+        if "payload added" in distributions:
+            inertia = wide(multiply(plant_inertia(nominal), drawn["payload added"]))
+            at, until = wide(drawn["payload at"])[0], np.full((n,), np.inf)
+            if "payload width" in distributions:
+                until = at + wide(drawn["payload width"])[0]
+            parts = map(as_float, (inertia, at, until))
+            payload = MemberPayload(*parts, latest=latest("payload at"))
+        believed = multiply(plant_inertia(nominal), drawn["inertia"])
+        return Members(
+            plant=vary_plant(plant, drawn),
+            delay=as_float(wide(delay)[0]),
+            assumed_inertia=as_float(wide(multiply(believed, drawn["assumed_inertia"]))),
+            keys=make_member_keys(key, n),
+            noise=as_float(wide(drawn["noise"])) if "noise" in distributions else None,
+            gust=as_float(wide(drawn["gust"])) if "gust" in distributions else None,
+            payload=payload,
+            drive=loop.drive,
+            encoder=loop.encoder,
+            longest_delay=longest,
+            gust_corner=self.gust_corner,
+            dt=loop.dt,
+            substeps=loop.substeps,
+            bound=loop.bound,
+        )
 
     def __str__(self) -> str:
-        return describe(self)
+        varies = {name: one for name, one in self.distributions.items() if one.varies}
+        same = {
+            name: one
+            for name, one in self.distributions.items()
+            if name not in varies and not (name in FACTORS and np.all(one.support[0] == 1))
+        }
+        corner = f", gusts of {self.gust_corner:.4g} rad/s" if self.gust is not None else ""
+        lines = [f"ensemble, {self.sampling} sampling{corner}"]
+        lines += [f"  plants {self.plants}"] if self.plants is not None else []
+        for name, one in (varies | same).items():
+            relative = one.relative and name not in FACTORS
+            unit = "times the nominal" if relative else _UNITS[name]
+            alone = ", each axis by itself" if name in self.independent else ""
+            lines.append(f"  {name:<15} {one.text:<32} {unit}{alone}")
+        return "\n".join(lines)

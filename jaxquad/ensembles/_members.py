@@ -13,7 +13,7 @@ from jaxquad._compile import brief_options, Jit
 from jaxquad._core import as_float, is_concrete, mark_members, per_member
 from jaxquad.control import schedule_for_flight
 from jaxquad.loops import Drive, Loop, Sensor
-from jaxquad.models import Allocation, Attitude, DecoupledAxes, MotorLag, Multirotor
+from jaxquad.models import Attitude, DecoupledAxes, MotorLag, Multirotor
 from jaxquad.simulation import gauss_markov, Scenario
 
 from ._distributions import as_distribution, Distribution, distribution_or_none
@@ -49,15 +49,12 @@ def vary_plant(plant: VariablePlant, drawn: Drawn) -> VariablePlant:
         return DecoupledAxes(gain, inertia, lag=drawn.get("lag", plant.lag), **changed)
     attitude = Attitude(inertia, rotor_inertia=plant.attitude.rotor_inertia, **changed)
     motor = MotorLag(drawn["lag"][0]) if "lag" in drawn else plant.motor
-    return Multirotor(attitude, _scale_torques(plant.allocation, drawn["torque_gain"][0]), motor)
-
-
-def _scale_torques(rotors: Allocation, factor: Numbers) -> Allocation:
-    """All three torques times a factor; the arm is as wide, since it tells the ensemble's shape."""
+    # All three torques times a factor; the arm is as wide, since it tells the ensemble's shape.
+    factor = drawn["torque_gain"][0]
     where = lambda r: (r.arm, r.thrust_coefficient, r.torque_coefficient)
-    factors = (np.ones_like(factor), factor, factor)
-    scaled = [as_float(np.asarray(x) * y) for x, y in zip(where(rotors), factors, strict=True)]
-    return eqx.tree_at(where, rotors, scaled)
+    pairs = zip(where(plant.allocation), (np.ones_like(factor), factor, factor), strict=True)
+    scaled = [as_float(np.asarray(x) * y) for x, y in pairs]
+    return Multirotor(attitude, eqx.tree_at(where, plant.allocation, scaled), motor)
 
 
 def plant_inertia(plant: VariablePlant) -> Numbers:
@@ -179,7 +176,15 @@ class Members(eqx.Module):
 
         - `ValueError`: for other indices.
         """
-        return _take(self, _require_indices(indices, self.size))
+        places = jnp.asarray(indices)
+        if places.ndim != 1 or not jnp.issubdtype(places.dtype, jnp.integer) or not places.size:
+            raise ValueError(f"indices are {indices}: give a row of whole numbers, one or more")
+        at = np.asarray(places) if is_concrete(places) else np.zeros(1)
+        if not np.all((at >= 0) & (at < self.size)):
+            raise ValueError(
+                f"indices are {indices}, but the {self.size} members are 0 to {self.size - 1}"
+            )
+        return _take(self, places)
 
     def loop(self, controller: PyTree) -> Loop:
         """The loops of all members around one controller.
@@ -224,15 +229,6 @@ class Members(eqx.Module):
 
         - `ValueError`: the scenario is for other axes or for another number of members.
         """
-        shape = (self._checked(scenario), self.axes)
-        parts = _add_drawn(
-            scenario, self.keys, self.noise, self.gust, self.payload, shape, self.dt,
-            self.gust_corner,
-        )  # fmt: skip
-        where = lambda s: [vars(s)[name] for name in parts]
-        return eqx.tree_at(where, scenario, list(parts.values()), is_leaf=lambda x: x is None)
-
-    def _checked(self, scenario: Scenario) -> int:
         samples, axes = scenario.reference.shape[:2]
         if axes != self.axes:
             raise ValueError(
@@ -244,22 +240,19 @@ class Members(eqx.Module):
                 f"the scenario is for an ensemble of {scenario.ensemble}, but there are "
                 f"{self.size} members: give a scenario for one loop, or for as many"
             )
-        return samples
+        shape = (samples, axes)
+        parts = _add_drawn(
+            scenario, self.keys, self.noise, self.gust, self.payload, shape, self.dt,
+            self.gust_corner,
+        )  # fmt: skip
+        where = lambda s: [vars(s)[name] for name in parts]
+        return eqx.tree_at(where, scenario, list(parts.values()), is_leaf=lambda x: x is None)
 
 
 @eqx.filter_jit
 def _take(members: Members, places: Int[Array, " some"]) -> Members:
     varies = mark_members(members, (members.size,))
     return jax.tree.map(lambda x, mine: x[..., places] if mine else x, members, varies)
-
-
-def _require_indices(indices: ArrayLike | Sequence[int], size: int) -> Array:
-    places = jnp.asarray(indices)
-    if places.ndim != 1 or not jnp.issubdtype(places.dtype, jnp.integer) or not places.size:
-        raise ValueError(f"indices are {indices}: give a row of whole numbers, one or more")
-    if is_concrete(places) and not np.all((np.asarray(places) >= 0) & (np.asarray(places) < size)):
-        raise ValueError(f"indices are {indices}, but the {size} members are 0 to {size - 1}")
-    return places
 
 
 @ft.partial(Jit, options=brief_options)  # eager, it would be a dozen programs for each shape
@@ -290,12 +283,9 @@ def _add_drawn(
         drawn["disturbance"] = of_members(gusts).astype(gust.dtype) * gust[None]
     if payload is not None:
         drawn["payload"] = payload.signal(shape[0], dt)
-    return {name: _add(vars(scenario)[name], x) for name, x in drawn.items()}
-
-
-def _add(signal: Array | None, drawn: Float[Array, "samples axes members"]) -> Array:
-    if signal is None:
-        return drawn
-    return signal.reshape(signal.shape[:2] + (signal.shape[2:] or (1,))) + drawn.astype(
-        signal.dtype
-    )
+    wide = lambda x: x.reshape(x.shape[:2] + (x.shape[2:] or (1,)))
+    parts = {name: vars(scenario)[name] for name in drawn}
+    return {
+        name: x if parts[name] is None else wide(parts[name]) + x.astype(parts[name].dtype)
+        for name, x in drawn.items()
+    }

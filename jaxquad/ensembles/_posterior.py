@@ -26,8 +26,7 @@ from jaxquad.models import (
     TransferFunction,
 )
 
-from ._distributions import normal_scores
-from ._draw import draw_unit_points
+from ._distributions import draw_unit_points, normal_scores
 
 
 Number = Float[ArrayLike, ""]
@@ -61,7 +60,23 @@ def make_plant(
 def _choose_builder(model: PyTree, believed: ArrayLike | None, plant: Given | None) -> Build:
     """How plants are made of models like this one. Raise ValueError where that is not known."""
     if plant is not None:
-        return _build_given(plant, believed)
+        if believed is not None:
+            raise ValueError(
+                "give plant= or believed=, not both: the function plant= sets the inertia itself"
+            )
+
+        def build_given(model: PyTree) -> tuple[DecoupledAxes, Array]:
+            pair = plant(model)
+            if not (
+                isinstance(pair, tuple) and len(pair) == 2 and isinstance(pair[0], DecoupledAxes)
+            ):
+                raise ValueError(
+                    f"plant(model) returned {type(pair).__name__}, but it must return a pair: "
+                    "(jq.DecoupledAxes(...), delay in s)"
+                )
+            return pair[0], as_float(pair[1])
+
+        return build_given
     if believed is not None:
         believed = on_host(as_float(believed))
         require_positive("believed", believed, "the inertia in kg m^2 that the gain belongs to")
@@ -70,7 +85,16 @@ def _choose_builder(model: PyTree, believed: ArrayLike | None, plant: Given | No
                 f"believed is {believed}: give one number, the axis's inertia in kg m^2"
             )
     if isinstance(model, AttitudeAxis):
-        return lambda m: _of_axis(m, believed, lagging=not is_zero(model.lag))
+        lagging = not is_zero(model.lag)
+
+        def build_axis(m: AttitudeAxis) -> tuple[DecoupledAxes, Number]:
+            # With a believed inertia it depends on b = L K_t / J_x and on K_af / J_x alone.
+            inertia = m.J_x if believed is None else believed
+            share, lag = inertia / m.J_x, m.lag if lagging else None
+            gain, damping = share * m.L * m.K_t, share * m.K_af
+            return DecoupledAxes(gain, inertia, lag=lag, damping=damping), m.delay
+
+        return build_axis
     if not isinstance(model, TransferFunction | HasTransferFunction):
         raise ValueError(
             f"a {type(model).__name__} cannot be converted into a plant: give plant=, a "
@@ -88,41 +112,6 @@ def _choose_builder(model: PyTree, believed: ArrayLike | None, plant: Given | No
         return _of_transfer_function(model, believed)
     build = _of_transfer_function(model.transfer_function(), believed)
     return lambda m: build(m.transfer_function())
-
-
-def _build_given(plant: Given, believed: ArrayLike | None) -> Build:
-    if believed is not None:
-        raise ValueError(
-            "give plant= or believed=, not both: the function plant= sets the inertia itself"
-        )
-
-    def build(model: PyTree) -> tuple[DecoupledAxes, Array]:
-        built = plant(model)
-        if not (
-            isinstance(built, tuple) and len(built) == 2 and isinstance(built[0], DecoupledAxes)
-        ):
-            raise ValueError(
-                f"plant(model) returned {type(built).__name__}, but it must return a pair: "
-                "(jq.DecoupledAxes(...), delay in s)"
-            )
-        return built[0], as_float(built[1])
-
-    return build
-
-
-def _of_axis(
-    model: AttitudeAxis, believed: Number | None, *, lagging: bool
-) -> tuple[DecoupledAxes, Number]:
-    """With a believed inertia the plant depends on b = L K_t / J_x and on K_af / J_x alone."""
-    inertia = model.J_x if believed is None else believed
-    share = inertia / model.J_x
-    plant = DecoupledAxes(
-        share * model.L * model.K_t,
-        inertia,
-        lag=model.lag if lagging else None,
-        damping=share * model.K_af,
-    )
-    return plant, model.delay
 
 
 def _of_integrator(model: LaggedIntegrator, believed: Number) -> Build:
@@ -153,13 +142,10 @@ def _of_transfer_function(model: TransferFunction, believed: Number) -> Build:
 
     def build(m: TransferFunction) -> tuple[DecoupledAxes, Number]:
         lag = m.denominator[0] / m.denominator[1] if order else None
-        return _axis(m.numerator[0] / m.denominator[order], lag, believed), m.delay
+        gain = m.numerator[0] / m.denominator[order]
+        return DecoupledAxes(gain * believed, believed, lag=lag), m.delay
 
     return build
-
-
-def _axis(gain: Number, lag: Number | None, believed: Number) -> DecoupledAxes:
-    return DecoupledAxes(gain * believed, believed, lag=lag)
 
 
 def _unmodelled_delay(fit: Fit, recorded_dt: float | None | Literal["as fitted"]) -> float:
@@ -319,7 +305,40 @@ class Posterior(eqx.Module):
 
         Quantities that are `replaced` by distributions do not count.
         """
-        _require_determined(self.fit, self.build, replaced)
+        if self.fit.identifiable:
+            return
+        here = jnp.asarray(self.fit.values)
+
+        def numbers(values: Array) -> dict[str, Array]:
+            plant, delay = self.build(self.fit.parameters.replace(self.fit.model, values))
+            parts = {name: x for name, x in vars(plant).items() if x is not None} | {"delay": delay}
+            return {name: jnp.ravel(x) for name, x in parts.items() if name not in replaced}
+
+        slopes = {n: np.asarray(s) * self.fit.units for n, s in jax.jacfwd(numbers)(here).items()}
+        moved = [numbers(jnp.asarray(values)) for values in self.fit.verdict.alternatives]
+        fixed, lost = numbers(here), []
+        for name, slope in slopes.items():
+            jumps = [
+                not np.allclose(other[name], fixed[name], rtol=1e-6, atol=0) for other in moved
+            ]
+            if any(jumps) or any(_depends(self.fit, row) for row in slope):
+                lost.append(name)
+        if not lost:
+            return
+        remedies = []
+        if {"inertia", "torque_gain"} & set(lost):
+            remedies.append("believed=, an inertia in kg m^2, if b = KT / J is determined")
+        replaceable = [name for name in lost if name not in ("inertia", "torque_gain")]
+        if replaceable:
+            remedies.append(
+                f"a distribution instead, {replaceable[0]}=jq.ensembles.Uniform(low, high)"
+            )
+        undetermined = ", ".join(self.fit.verdict.undetermined)
+        raise UndeterminedError(
+            f"the plant's {', '.join(lost)} would change with parameters that the record does not "
+            f"determine ({undetermined}): give {'; or '.join(remedies)}; or fit with a "
+            "jq.identify.Prior or a second record"
+        )
 
     def __str__(self) -> str:
         names = ", ".join(self.fit.names)
@@ -339,28 +358,6 @@ def _build_plants(
     return eqx.filter_vmap(build, in_axes=(axes,), out_axes=-1, axis_size=count)(models)
 
 
-def _require_determined(fit: Fit, build: Build, replaced: tuple[str, ...]) -> None:
-    """Raise UndeterminedError where a quantity changes with undetermined directions of the fit."""
-    if fit.identifiable:
-        return
-    here = jnp.asarray(fit.values)
-
-    def numbers(values: Array) -> dict[str, Array]:
-        plant, delay = build(fit.parameters.replace(fit.model, values))
-        parts = {name: x for name, x in vars(plant).items() if x is not None} | {"delay": delay}
-        return {name: jnp.ravel(x) for name, x in parts.items() if name not in replaced}
-
-    slopes = {n: np.asarray(s) * fit.units for n, s in jax.jacfwd(numbers)(here).items()}
-    moved = [numbers(jnp.asarray(values)) for values in fit.verdict.alternatives]
-    fixed, lost = numbers(here), []
-    for name, slope in slopes.items():
-        jumps = [not np.allclose(other[name], fixed[name], rtol=1e-6, atol=0) for other in moved]
-        if any(jumps) or any(_depends(fit, row) for row in slope):
-            lost.append(name)
-    if lost:
-        raise UndeterminedError(_refusal(fit, lost))
-
-
 def _depends(fit: Fit, slope: Float[np.ndarray, " parameters"]) -> bool:
     verdict, size = fit.verdict, np.linalg.norm(slope)
     if np.any(np.abs(verdict.exact @ slope) > 1e-6 * size):
@@ -371,18 +368,3 @@ def _depends(fit: Fit, slope: Float[np.ndarray, " parameters"]) -> bool:
     variance = slope @ keep @ fit.relative_covariance @ keep @ slope
     drawn = slope @ known_covariance(fit) @ slope
     return bool(variance - drawn > _LOST * variance + 1e-12 * size**2)
-
-
-def _refusal(fit: Fit, lost: list[str]) -> str:
-    remedies = []
-    if {"inertia", "torque_gain"} & set(lost):
-        remedies.append("believed=, an inertia in kg m^2, if b = KT / J is determined")
-    replaceable = [name for name in lost if name not in ("inertia", "torque_gain")]
-    if replaceable:
-        remedies.append(f"a distribution instead, {replaceable[0]}=jq.ensembles.Uniform(low, high)")
-    undetermined = ", ".join(fit.verdict.undetermined)
-    return (
-        f"the plant's {', '.join(lost)} would change with parameters that the record does not "
-        f"determine ({undetermined}): give {'; or '.join(remedies)}; or fit with a "
-        "jq.identify.Prior or a second record"
-    )

@@ -4,6 +4,8 @@ from jaxquad._core import align as align, per_member as per_member
 
 from ._analysis import (
     analyse as analyse,
+    gain_window as gain_window,
+    GainWindow as GainWindow,
     linear_numbers as linear_numbers,
     loop_numbers as loop_numbers,
     LoopAnalysis as LoopAnalysis,
@@ -11,25 +13,24 @@ from ._analysis import (
     LoopResponse as LoopResponse,
 )
 from ._bandwidth import attitude_bandwidth as attitude_bandwidth, Bandwidth as Bandwidth
-from ._gain_window import gain_window as gain_window, GainWindow as GainWindow
-from ._loop import Loop as Loop
-from ._margins import (
-    disturbance_rejection as disturbance_rejection,
-    Margins as Margins,
-    margins as margins,
-    Rejection as Rejection,
-)
-from ._protocols import (
+from ._loop import (
     after_drive as after_drive,
     CarriesPayload as CarriesPayload,
     ChecksState as ChecksState,
     Controller as Controller,
     Drive as Drive,
     LinearisablePlant as LinearisablePlant,
+    Loop as Loop,
     Plant as Plant,
     prepared as prepared,
     sample_interval as sample_interval,
     Sensor as Sensor,
     signals_of as signals_of,
 )
-from ._rms import rms_response as rms_response, RmsResponse as RmsResponse
+from ._margins import Margins as Margins, margins as margins
+from ._rejection import (
+    disturbance_rejection as disturbance_rejection,
+    Rejection as Rejection,
+    rms_response as rms_response,
+    RmsResponse as RmsResponse,
+)

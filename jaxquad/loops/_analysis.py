@@ -1,4 +1,4 @@
-"""Numbers and responses of linear loops, of all axes of all members at once."""
+"""Numbers and responses of linear loops, of all axes of all members at once; gain windows."""
 
 import functools as ft
 from collections.abc import Collection, Sequence
@@ -11,20 +11,27 @@ import numpy as np
 from jaxtyping import Array, Bool, Complex, Float
 
 from jaxquad._compile import brief_options, Jit
+from jaxquad.control import LinearController
+from jaxquad.records import AXES
 
-from ._curve import decibels, degrees, lines, shown
+from ._curve import decibels, degrees, first, lines, shown
 from ._linear_loop import (
-    axis_index,
+    abscissa,
     close,
     ClosedLoopMatrix,
+    growth,
     join,
     linear_parts,
     LinearParts,
+    noise_gain,
     OpenLoop,
+    powers,
+    SampledAxis,
+    sharpest,
 )
 from ._loop import Loop
-from ._margins import disturbance_rejection, margins
-from ._spectrum import abscissa, noise_gain, powers, sharpest
+from ._margins import margins
+from ._rejection import disturbance_rejection
 
 
 _LOWEST, _BEYOND, _POINTS = 1e-5, 1.0005, 500  # of pi / dt; a crossing may lie at pi / dt itself
@@ -82,48 +89,30 @@ def numbers_of(
         numbers["noise_gain"] = noise if smooth else jnp.where(stable, noise, jnp.inf)
     if smooth and "sensitivity_peak" in wanted:
         numbers["sensitivity_peak"] = _smooth_peak(loop)
-    if any(name in wanted for name in MARGINS):
-        numbers |= _only(_margins(loop, stable), wanted)
-    if any(name in wanted and name not in numbers for name in REJECTION):
-        numbers = _only(_rejection(loop, stable), wanted) | numbers
-    return numbers
-
-
-def _only(numbers: dict[str, Array], wanted: Collection[str]) -> dict[str, Array]:
-    return {name: x for name, x in numbers.items() if name in wanted}
-
-
-def _grid(loop: OpenLoop) -> Float[Array, " points"]:
     # It holds all frequencies but 0: a crossing that is missing does not exist.
     grid = np.geomspace(_LOWEST, _BEYOND, _POINTS) * np.pi / loop.dt
-    return jnp.asarray(grid, loop.shift.dtype)
-
-
-def _margins(loop: OpenLoop, stable: Bool[Array, ""]) -> dict[str, Float[Array, ""]]:
-    margin, static = margins(loop, omega=_grid(loop)), loop.static_gain_margin()
-    up, down = _or(jnp.inf, margin.gain_margin), _or(0.0, margin.gain_reduction)
-    falls = (static < 1) & (static > _STATIC)
-    numbers = {
-        "gain_margin": jnp.where(static >= 1, jnp.minimum(up, static), up),
-        "gain_reduction": jnp.where(falls, jnp.maximum(down, static), down),
-        "phase_margin": _or(jnp.inf, margin.phase_margin),
-        "crossover": margin.crossover,
-        "delay_margin": _or(jnp.inf, margin.delay_margin),
-    }
-    return {name: jnp.where(stable, value, jnp.nan) for name, value in numbers.items()}
-
-
-def _rejection(loop: OpenLoop, stable: Bool[Array, ""]) -> dict[str, Float[Array, ""]]:
-    rejection = disturbance_rejection(loop, omega=_grid(loop))
-    return {
-        "sensitivity_peak": jnp.where(stable, rejection.peak, jnp.inf),
-        "sensitivity_frequency": jnp.where(stable, rejection.peak_frequency, jnp.nan),
-        "rejection_bandwidth": jnp.where(stable, rejection.bandwidth, jnp.nan),
-    }
-
-
-def _or(missing: float, value: Float[Array, ""]) -> Float[Array, ""]:
-    return jnp.where(jnp.isnan(value), missing, value)
+    others, omega = {}, jnp.asarray(grid, loop.shift.dtype)
+    if any(name in wanted for name in MARGINS):
+        margin, static = margins(loop, omega=omega), loop.static_gain_margin()
+        there = lambda x, missing: jnp.where(jnp.isnan(x), missing, x)
+        up, down = there(margin.gain_margin, jnp.inf), there(margin.gain_reduction, 0.0)
+        falls = (static < 1) & (static > _STATIC)
+        of_margins = {
+            "gain_margin": jnp.where(static >= 1, jnp.minimum(up, static), up),
+            "gain_reduction": jnp.where(falls, jnp.maximum(down, static), down),
+            "phase_margin": there(margin.phase_margin, jnp.inf),
+            "crossover": margin.crossover,
+            "delay_margin": there(margin.delay_margin, jnp.inf),
+        }
+        others = {name: jnp.where(stable, x, jnp.nan) for name, x in of_margins.items()}
+    if any(name in wanted and name not in numbers for name in REJECTION):
+        rejection = disturbance_rejection(loop, omega=omega)
+        others |= {
+            "sensitivity_peak": jnp.where(stable, rejection.peak, jnp.inf),
+            "sensitivity_frequency": jnp.where(stable, rejection.peak_frequency, jnp.nan),
+            "rejection_bandwidth": jnp.where(stable, rejection.bandwidth, jnp.nan),
+        }
+    return {name: x for name, x in others.items() if name in wanted} | numbers
 
 
 def _smooth_peak(loop: OpenLoop) -> Float[Array, ""]:
@@ -183,20 +172,15 @@ class LoopAnalysis(eqx.Module):
 
     **Arguments:**
 
-    - `abscissa`: 1/s.
-    - `stable`: whether every pole decays.
-    - `sensitivity_peak`: Ms, the greatest |S|.
-    - `sensitivity_frequency`: rad/s, of that peak.
+    - `abscissa`: 1/s; `stable`: whether every pole decays.
+    - `sensitivity_peak`, `sensitivity_frequency`: Ms, the greatest |S|, and where, rad/s.
     - `rejection_bandwidth`: rad/s, where |S| first rises through -3 dB.
-    - `gain_margin`: factor by which the gain may rise; inf if any.
-    - `gain_reduction`: factor to which it may fall; 0 if any.
-    - `phase_margin`: rad.
-    - `crossover`: rad/s, of the phase margin.
+    - `gain_margin`, `gain_reduction`: factors by which the gain may rise (inf if any), and to which
+        it may fall (0 if any).
+    - `phase_margin`, `crossover`: rad, and at which frequency, rad/s.
     - `delay_margin`: s, from the phase margin at its crossover.
     - `noise_gain`: rms of the command per rms of white measurement noise.
-    - `closed`: the closed loop as a matrix.
-    - `loop`: the loop broken at the command.
-    - `dt`: s.
+    - `closed`, `loop`: the closed loop as a matrix, the loop broken at the command; `dt`: s.
     """
 
     abscissa: Float[Array, "*ensemble"]
@@ -257,48 +241,40 @@ class LoopAnalysis(eqx.Module):
         return jax.tree.map(lambda x: x[place], self)
 
     def __str__(self) -> str:
-        return _table(self) if self.abscissa.ndim == 0 else _summary(self)
-
-
-def _table(loop: LoopAnalysis) -> str:
-    if np.isnan(loop.abscissa):
-        return "no analysis: a number is not finite, or the delay is beyond longest_delay"
-    if not bool(loop.stable):
-        return f"unstable loop\n  grows as exp({float(loop.abscissa):.4g} t / s): no margins"
-    peak, crossover = float(loop.sensitivity_frequency), float(loop.crossover)
-    up, down = _gain(loop.gain_margin), _gain(loop.gain_reduction)
-    rows = [
-        ("slowest pole", shown(loop.abscissa, None, "1/s")),
-        ("Ms", f"{float(loop.sensitivity_peak):.4g} at {peak:.4g} rad/s"),
-        ("gain margin", f"{up} up, {down} down"),
-        ("phase margin", "any"),
-        ("delay margin", "any"),
-        ("noise gain", f"{float(loop.noise_gain):.4g} command/rad, rms of white noise"),
-    ]
-    if np.isfinite(loop.phase_margin):
-        rows[3] = ("phase margin", f"{degrees(loop.phase_margin, None)} at {crossover:.4g} rad/s")
-        rows[4] = ("delay margin", shown(loop.delay_margin, None, "ms", 1e3))
-    return "\n".join(["stable loop", lines(rows, [])])
-
-
-def _gain(factor: Float[Array, ""]) -> str:
-    return decibels(factor, None) if 0 < factor < np.inf else "any"
-
-
-def _summary(loop: LoopAnalysis) -> str:
-    stable = np.asarray(loop.stable)
-    share = f"ensemble of {stable.size} loops, {100 * np.mean(stable):.3g} % stable"
-    if not np.any(stable):
-        return share
-    worst = lambda x, find: float(find(np.asarray(x)[stable]))
-    rows = [
-        ("slowest pole", f"{worst(loop.abscissa, np.max):.4g} 1/s"),
-        ("Ms", f"{worst(loop.sensitivity_peak, np.max):.4g}"),
-        ("phase margin", f"{np.degrees(worst(loop.phase_margin, np.min)):.4g} deg"),
-        ("delay margin", f"{1e3 * worst(loop.delay_margin, np.min):.4g} ms"),
-        ("noise gain", f"{worst(loop.noise_gain, np.max):.4g} command/rad"),
-    ]
-    return "\n".join([share, "worst of the stable ones:", lines(rows, [])])
+        if self.abscissa.ndim:
+            stable = np.asarray(self.stable)
+            share = f"ensemble of {stable.size} loops, {100 * np.mean(stable):.3g} % stable"
+            if not np.any(stable):
+                return share
+            worst = lambda x, find: float(find(np.asarray(x)[stable]))
+            rows = [
+                ("slowest pole", f"{worst(self.abscissa, np.max):.4g} 1/s"),
+                ("Ms", f"{worst(self.sensitivity_peak, np.max):.4g}"),
+                ("phase margin", f"{np.degrees(worst(self.phase_margin, np.min)):.4g} deg"),
+                ("delay margin", f"{1e3 * worst(self.delay_margin, np.min):.4g} ms"),
+                ("noise gain", f"{worst(self.noise_gain, np.max):.4g} command/rad"),
+            ]
+            return "\n".join([share, "worst of the stable ones:", lines(rows, [])])
+        if np.isnan(self.abscissa):
+            return "no analysis: a number is not finite, or the delay is beyond longest_delay"
+        if not bool(self.stable):
+            return f"unstable loop\n  grows as exp({float(self.abscissa):.4g} t / s): no margins"
+        factors = float(self.gain_margin), float(self.gain_reduction)
+        up, down = (decibels(x, None) if 0 < x < np.inf else "any" for x in factors)
+        phase, late = "any", "any"
+        if np.isfinite(self.phase_margin):
+            phase = f"{degrees(self.phase_margin, None)} at {float(self.crossover):.4g} rad/s"
+            late = shown(self.delay_margin, None, "ms", 1e3)
+        peak = float(self.sensitivity_frequency)
+        rows = [
+            ("slowest pole", shown(self.abscissa, None, "1/s")),
+            ("Ms", f"{float(self.sensitivity_peak):.4g} at {peak:.4g} rad/s"),
+            ("gain margin", f"{up} up, {down} down"),
+            ("phase margin", phase),
+            ("delay margin", late),
+            ("noise gain", f"{float(self.noise_gain):.4g} command/rad, rms of white noise"),
+        ]
+        return "\n".join(["stable loop", lines(rows, [])])
 
 
 def analyse(
@@ -356,20 +332,29 @@ def _analyse_axis(
     return jax.tree.map(lambda x: x.reshape(ensemble + x.shape[1:]), analysis)
 
 
+def axis_index(axis: int | str) -> int:
+    """The number of an axis. Raises ValueError for a name that it does not have."""
+    if isinstance(axis, int):
+        if axis < 0:
+            raise ValueError(f"axis is {axis}: give 0 or above, or one of {', '.join(AXES)}")
+        return axis
+    if axis not in AXES:
+        raise ValueError(f"axis is {axis!r}: choose one of {', '.join(AXES)}, or a number")
+    return AXES.index(axis)
+
+
 @ft.partial(Jit, options=brief_options)
 def analyse_parts(parts: LinearParts, smoothing: float) -> LoopAnalysis:
     """The analysis of each loop, on a first axis."""
-    if parts.count == 1:
-        return jax.tree.map(lambda x: x[None], _analyse_one(parts.at(0), smoothing))
-    return jax.vmap(lambda one: _analyse_one(one, smoothing))(parts)
 
+    def analyse_one(one: LinearParts) -> LoopAnalysis:
+        plant, controller = one.sampled()
+        loop, closed = join(plant, controller), close(plant, controller, one.memory).balanced()
+        numbers = numbers_of(loop, closed, NUMBERS, smoothing)
+        stable = jax.lax.stop_gradient(numbers["abscissa"]) < 0
+        return LoopAnalysis(**numbers, stable=stable, closed=closed, loop=loop, dt=one.dt)
 
-def _analyse_one(parts: LinearParts, smoothing: float) -> LoopAnalysis:
-    plant, controller = parts.sampled()
-    loop, closed = join(plant, controller), close(plant, controller, parts.memory).balanced()
-    numbers = numbers_of(loop, closed, NUMBERS, smoothing)
-    stable = jax.lax.stop_gradient(numbers["abscissa"]) < 0
-    return LoopAnalysis(**numbers, stable=stable, closed=closed, loop=loop, dt=parts.dt)
+    return parts.map(analyse_one)
 
 
 _STATES = 5  # all controllers get as many: then they share what is compiled
@@ -400,3 +385,106 @@ def loop_numbers(loop: Loop, axes: Sequence[int]) -> LoopNumbers:
     }
     rows = (stable, slowest, *numbers.values())
     return LoopNumbers(*(x.reshape(len(axes), *ensemble) for x in rows))
+
+
+_REACH = 1e4  # of the search, as a factor and its inverse
+_COARSE, _FINE, _ROUNDS = 121, 15, 2  # gains of the search, and of each closer look
+_SHARP = 1e-5  # 1/s, to which the edges of stability are known
+
+
+class GainWindow(NamedTuple):
+    """Between which values of b/b0 a loop is stable; `nan` where none is.
+
+    An end that the search does not reach, a ten-thousandth or ten thousand times the plant's own
+    gain, is 0 or infinite.
+
+    **Arguments:**
+
+    - `low`, `high`: b/b0, in the shape of the loop's ensemble.
+    """
+
+    low: Float[Array, "*ensemble"]
+    high: Float[Array, "*ensemble"]
+
+    def __str__(self) -> str:
+        low, high = np.atleast_1d(self.low), np.atleast_1d(self.high)
+        if np.all(np.isnan(low)):
+            return "no gain makes the loop stable"
+        text = f"stable for gains of {np.nanmax(low):.4g} to {np.nanmin(high):.4g}"
+        return text if low.size == 1 else f"{text}, all of {np.sum(~np.isnan(low))} members"
+
+
+def gain_window(
+    loop: Loop, axis: int | str = "roll", *, member: int | tuple[int, ...] | None = None
+) -> GainWindow:
+    """The values of r = b/b0 for which the controller keeps the plant stable.
+
+    b is the plant's gain, torque per unit of command over inertia. All values are tried, whatever
+    the plant's own, with the same lag, delay, damping/inertia and stiffness/inertia; b0 is the
+    controller's. For a controller without b0 the window is that of b itself, in rad/s^2 per unit of
+    command. The edges are roots of the abscissa, exact to 1e-5 1/s and differentiable. Of several
+    windows it is the one that holds the plant's own gain, else the one with the most stable loop. A
+    window narrower than a thousandth of its place may be missed.
+
+    **Arguments:** those of `jq.analyse`.
+
+    **Returns:** a `GainWindow`, in the shape of the loop's ensemble.
+
+    **Raises:** ValueError as `jq.analyse` does.
+    """
+    parts, ensemble = linear_parts(loop, [axis_index(axis)], member)
+    return GainWindow(*(edge.reshape(ensemble) for edge in _windows(parts)))
+
+
+@eqx.filter_jit
+def _windows(parts: LinearParts) -> GainWindow:
+    return parts.map(_window)
+
+
+def _window(parts: LinearParts) -> GainWindow:
+    plant, controller = parts.sampled()
+    sharp = sharpest(_SHARP, parts.dt, plant.fresh.dtype)
+    ladder = lambda matrix: powers(matrix, parts.dt, sharp)
+
+    def closed(
+        plant: SampledAxis, controller: LinearController, factor: Float[Array, ""]
+    ) -> Float[Array, "states states"]:
+        scaled = plant._replace(fresh=plant.fresh * factor, stale=plant.stale * factor)
+        return close(scaled, controller, parts.memory).balanced().matrix
+
+    fixed = jax.lax.stop_gradient((plant, controller))
+    rate = jax.vmap(lambda factor: growth(ladder(closed(*fixed, factor)), parts.dt))
+
+    def slowest(factor: Float[Array, ""]) -> Float[Array, ""]:
+        matrix = closed(plant, controller, factor)
+        return abscissa(matrix, ladder(matrix), parts.dt, sharp)
+
+    def newton_step(root: Float[Array, ""]) -> Float[Array, ""]:
+        """`root` a Newton step on, with its derivatives by the implicit function theorem."""
+        place = jnp.where(jnp.isnan(root), 1.0, root)
+        value, slope = jax.jvp(slowest, (place,), (jnp.ones_like(place),))
+        slope = jax.lax.stop_gradient(slope)
+        return root - value / jnp.where(slope == 0, 1.0, slope)
+
+    # Closer looks at the most stable gain, for windows that a coarse search steps over.
+    factors = jnp.asarray(np.geomspace(1 / _REACH, _REACH, _COARSE), plant.fresh.dtype)
+    share = jnp.linspace(0, 1, _FINE + 2, dtype=plant.fresh.dtype)[1:-1]
+    for _ in range(_ROUNDS):
+        best = jnp.argmin(rate(factors))
+        ends = [factors[jnp.clip(best + k, 0, factors.size - 1)] for k in (-1, 1)]
+        closer = ends[0] * (ends[1] / ends[0]) ** share
+        factors = jnp.sort(jnp.concatenate([factors, closer]))
+    rates = rate(factors)
+    # The stable neighbours of the plant's own gain, or of the most stable one.
+    unity = jnp.argmin(jnp.abs(jnp.log(factors)))
+    anchor = jnp.where(rates[unity] < 0, unity, jnp.argmin(rates))
+    label = jnp.cumsum(~(rates < 0))
+    inside = (rates < 0) & (label == label[anchor])
+    exists, ratio = jnp.any(inside), parts.ratio
+
+    crossed = jnp.stack([~inside[:-1] & inside[1:], inside[:-1] & ~inside[1:]])
+    roots = jax.lax.stop_gradient(jax.vmap(lambda where: first(rate, factors, where))(crossed))
+    edges = jax.vmap(newton_step)(roots)
+    is_open = jnp.stack([inside[0], inside[-1]])
+    edges = jnp.where(is_open, jnp.array([0.0, jnp.inf], edges.dtype), edges) * ratio
+    return GainWindow(*jnp.where(exists, edges, jnp.nan))

@@ -7,19 +7,16 @@ from jaxtyping import Array, ArrayLike, Float
 from ._curve import (
     ambiguous,
     Basis,
-    basis_of,
     crossed,
     Curve,
     curve_of,
     degrees,
     evaluate_curve,
+    Evaluated,
     first,
     lines,
-    Numbers,
-    only_finite,
     Response,
     shown,
-    with_coherence,
 )
 
 
@@ -152,18 +149,15 @@ class Bandwidth(eqx.Module):
 
     **Arguments:**
 
-    - `bandwidth`: rad/s.
-    - `phase_bandwidth`: rad/s, where the phase falls through -135 deg.
-    - `gain_bandwidth`: rad/s, where the magnitude is 6 dB above that at w180.
-    - `omega_180`: rad/s, where the phase falls through -180 deg.
-    - `phase_delay`: s, from the phase at w180 and at 2 w180.
-    - `phase_delay_fit`: s, from a straight line through the phase between them.
-    - `gain_crossings`: how often the magnitude falls through that level below w180.
-    - `phase_crossings`: how often the phase passes -135 or -180 deg.
+    - `bandwidth`: rad/s; `phase_bandwidth`, `omega_180`: rad/s, where the phase falls through -135
+        and -180 deg; `gain_bandwidth`: rad/s, where the magnitude is 6 dB above that at w180.
+    - `phase_delay`: s, from the phase at w180 and at 2 w180; `phase_delay_fit`: s, from a straight
+        line through the phase between them.
+    - `gain_crossings`, `phase_crossings`: how often the magnitude falls through that level below
+        w180, and the phase passes -135 or -180 deg.
     - `standard_errors`: of a measured response, by the names above; else empty.
-    - `basis`: what the numbers were found from.
-    - `quantity`: what the response is of.
-    - `branch`: who chose the branch of the phase at the lowest frequency.
+    - `basis`, `quantity`, `branch`: what the numbers were found from, what the response is of, and
+        who chose the branch of the phase at the lowest frequency.
     """
 
     bandwidth: Float[Array, ""]
@@ -214,16 +208,11 @@ def attitude_bandwidth(
 
     **Arguments:**
 
-    - `response`: a `jq.spectra.FrequencyResponse`, whose numbers are interpolated (ln|T| and phase
-        straight in ln omega) and carry standard errors, or any model with
-        `frequency_response(omega)`, whose numbers are exact and differentiable, also under jit.
+    - `response`, `omega`, `output`, `input`: as in `jq.loops.margins`.
     - `quantity`: what it is the response of, the "attitude" or the "rate", which is divided by s.
-    - `omega`: rad/s. A model is searched there, by default at 2000 log-spaced values from 0.01 to
-        1000; of a measured response it picks some of its own frequencies.
     - `phase_at_start`: rad, of the response as given: the phase at the lowest frequency is the one
         nearest to it. Give it where the response starts near -180 deg or behind a delay; None is
         the principal value.
-    - `output`, `input`: the channel, by name or number; None where there is one.
 
     **Returns:** a `Bandwidth`.
 
@@ -235,18 +224,12 @@ def attitude_bandwidth(
         raise ValueError(f'quantity is {quantity!r}: choose "attitude" or "rate"')
     curve = curve_of(response, omega, output, input, int(quantity == "rate"))
     start = None if phase_at_start is None else jnp.asarray(phase_at_start, curve.omega.dtype)
-    values, basis, errors = evaluate_curve(_numbers, curve, start)
-    places = {name: values[name] for name in _PLACES}
-    return Bandwidth(
-        **values,
-        standard_errors=errors,
-        basis=with_coherence(basis, curve, places),
-        quantity=quantity,
-        branch="principal value" if start is None else "as given",
-    )
+    numbers = evaluate_curve(_numbers, curve, start, places=_PLACES)
+    branch = "principal value" if start is None else "as given"
+    return Bandwidth(**numbers, quantity=quantity, branch=branch)
 
 
-def _numbers(curve: Curve, start: Float[Array, ""] | None) -> tuple[Numbers, Numbers, Basis]:
+def _numbers(curve: Curve, start: Float[Array, ""] | None) -> Evaluated:
     values = jax.lax.stop_gradient(curve(curve.omega))
     phase = jax.lax.stop_gradient(curve.phase(start))
     clear = jnp.cumsum(ambiguous(phase)) == 0
@@ -270,7 +253,7 @@ def _numbers(curve: Curve, start: Float[Array, ""] | None) -> tuple[Numbers, Num
         "phase_crossings": jnp.maximum(*passes).astype(w180.dtype),
     }
     finite = jnp.all(jnp.isfinite(values))
-    return only_finite(numbers, finite), counts, basis_of(curve, phase, finite)
+    return Evaluated(numbers, counts, finite, phase)
 
 
 def _falls_through(

@@ -1,12 +1,13 @@
 """One response, measured or of a model, that can be asked at any frequency, and its numbers."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Bool, Complex, Float, Int
+from jaxtyping import Array, ArrayLike, Bool, Complex, Float
 
 from jaxquad._core import is_concrete
 from jaxquad.models import (
@@ -149,16 +150,6 @@ def ambiguous(phase: Float[Array, " frequencies"]) -> Bool[Array, " intervals"]:
     return ~(jnp.abs(jnp.diff(phase)) < AMBIGUOUS)
 
 
-def around(
-    omega: Float[Array, " frequencies"], place: Float[ArrayLike, ""]
-) -> Int[np.ndarray, "2"]:
-    """Indices of the grid points below and above a frequency; the same twice at a point."""
-    grid = np.asarray(omega)
-    above = np.clip(np.searchsorted(grid, place * (1 - 1e-12)), 0, grid.size - 1)
-    below = np.clip(np.searchsorted(grid, place * (1 + 1e-12), "right") - 1, 0, grid.size - 1)
-    return np.array([below, above])
-
-
 def _measured(
     frf: FrequencyResponse,
     omega: Float[ArrayLike, " frequencies"] | None,
@@ -219,6 +210,7 @@ def _require_grid(omega: Float[ArrayLike, " frequencies"]) -> None:
         )
 
 
+Residual = Callable[[Float[Array, " points"]], Float[Array, " points"]]
 _HALVINGS = 60  # from a grid's interval to the last bit of a float64
 
 
@@ -235,7 +227,7 @@ def crossed(values: Float[Array, " frequencies"], direction: str) -> Bool[Array,
 
 
 def crossings(
-    residual: Callable[[Float[Array, " points"]], Float[Array, " points"]],
+    residual: Residual,
     omega: Float[Array, " frequencies"],
     where: Bool[Array, " intervals"],
     *,
@@ -253,12 +245,12 @@ def crossings(
     chosen = jax.lax.top_k(jnp.where(where, -rank, -jnp.inf), min(limit, where.size))[1]
     chosen = jnp.sort(jnp.where(where[chosen], chosen, where.size))
     exists, interval = chosen < where.size, jnp.minimum(chosen, where.size - 1)
-    root = _root(residual, omega[interval], omega[interval + 1])
+    root = between(residual, omega[interval], omega[interval + 1])
     return jnp.where(exists, root, jnp.nan)
 
 
 def first(
-    residual: Callable[[Float[Array, " points"]], Float[Array, " points"]],
+    residual: Residual,
     omega: Float[Array, " frequencies"],
     where: Bool[Array, " intervals"],
     rank: Float[Array, " intervals"] | None = None,
@@ -268,19 +260,9 @@ def first(
 
 
 def between(
-    residual: Callable[[Float[Array, " points"]], Float[Array, " points"]],
-    low: Float[Array, ""],
-    high: Float[Array, ""],
-) -> Float[Array, ""]:
-    """A root between two frequencies where `residual` has opposite signs."""
-    return _root(residual, low[None], high[None])[0]
-
-
-def _root(
-    residual: Callable[[Float[Array, " points"]], Float[Array, " points"]],
-    low: Float[Array, " points"],
-    high: Float[Array, " points"],
+    residual: Residual, low: Float[Array, " points"], high: Float[Array, " points"]
 ) -> Float[Array, " points"]:
+    """Roots between frequencies where `residual` has opposite signs."""
     low, high = jax.lax.stop_gradient((low, high))
 
     def bisect(f, _):
@@ -334,32 +316,31 @@ class Basis(eqx.Module):
         return remarks
 
 
-def basis_of(
-    curve: Curve,
-    phase: Float[Array, " frequencies"],
-    finite: Bool[Array, ""],
-    heeded: Bool[Array, " intervals"] | bool = True,
-) -> Basis:
-    """The basis of what was found on a curve with this unwrapped phase, where it is `heeded`."""
-    jumps = ambiguous(phase) & heeded
-    unclear = jnp.where(jnp.any(jumps), curve.omega[jnp.argmax(jumps)], jnp.inf)
-    band = jnp.stack([curve.omega[0], curve.omega[-1]])
-    return Basis(band, phase[0], unclear, finite, {}, curve.dropped)
+class Evaluated(NamedTuple):
+    """What a search of a curve gives back."""
+
+    numbers: Numbers  # that have a standard error
+    others: Numbers
+    finite: Bool[Array, ""]  # whether the response is
+    phase: Float[Array, " frequencies"]  # rad, unwrapped
+    heeded: Bool[Array, " intervals"] | bool = True  # where it matters how the phase turns
+
+
+Search = Callable[..., Evaluated]
 
 
 def evaluate_curve(
-    numbers: Callable[..., tuple[Numbers, Numbers, Basis]], curve: Curve, *args: Argument
-) -> tuple[Numbers, Basis, Numbers]:
-    """Numbers, basis and standard errors of a curve; the last are empty for a model.
+    search: Search, curve: Curve, *args: Argument, places: tuple[str, ...] = ()
+) -> dict[str, Any]:
+    """The numbers of `search(curve, *args)`, their `standard_errors` if measured, and `basis`.
 
-    `numbers(curve, *args)` gives the numbers that have a standard error, those that have none, and
-    their basis. Raises ValueError for a response that is not finite; under jit the numbers
-    are `nan` then.
+    `places` are the numbers beside which the measured coherence is of interest. Raises ValueError
+    for a response that is not finite; under jit the numbers are `nan` then.
     """
     if curve.coherence is None:
-        (values, others, basis), errors = _evaluated(numbers, curve, *args), {}
+        (values, others, basis), errors = _evaluate(search, curve, *args), {}
     else:
-        values, others, basis, errors = _propagated(numbers, curve, *args)
+        values, others, basis, errors = _propagate(search, curve, *args)
     if is_concrete(basis.finite) and not bool(basis.finite):
         bad = np.asarray(curve.omega)[~np.isfinite(np.asarray(curve(curve.omega)))]
         where = (
@@ -369,7 +350,17 @@ def evaluate_curve(
             f"the response is not finite {where}: choose omega= without the poles on the imaginary "
             "axis (of 1 / (1 + L) too), and a spectrum of 0 or more"
         )
-    return values | others, basis, errors
+    values = values | others
+    if curve.coherence is not None:  # the lesser of the two points beside each frequency
+        coherence, grid = np.asarray(curve.coherence), np.asarray(curve.omega)
+        least = {}
+        for name in places:
+            if np.isfinite(place := np.asarray(values[name])):
+                above = np.clip(np.searchsorted(grid, place * (1 - 1e-12)), 0, grid.size - 1)
+                below = np.searchsorted(grid, place * (1 + 1e-12), "right") - 1
+                least[name] = float(min(coherence[above], coherence[max(below, 0)]))
+        basis = eqx.tree_at(lambda b: b.coherence, basis, least)
+    return values | {"standard_errors": errors, "basis": basis}
 
 
 def only_finite(values: Numbers, finite: Bool[Array, ""]) -> Numbers:
@@ -377,34 +368,28 @@ def only_finite(values: Numbers, finite: Bool[Array, ""]) -> Numbers:
     return {name: jnp.where(finite, value, jnp.nan) for name, value in values.items()}
 
 
-def with_coherence(basis: Basis, curve: Curve, places: Mapping[str, ArrayLike]) -> Basis:
-    """The basis, with the lesser coherence of the two points beside each frequency found."""
-    if curve.coherence is None:
-        return basis
-    coherence = np.asarray(curve.coherence)
-    least = {
-        name: float(np.min(coherence[around(curve.omega, place)]))
-        for name, place in places.items()
-        if np.isfinite(place)
-    }
-    return eqx.tree_at(lambda b: b.coherence, basis, least)
+def _searched(search: Search, curve: Curve, *args: Argument) -> tuple[Numbers, Numbers, Basis]:
+    values, others, finite, phase, heeded = search(curve, *args)
+    jumps = ambiguous(phase) & heeded
+    unclear = jnp.where(jnp.any(jumps), curve.omega[jnp.argmax(jumps)], jnp.inf)
+    band = jnp.stack([curve.omega[0], curve.omega[-1]])
+    basis = Basis(band, phase[0], unclear, finite, {}, curve.dropped)
+    return only_finite(values, finite), others, basis
+
+
+_evaluate = eqx.filter_jit(_searched)
 
 
 @eqx.filter_jit
-def _evaluated(numbers: Callable, curve: Curve, *args: Argument) -> tuple[Numbers, Numbers, Basis]:
-    return numbers(curve, *args)
-
-
-@eqx.filter_jit
-def _propagated(
-    numbers: Callable, curve: Curve, *args: Argument
+def _propagate(
+    search: Search, curve: Curve, *args: Argument
 ) -> tuple[Numbers, Numbers, Basis, Numbers]:
 
     def perturbed(change):
         model = curve.measured
         moved = (model.log_magnitude + change[0], model.phase + change[1])
         model = eqx.tree_at(lambda m: (m.log_magnitude, m.phase), model, moved)
-        values, *rest = numbers(eqx.tree_at(lambda c: c.model, curve, model), *args)
+        values, *rest = _searched(search, eqx.tree_at(lambda c: c.model, curve, model), *args)
         return values, (values, *rest)
 
     def spread(slope: Float[Array, " *numbers 2 frequencies"]) -> Float[Array, " *numbers"]:

@@ -3,24 +3,152 @@
 import dataclasses
 import functools as ft
 import math
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
+from typing import NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import DTypeLike
 from jaxtyping import Array, Complex, Float, Int
 
 from jaxquad._compile import brief_options, Jit
 from jaxquad._core import ensemble_shape
 from jaxquad.control import LinearController, LinearisableController
 from jaxquad.models import imaginary, LinearAxis, matrix_exponential, split_delay
-from jaxquad.records import AXES
 
-from ._loop import Loop
-from ._protocols import assumed_gain, LinearisablePlant
-from ._spectrum import balance
+from ._loop import LinearisablePlant, Loop
+
+
+Tree = TypeVar("Tree")
+
+# Growth and noise of a sampled system without its eigenvalues: values come from repeated squaring,
+# derivatives from Lyapunov equations, of which only the first exist.
+_SWEEPS = 6
+_FADED = 20.0  # nepers, after which a sum over samples has no more to add
+_ROUNDINGS = 100.0
+
+
+class Powers(NamedTuple):
+    """matrix^(2^k) = matrices[k] exp(logs[k]), without derivatives."""
+
+    matrices: Float[Array, "powers states states"]
+    logs: Float[Array, " powers"]
+
+
+def sharpest(smoothing: float, dt: float, dtype: DTypeLike) -> float:
+    """`smoothing` in 1/s, or what the rounding of a sample leaves of it."""
+    return max(smoothing, _ROUNDINGS * float(jnp.finfo(dtype).eps) / dt)
+
+
+def powers(matrix: Float[Array, "states states"], dt: float, smoothing: float) -> Powers:
+    """Powers up to one in which modes that are `smoothing` in 1/s apart have parted."""
+    count = max(1, math.ceil(math.log2(_FADED / (smoothing * dt))))
+    size = lambda m: jnp.maximum(jnp.max(jnp.abs(m)), jnp.finfo(m.dtype).tiny)
+
+    def square(carry, _):
+        power, log = carry
+        following = _dot(power, power)
+        scale = size(following)
+        return (following / scale, 2 * log + jnp.log(scale)), carry
+
+    fixed = jax.lax.stop_gradient(matrix)
+    start = (fixed / size(fixed), jnp.log(size(fixed)))
+    last, earlier = jax.lax.scan(square, start, length=count)
+    return Powers(*(jnp.concatenate([a, b[None]]) for a, b in zip(earlier, last, strict=True)))
+
+
+def growth(ladder: Powers, dt: float) -> Float[Array, ""]:
+    """ln |matrix^N| / (N dt) in 1/s for the highest power N.
+
+    Never below the growth rate of the slowest mode, and above it by up to ln(N times the condition
+    of the eigenvectors) / (N dt).
+    """
+    size = 0.5 * jnp.log(jnp.sum(ladder.matrices[-1] ** 2))
+    return (ladder.logs[-1] + size) / (2.0 ** (len(ladder.logs) - 1) * dt)
+
+
+def gramian(
+    ladder: Powers, start: Float[Array, "states states"], shift: Float[Array, ""]
+) -> Float[Array, "states states"]:
+    """The sum over k of tame^k start tame'^k with tame = matrix exp(-shift): Smith's doubling."""
+
+    def double(total, power):
+        matrix, log = power
+        return total + jnp.exp(2 * log) * _dot(_dot(matrix, total), matrix.T), None
+
+    samples = jnp.exp2(jnp.arange(len(ladder.logs) - 1, dtype=start.dtype))
+    logs = ladder.logs[:-1] - samples * shift
+    return jax.lax.scan(double, start, (ladder.matrices[:-1], logs))[0]
+
+
+def abscissa(
+    matrix: Float[Array, "states states"], ladder: Powers, dt: float, smoothing: float
+) -> Float[Array, ""]:
+    """Growth rate of the slowest mode in 1/s, with derivatives that stay finite.
+
+    With H(s) the sum over |matrix^k|^2 exp(-2 k s dt), 1 / H falls to 0 at that rate: a Newton step
+    on it starts `smoothing` (1/s) above the `growth`, and the derivatives are those of the
+    root of H(s) = H there. Both are exact for a single slowest mode or pair as the smoothing
+    becomes small; of modes that coincide the value is above the rate by less than the smoothing.
+    (The norm of matrix^N turns with the phase of complex modes: its own gradient is wrong.)
+    Source: Vanbiervliet et al., The smoothed spectral abscissa for robust stability optimization,
+    SIAM J. Optim. 20 (2009), for sampled time.
+    """
+    start = growth(ladder, dt) + smoothing
+    unit, shift = jnp.eye(len(matrix), dtype=matrix.dtype), start * dt
+    reachable, observable = gramian(ladder, unit, shift), gramian(_turned(ladder), unit, shift)
+    tame = jnp.exp(-shift) * jax.lax.stop_gradient(matrix)
+    pull = _dot(_dot(observable, tame), reachable)
+    slope = jnp.sum(pull * tame) * dt
+    moved = jnp.sum(pull * (jnp.exp(-shift) * matrix - tame)) / slope  # 0, with the derivative
+    return start - 0.5 * jnp.trace(reachable) / slope + moved
+
+
+def noise_gain(
+    matrix: Float[Array, "states states"],
+    noise: Float[Array, " states"],
+    command: Float[Array, " states"],
+    through: Float[Array, ""],
+    ladder: Powers,
+    shift: Float[Array, ""],
+) -> Float[Array, ""]:
+    """rms of command x + through n per rms of white n, a new value each sample.
+
+    The state is x+ = tame x + noise n with tame = matrix exp(-shift), which is stable.
+    """
+    live = (jnp.exp(-shift) * matrix, noise, command, through)
+    tame, entry, reading, direct = jax.lax.stop_gradient(live)
+    reachable = gramian(ladder, jnp.outer(entry, entry), shift)
+    observable = gramian(_turned(ladder), jnp.outer(reading, reading), shift)
+    power = _dot(reading, _dot(reachable, reading)) + direct**2
+    pulls = (
+        _dot(_dot(observable, tame), reachable),
+        _dot(observable, entry),
+        _dot(reachable, reading),
+        direct,
+    )
+    changes = (x - fixed for x, fixed in zip(live, (tame, entry, reading, direct), strict=True))
+    moved = 2 * sum(jnp.sum(p * d) for p, d in zip(pulls, changes, strict=True))
+    return jnp.sqrt(power) + moved / (2 * jnp.sqrt(jnp.where(power > 0, power, jnp.inf)))
+
+
+def balance(matrix: Float[Array, "states states"]) -> Float[Array, " states"]:
+    """Scales of the states for which rows and columns are of one size (Osborne)."""
+    size = jax.lax.stop_gradient(jnp.abs(matrix)) * (1 - jnp.eye(len(matrix), dtype=matrix.dtype))
+    scale = jnp.ones(len(matrix), matrix.dtype)
+    for _ in range(_SWEEPS):
+        now = size * scale[None] / scale[:, None]
+        row, column = jnp.sum(now, axis=1), jnp.sum(now, axis=0)
+        usable = (row > 0) & (column > 0)
+        ratio = jnp.where(usable, row, 1.0) / jnp.where(usable, column, 1.0)
+        scale = scale * ratio**0.25  # half of the step: all states move at once
+    return scale
+
+
+def _turned(ladder: Powers) -> Powers:
+    return Powers(jnp.swapaxes(ladder.matrices, 1, 2), ladder.logs)
 
 
 class SampledAxis(NamedTuple):
@@ -76,14 +204,12 @@ class LinearParts(eqx.Module):
     memory: int = eqx.field(static=True)  # samples that a command may be on its way
     dt: float = eqx.field(static=True)  # s
 
-    @property
-    def count(self) -> int:
-        """How many loops there are."""
-        return len(self.ratio)
-
-    def at(self, k: int) -> "LinearParts":
-        """One of the loops."""
-        return jax.tree.map(lambda x: x[k], self)
+    def map(self, of_one: Callable[["LinearParts"], Tree]) -> Tree:
+        """What `of_one` makes of each loop, on a first axis; of a single one without vmap."""
+        if len(self.ratio) > 1:
+            return jax.vmap(of_one)(self)
+        one = jax.tree.map(lambda x: x[0], self)
+        return jax.tree.map(lambda x: x[None], of_one(one))
 
     def sampled(self) -> tuple[SampledAxis, LinearController]:
         """Plant and controller of a single loop, from sample to sample."""
@@ -103,8 +229,7 @@ def linear_parts(
 ) -> tuple[LinearParts, tuple[int, ...]]:
     """The linear loops of all members, or of one, axis by axis; and the shape of the ensemble.
 
-    Controllers get as many `states` at least, of which those in excess do nothing: then controllers
-    of any kind share what is compiled. Raises ValueError for what has no linear form.
+    Controllers get as many `states` at least, idle ones, to share what is compiled.
     """
     plant, controller = loop.plant, loop.controller
     if not isinstance(plant, LinearisablePlant):
@@ -151,7 +276,8 @@ def _linearised(
     rank = len(ensemble_shape(controller))
 
     def of_axis(axis: int) -> tuple:
-        linear, b0 = plant.linearise(axis), jnp.asarray(assumed_gain(controller, axis))
+        linear, b0 = plant.linearise(axis), jnp.asarray(getattr(controller, "b0", 1.0))
+        b0 = b0[axis if b0.shape[0] > 1 else 0] if b0.ndim else b0
 
         def of_member(*place: Int[Array, ""]) -> tuple:
             def at(x: Array, rank: int) -> Array:
@@ -163,59 +289,36 @@ def _linearised(
                 at(linear.A, 2), at(linear.command, 1), at(linear.torque, 1), at(linear.gain, 0)
             )
             late = None if delay is None else at(delay.astype(linear.A.dtype), 0)
-            sampled = (
-                controller
-                if isinstance(controller, LinearController)
-                else controller.linear(axis, place[:rank] if rank else None)
-            )
+            sampled = controller
+            if not isinstance(sampled, LinearController):
+                sampled = sampled.linear(axis, place[:rank] if rank else None)
             if not math.isclose(sampled.dt, dt, rel_tol=1e-6):
                 raise ValueError(
                     f"the controller's linear form is for samples of {sampled.dt} s, the loop's "
                     f"are {dt} s: give the loop dt={sampled.dt}"
                 )
-            return (
-                physical,
-                _with_states(sampled, states),
-                late,
-                at(linear.gain, 0) / (at(b0.astype(linear.gain.dtype), 0)),
+            # A state that nothing drives, as the integral of a PID with ki = 0, is no mode.
+            A = sampled.A
+            others = jnp.where(jnp.eye(len(A), dtype=bool), 0, A)
+            inputs = (sampled.measurement_in != 0) | (sampled.reference_in != 0)
+            driven = jnp.any(others != 0, axis=1) | inputs
+            extra = max(0, states - len(sampled.C))
+            longer = lambda x: jnp.pad(x, (0, extra))
+            padded = dataclasses.replace(
+                sampled,
+                A=jnp.pad(jnp.where(driven[:, None], A, 0), ((0, extra), (0, extra))),
+                reference_in=longer(sampled.reference_in),
+                measurement_in=longer(sampled.measurement_in),
+                C=longer(sampled.C),
             )
+            ratio = at(linear.gain, 0) / (at(b0.astype(linear.gain.dtype), 0))
+            return physical, padded, late, ratio
 
         if not places:
             return jax.tree.map(lambda x: jnp.asarray(x)[None], of_member())
         return jax.vmap(of_member)(*(jnp.asarray(x) for x in places))
 
     return jax.tree.map(lambda *rows: jnp.concatenate(rows), *(of_axis(k) for k in axes))
-
-
-def axis_index(axis: int | str) -> int:
-    """The number of an axis. Raises ValueError for a name that it does not have."""
-    if isinstance(axis, int):
-        if axis < 0:
-            raise ValueError(f"axis is {axis}: give 0 or above, or one of {', '.join(AXES)}")
-        return axis
-    if axis not in AXES:
-        raise ValueError(f"axis is {axis!r}: choose one of {', '.join(AXES)}, or a number")
-    return AXES.index(axis)
-
-
-def _with_states(controller: LinearController, states: int) -> LinearController:
-    """With further states that nothing drives and nothing reads.
-
-    A state that nothing drives, as the integral of a PID with ki = 0, stays at 0: it is no mode.
-    """
-    A = controller.A
-    others = jnp.where(jnp.eye(len(A), dtype=bool), 0, A)
-    inputs = (controller.measurement_in != 0) | (controller.reference_in != 0)
-    driven = jnp.any(others != 0, axis=1) | inputs
-    extra = max(0, states - len(controller.C))
-    longer = lambda x: jnp.pad(x, (0, extra))
-    return dataclasses.replace(
-        controller,
-        A=jnp.pad(jnp.where(driven[:, None], A, 0), ((0, extra), (0, extra))),
-        reference_in=longer(controller.reference_in),
-        measurement_in=longer(controller.measurement_in),
-        C=longer(controller.C),
-    )
 
 
 class Rational(NamedTuple):
@@ -249,10 +352,9 @@ def rational(
     C: Float[Array, " states"],
     D: Float[Array, " inputs"],
 ) -> Rational:
-    """C (z - A)^-1 B + D, by the Faddeev-LeVerrier recursion on A - 1.
+    """C (z - A)^-1 B + D, by the Faddeev-LeVerrier recursion on A - 1, for up to about 8 states.
 
-    Source: Householder, The Theory of Matrices in Numerical Analysis, section 6.7. It loses digits
-    as the number of states grows; sampled controllers have up to about eight.
+    Source: Householder, The Theory of Matrices in Numerical Analysis, section 6.7.
     """
     unit = jnp.eye(len(A), dtype=A.dtype)
     change, adjugate = A - unit, unit
@@ -311,7 +413,8 @@ class OpenLoop(eqx.Module):
         late = jnp.exp(-self.shift.astype(ahead.dtype) * imaginary(angle))
         driven = late * (fresh + stale * (1 + jnp.conj(ahead)))  # |1 + ahead| is 1
         denominator = below[0] * inner[0]
-        return _square(denominator - driven * feedback) / _square(denominator)
+        square = lambda x: x.real**2 + x.imag**2
+        return square(denominator - driven * feedback) / square(denominator)
 
     def static_gain_margin(self) -> Float[Array, ""]:
         """-1 / L at frequency 0, the gain at which a pole passes z = 1; `nan` without one.
@@ -329,10 +432,6 @@ class OpenLoop(eqx.Module):
 def _ahead(angle: Float[Array, " points"]) -> Complex[Array, " points"]:
     """exp(j angle) - 1 without the cancellation at small angles."""
     return jax.lax.complex(-2 * jnp.sin(angle / 2) ** 2, jnp.sin(angle))
-
-
-def _square(x: Complex[Array, " points"]) -> Float[Array, " points"]:
-    return x.real**2 + x.imag**2
 
 
 def join(plant: SampledAxis, controller: LinearController) -> OpenLoop:

@@ -1,22 +1,115 @@
+"""A loop, and what its parts need: methods, and nothing else."""
+
 import math
-from typing import NamedTuple
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import equinox as eqx
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, ArrayLike, Bool, Float, PyTree
 
 from jaxquad._core import as_float, per_member
-from jaxquad.control import LinearController, LinearisableController, ScheduledController
-from jaxquad.models import Multirotor
+from jaxquad.control import LinearController, LinearisableController, Reference, ScheduledController
+from jaxquad.models import LinearAxis, Multirotor
 
-from ._protocols import (
-    Controller,
-    Drive,
-    Plant,
-    sample_interval,
-    Sensor,
-)
+
+Vector = Float[Array, " axes *ensemble"]
+
+
+@runtime_checkable
+class Plant(Protocol):
+    """What a loop is closed around: `jq.DecoupledAxes`, `jq.models.Multirotor`, or your own module.
+
+    `init` gives the state at rest at the angles `euler` in rad, as wide as `ensemble` and the
+    plant's own arrays ask for; `derivative` its rate of change under held inputs and a disturbance
+    torque in N m; `measure` the angles in rad. With `with_added_inertia(inertia)` a plant can carry
+    a scenario's payload.
+    """
+
+    def init(self, euler: ArrayLike | None = None, *, ensemble: tuple[int, ...] = ()) -> PyTree: ...
+    def derivative(self, state: PyTree, inputs: Vector, disturbance: Vector) -> PyTree: ...
+    def measure(self, state: PyTree) -> Vector: ...
+
+
+@runtime_checkable
+class Controller(Protocol):
+    """What closes a loop, one step a sample.
+
+    `init(like)` gives its state at rest, for measurements shaped as `like`; `step` the next state
+    and the command to hold. Further members are used where a controller has them:
+
+    - `dt`: the sample interval in s that it was made for;
+    - `applied(state, achieved)`: gets what the drive really gave, before the next sample;
+    - `signals(state)`: a dict of arrays `[axes, *ensemble]` to record;
+    - `prepared()`: the controller to run, with what is the same for all samples computed;
+    - `linear(axis, member)`: a `jq.control.LinearController` to analyse.
+    """
+
+    def init(self, like: Vector) -> PyTree: ...
+    def step(
+        self, state: PyTree, reference: Reference, measurement: Vector
+    ) -> tuple[PyTree, Vector]: ...
+
+
+@runtime_checkable
+class Drive(Protocol):
+    """From a command to the plant's inputs within their limits, as `jq.simulation.MotorDrive`."""
+
+    def inputs(self, command: Vector) -> Float[Array, " inputs *ensemble"]: ...
+    def achieved(self, inputs: Vector) -> Vector: ...
+
+
+@runtime_checkable
+class Sensor(Protocol):
+    """From true angles to measured ones, rad: `jq.simulation.Encoder`."""
+
+    def __call__(self, angle: Vector) -> Vector: ...
+
+
+@runtime_checkable
+class LinearisablePlant(Protocol):
+    """A plant that `jq.analyse`, `jq.tune` and `jq.certify` can analyse as a linear loop."""
+
+    def linearise(self, axis: int) -> LinearAxis:
+        """One axis about rest."""
+        ...
+
+
+@runtime_checkable
+class CarriesPayload(Protocol):
+    """A plant that can carry a scenario's payload."""
+
+    def with_added_inertia(self, inertia: Float[ArrayLike, "..."]) -> Plant: ...
+
+
+@runtime_checkable
+class ChecksState(Protocol):
+    """A plant that knows a state which integration has spoilt, such as a short quaternion."""
+
+    def is_resolved(self, state: PyTree) -> Bool[Array, "*ensemble"]: ...
+
+
+def sample_interval(controller: object) -> float | None:
+    """The interval in s that a controller was made for; None where it has no `dt`."""
+    return getattr(controller, "dt", None)
+
+
+def prepared(controller: Controller) -> Controller:
+    """The controller to run sample by sample."""
+    prepare = getattr(controller, "prepared", None)
+    return controller if prepare is None else prepare()
+
+
+def after_drive(controller: Controller, state: PyTree, achieved: Vector) -> PyTree:
+    """The controller's state once it knows what the drive really gave."""
+    applied = getattr(controller, "applied", None)
+    return state if applied is None else applied(state, achieved)
+
+
+def signals_of(controller: Controller, state: PyTree) -> dict[str, Array]:
+    """What a controller gives to record."""
+    signals = getattr(controller, "signals", None)
+    return {} if signals is None else signals(state)
 
 
 _DEFAULT_DT = 0.002  # s
@@ -112,7 +205,8 @@ class Loop(eqx.Module):
         longest_delay: float | None = None,
     ):
         dt = (sample_interval(controller) or _DEFAULT_DT) if dt is None else dt
-        _require_positive_number(dt, f"dt is {dt} s: give a sample interval above 0")
+        if not (dt > 0 and math.isfinite(dt)):
+            raise ValueError(f"dt is {dt} s: give a sample interval above 0")
         self.plant, self.controller, self.drive, self.encoder = plant, controller, drive, encoder
         self.dt, self.substeps, self.bound = float(dt), substeps, float(bound)
         self.queue, self.longest_delay = DelayQueue.of(delay, self.dt, longest_delay), longest_delay
@@ -121,8 +215,8 @@ class Loop(eqx.Module):
     def __check_init__(self):
         if not (isinstance(self.substeps, int | np.integer) and self.substeps >= 1):
             raise ValueError(f"substeps is {self.substeps}: give a whole number, 1 or more")
-        message = f"bound is {self.bound} rad: give an angle above 0"
-        _require_positive_number(self.bound, message)
+        if not (self.bound > 0 and math.isfinite(self.bound)):
+            raise ValueError(f"bound is {self.bound} rad: give an angle above 0")
         if isinstance(self.controller, Plant) and not isinstance(self.controller, Controller):
             raise ValueError(
                 f"the controller is a {type(self.controller).__name__}, which is a plant: give "
@@ -161,8 +255,3 @@ class Loop(eqx.Module):
         loop = eqx.tree_at(lambda x: x.plant, self, plant)
         loop.__check_init__()
         return loop
-
-
-def _require_positive_number(value: float, message: str) -> None:
-    if not (value > 0 and math.isfinite(value)):
-        raise ValueError(message)

@@ -1,7 +1,5 @@
 """Margins of a loop, how it rejects disturbances, and whether it closes stably at all."""
 
-from collections.abc import Callable
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -11,8 +9,6 @@ from jaxtyping import Array, ArrayLike, Complex, Float
 from ._curve import (
     ambiguous,
     Basis,
-    basis_of,
-    between,
     count_unstable_poles,
     crossed,
     crossings,
@@ -21,13 +17,11 @@ from ._curve import (
     decibels,
     degrees,
     evaluate_curve,
-    first,
+    Evaluated,
     lines,
     Numbers,
-    only_finite,
     Response,
     shown,
-    with_coherence,
 )
 
 
@@ -62,7 +56,6 @@ def unstable_roots(
 
 
 def remarks_on_roots(roots: float, unstable_poles: int) -> list[str]:
-    """What a count of unstable roots means for the numbers of a loop."""
     if roots > 0:
         return [
             f"the closed loop is unstable: with {unstable_poles} unstable poles in the loop, "
@@ -93,24 +86,17 @@ class Margins(eqx.Module):
 
     **Arguments:**
 
-    - `phase_margin`: rad, the smallest; negative beyond -180 deg.
-    - `crossover`: rad/s, of that phase margin.
-    - `delay_margin`: s, the smallest.
-    - `delay_crossover`: rad/s, of that delay margin.
-    - `gain_margin`: smallest factor above 1.
-    - `phase_crossover`: rad/s, of that gain margin.
-    - `gain_reduction`: greatest factor below 1.
-    - `reduction_crossover`: rad/s, of that reduction.
-    - `crossovers`: rad/s, where |L| = 1.
-    - `phase_margins`: rad, -pi to pi, at those crossings.
-    - `delay_margins`: s, at those crossings.
-    - `phase_crossovers`: rad/s, where L is real and negative.
-    - `gain_margins`: 1 / |L| at those crossings.
+    - `phase_margin`, `delay_margin`: rad and s, the smallest (negative beyond -180 deg), at
+        `crossover` and `delay_crossover`, rad/s.
+    - `gain_margin`, `gain_reduction`: smallest factor above 1 and greatest below 1, at
+        `phase_crossover` and `reduction_crossover`, rad/s.
+    - `crossovers`: rad/s, where |L| = 1, with `phase_margins` (rad, -pi to pi) and
+        `delay_margins` (s); `phase_crossovers`: rad/s, where L is real and negative, with
+        `gain_margins`, 1 / |L|.
     - `unstable_roots`: of the closed loop, by Nyquist's count; nan if unknown.
     - `left_out`: crossings beyond 16 of a kind.
     - `standard_errors`: of a measured response, by the names above; else empty.
-    - `basis`: what the numbers were found from.
-    - `unstable_poles`: of L.
+    - `basis`: what the numbers were found from; `unstable_poles`: of L.
     """
 
     phase_margin: Float[Array, ""]
@@ -210,16 +196,15 @@ def margins(
     """
     curve = curve_of(loop, omega, output, input)
     unstable_poles = count_unstable_poles(loop, unstable_poles)
-    values, basis, errors = evaluate_curve(
-        _margins_of, curve, jnp.asarray(unstable_poles, curve.omega.dtype)
-    )
-    places = {"crossover": values["crossover"], "phase_crossover": values["phase_crossover"]}
-    places["reduction_crossover"] = values["reduction_crossover"]
-    basis = with_coherence(basis, curve, places)
-    return Margins(**values, standard_errors=errors, basis=basis, unstable_poles=unstable_poles)
+    poles = jnp.asarray(unstable_poles, curve.omega.dtype)
+    numbers = evaluate_curve(_margins_of, curve, poles, places=_PLACES)
+    return Margins(**numbers, unstable_poles=unstable_poles)
 
 
-def _margins_of(curve: Curve, unstable_poles: Float[Array, ""]) -> tuple[Numbers, Numbers, Basis]:
+_PLACES = ("crossover", "phase_crossover", "reduction_crossover")
+
+
+def _margins_of(curve: Curve, unstable_poles: Float[Array, ""]) -> Evaluated:
     values = jax.lax.stop_gradient(curve(curve.omega))
     level, angle = jnp.log(jnp.abs(values)), jnp.angle(-values)
     # Across the positive axis the angle of -L jumps by a turn.
@@ -236,8 +221,7 @@ def _margins_of(curve: Curve, unstable_poles: Float[Array, ""]) -> tuple[Numbers
     phase = jax.lax.stop_gradient(curve.phase(None))
     # How a loop of small gain turns does not matter.
     heard = jnp.maximum(level[:-1], level[1:]) > np.log(0.1)
-    basis = basis_of(curve, phase, finite, heard)
-    return only_finite(numbers, finite), counts, basis
+    return Evaluated(numbers, counts, finite, phase, heard)
 
 
 def _phase_margins(curve: Curve, where: Array, rank: Array) -> Numbers:
@@ -294,194 +278,3 @@ def _gain_margins(curve: Curve, where: Array, rank: Array) -> Numbers:
 def _listed(places: Float[Array, " crossings"]) -> str:
     numbers = np.asarray(places)[np.isfinite(np.asarray(places))]
     return ", ".join(f"{x:.4g}" for x in numbers) + " rad/s" if numbers.size else "none"
-
-
-_LEVEL = np.log(10.0) * -3 / 20  # -3 dB in nepers
-_PLACES = ("bandwidth", "peak_frequency", "complementary_peak_frequency")
-
-
-class Rejection(eqx.Module):
-    """How a loop rejects disturbances: S = 1 / (1 + L), and T = 1 - S.
-
-    `str()` says why a number is missing (`nan`), and where a peak lies on the edge of the band.
-
-    **Arguments:**
-
-    - `bandwidth`: rad/s, DRB: where |S| first rises through -3 dB.
-    - `peak`: DRP or Ms: greatest |S|.
-    - `peak_frequency`: rad/s, of that peak.
-    - `complementary_peak`: Mt: greatest |T|.
-    - `complementary_peak_frequency`: rad/s, of that peak.
-    - `start`: |S| at the lowest frequency.
-    - `rivals`: measured points within two standard errors of the peak of S.
-    - `unstable_roots`: of the closed loop, by Nyquist's count; nan if unknown.
-    - `standard_errors`: of a measured response, by the names above; else empty.
-    - `basis`: what the numbers were found from.
-    - `unstable_poles`: of L.
-    - `quantity`: what the response is of.
-    """
-
-    bandwidth: Float[Array, ""]
-    peak: Float[Array, ""]
-    peak_frequency: Float[Array, ""]
-    complementary_peak: Float[Array, ""]
-    complementary_peak_frequency: Float[Array, ""]
-    start: Float[Array, ""]
-    rivals: Float[Array, ""]
-    unstable_roots: Float[Array, ""]
-    standard_errors: dict[str, Array]
-    basis: Basis
-    unstable_poles: int = eqx.field(static=True)
-    quantity: str = eqx.field(static=True)
-
-    @property
-    def modulus_margin(self) -> Float[Array, ""]:
-        """Least distance of L from -1."""
-        return 1 / self.peak
-
-    @property
-    def remarks(self) -> tuple[str, ...]:
-        """What a reader has to know before using the numbers."""
-        roots = []
-        if self.quantity == "loop":
-            roots = remarks_on_roots(float(self.unstable_roots), self.unstable_poles)
-        missing, doubts, ends = [], [], np.asarray(self.basis.band)
-        if not np.isfinite(self.bandwidth) and bool(self.basis.finite):
-            missing = [f"no DRB: |S| does not rise to -3 dB {self.basis.where}"]
-            if float(np.log(self.start)) >= _LEVEL:
-                start = decibels(self.start, None)
-                missing = [f"no DRB: |S| starts at {start}, above -3 dB; give lower frequencies"]
-        for title, name in (("S", "peak"), ("T", "complementary_peak")):
-            if float(vars(self)[f"{name}_frequency"]) in ends:
-                doubts.append(
-                    f"the greatest |{title}| is on the edge of the band: no peak, or one beyond"
-                )
-        if float(self.rivals) > 0:
-            doubts.append(
-                f"{int(self.rivals)} more points lie within two standard errors of the peak of S: "
-                "the greatest of them is high by chance"
-            )
-        return tuple(missing + roots + doubts + self.basis.remarks)
-
-    def __str__(self) -> str:
-        error = self.standard_errors.get
-        rows = [("DRB", shown(self.bandwidth, error("bandwidth"), "rad/s"))]
-        for title, name in (("DRP = Ms", "peak"), ("Mt", "complementary_peak")):
-            place = float(vars(self)[f"{name}_frequency"])
-            height = decibels(vars(self)[name], error(name))
-            rows.append((title, f"{height} at {place:.4g} rad/s"))
-        return "\n".join(
-            [f"disturbance rejection, {self.basis.where}", lines(rows, [*self.remarks])]
-        )
-
-
-def disturbance_rejection(
-    response: Response,
-    *,
-    quantity: str = "loop",
-    omega: Float[ArrayLike, " frequencies"] | None = None,
-    unstable_poles: int | None = None,
-    output: str | int | None = None,
-    input: str | int | None = None,
-) -> Rejection:
-    """Disturbance rejection bandwidth and peak, and the complementary peak, of a control loop.
-
-    The peak of a measured response is its greatest value at a measured frequency: noise pushes it
-    up. Whether the closed loop is stable is counted by Nyquist's criterion.
-
-    **Arguments:**
-
-    - `response`: a `jq.spectra.FrequencyResponse`, whose numbers are interpolated (ln|T| and phase
-        straight in ln omega) and carry standard errors, or any model with
-        `frequency_response(omega)`, whose numbers are exact and differentiable, also under jit.
-    - `quantity`: what the response is, the "loop" L, with negative feedback, or the "sensitivity"
-        S, from a disturbance at the output to the output.
-    - `omega`: rad/s. A model is searched there, by default at 2000 log-spaced values from 0.01 to
-        1000; of a measured response it picks some of its own frequencies.
-    - `unstable_poles`: how many the loop L has. By default those of a model of s, as
-        `jq.TransferFunction` or `jq.StateSpace`, and none under jit and of other loops.
-    - `output`, `input`: the channel, by name or number; None where there is one.
-
-    **Returns:** a `Rejection`.
-
-    **Raises:** ValueError for an unknown quantity, channel or grid.
-
-    Source: MIL-DTL-32742 / CONDUIT's DRB (-3 dB) and DRP.
-    """
-    if quantity not in ("loop", "sensitivity"):
-        raise ValueError(f'quantity is {quantity!r}: choose "loop" or "sensitivity"')
-    curve = curve_of(response, omega, output, input)
-    if quantity == "loop":
-        unstable_poles = count_unstable_poles(response, unstable_poles)
-    unstable_poles = unstable_poles or 0
-    poles = jnp.asarray(unstable_poles, curve.omega.dtype)
-    values, basis, errors = evaluate_curve(_rejection_of, curve, quantity, poles)
-    basis = with_coherence(basis, curve, {name: values[name] for name in _PLACES})
-    return Rejection(
-        **values,
-        standard_errors=errors,
-        basis=basis,
-        unstable_poles=unstable_poles,
-        quantity=quantity,
-    )
-
-
-def _rejection_of(
-    curve: Curve, quantity: str, unstable_poles: Float[Array, ""]
-) -> tuple[Numbers, Numbers, Basis]:
-    def sensitivity(omega):
-        values = curve(omega)
-        return 1 / (1 + values) if quantity == "loop" else values
-
-    def complement(omega):
-        values = curve(omega)
-        return values / (1 + values) if quantity == "loop" else 1 - values
-
-    level = jnp.log(jnp.abs(sensitivity(curve.omega)))
-    rises = crossed(jax.lax.stop_gradient(level) - _LEVEL, "rising")
-    bandwidth = first(lambda w: jnp.log(jnp.abs(sensitivity(w))) - _LEVEL, curve.omega, rises)
-    (peak, at), (other, there) = (_peak(f, curve) for f in (sensitivity, complement))
-    loop = jax.lax.stop_gradient(curve(curve.omega))
-    unknown = jnp.asarray(jnp.nan, level.dtype)
-    by_nyquist = unstable_roots(curve.omega, loop, unstable_poles)
-    rivals = jnp.zeros((), level.dtype)
-    if curve.coherence is not None:
-        gain = jnp.abs(loop / (1 + loop)) if quantity == "loop" else jnp.ones_like(level)
-        close = level + 2 * gain * curve.measured.random_error >= jnp.max(level)
-        rivals = jax.lax.stop_gradient(jnp.sum(close).astype(level.dtype) - 1)
-    numbers = {
-        "bandwidth": bandwidth,
-        "peak": peak,
-        "complementary_peak": other,
-        "start": jnp.exp(level[0]),
-    }
-    others = {
-        "peak_frequency": at,
-        "complementary_peak_frequency": there,
-        "rivals": rivals,
-        "unstable_roots": by_nyquist if quantity == "loop" else unknown,
-    }
-    finite = jnp.all(jnp.isfinite(loop)) & jnp.all(jnp.isfinite(level))
-    phase = jax.lax.stop_gradient(curve.phase(None))
-    others = only_finite(others, finite)
-    return only_finite(numbers, finite), others, basis_of(curve, phase, finite)
-
-
-def _peak(response: Callable, curve: Curve) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    def level(omega):
-        return jnp.log(jnp.abs(response(omega)))
-
-    def slope(omega):
-        return jax.jvp(level, (omega,), (omega,))[1]
-
-    grid = level(curve.omega)
-    k, omega = jnp.argmax(grid), jax.lax.stop_gradient(curve.omega)
-    if curve.coherence is not None:
-        return jnp.exp(grid[k]), omega[k]
-    last = omega.size - 1
-    inside = (k > 0) & (k < last)
-    place = between(slope, omega[jnp.maximum(k - 1, 0)], omega[jnp.minimum(k + 1, last)])
-    height = level(place[None])[0]
-    # A peak that the grid does not resolve has more than one place of no slope.
-    better = inside & (height >= grid[k] - 1e-12)
-    return jnp.exp(jnp.where(better, height, grid[k])), jnp.where(better, place, omega[k])

@@ -122,10 +122,7 @@ def chosen_span(
     first: float, last: float, start: Number | None, stop: Number | None, origin: float,
     slack: float, extent: str,
 ) -> tuple[float, float]:  # fmt: skip
-    """From `start` to `stop` within `first` .. `last` (s), where None is the end.
-
-    Both may count from the `origin` that is shown; the `extent` is what errors say there is.
-    """
+    """From `start` to `stop` within `first` .. `last` (s); both may count from `origin`."""
     start, stop = (
         origin + time if time is not None and origin and time < _DATES else time
         for time in (start, stop)
@@ -173,7 +170,7 @@ def unwrap(counter: np.ndarray) -> tuple[np.ndarray, int]:
     return counter.astype(np.float64) + span * turns, int(wraps.sum())
 
 
-RepairedTime = tuple[Times, np.ndarray | None, str]  # stamps, which rows (None: all), a remark
+RepairedTime = tuple[np.ndarray, np.ndarray | None, str]  # stamps, which rows (None: all), a remark
 
 
 def repair_time(time: Times) -> RepairedTime:
@@ -327,10 +324,8 @@ _MOST_TURNS = 0.02  # of all steps; more are no turns of a vehicle
 def without_turns(values: Values, unit: str) -> tuple[Values, int, float]:
     """An angle that goes on where it jumped by a turn, how often it jumped, and the turn.
 
-    A turn is 360 where the `unit` is deg, 2 pi where it is rad, either where it is unknown; other
-    units are no angles. Jumps are turns where they go from one end of a range of one turn to the
-    other, and the angle moves little from sample to sample elsewhere, but moves. A square wave from
-    -180 to 180 does not.
+    It jumps from end to end of a range of one turn, and else moves little from sample to sample,
+    but moves: a square wave from -180 to 180 does not.
     """
     periods = _PERIODS.get(unit, ())
     if not periods or values.size < 2 or not np.isfinite(values).all():

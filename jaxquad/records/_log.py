@@ -18,17 +18,17 @@ class Table:
 
     A column has one or two dimensions and any real dtype, and may be a strided view. Its values
     times its `scale` (1 by default) are in its `unit`. Without a `time` the time stamps are found
-    by their name, as `read` describes. A column with blank cells holds its values alone, and `rows`
-    says in which rows of the table they stand. A column whose header has a unit is also known by
-    this whole title.
+    by their name, as `read` describes. A column with blank cells holds its values alone.
     """
 
     columns: Mapping[str, np.ndarray]
     time: Float[np.ndarray, " samples"] | None = None  # s
     units: Mapping[str, str] = dataclasses.field(default_factory=dict)
     scales: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    # Of columns with blank cells: in which rows of the table the values stand.
     rows: Mapping[str, Bool[np.ndarray, " rows"]] = dataclasses.field(default_factory=dict)
-    titles: Mapping[str, str] = dataclasses.field(default_factory=dict)  # title -> column
+    # Of columns whose header has a unit: the whole title -> column.
+    titles: Mapping[str, str] = dataclasses.field(default_factory=dict)
 
 
 class SettingChange(NamedTuple):
@@ -96,11 +96,10 @@ def changes_of(
 
 
 def flattened(log: Log) -> Signals:
-    """The numeric columns of a log with one or two dimensions, by their full names.
+    """The numeric columns of a log by their full names, without those longer than their clock.
 
-    In a table with a clock, columns of another length, such as parameters, are left out. In one
-    without, a matrix whose rows are the channels is turned: it has too few rows for a record, or as
-    many columns as other arrays of the file have samples.
+    Without a clock, a matrix whose rows are the channels is turned: it has too few rows for a
+    record, or as many columns as other arrays of the file have samples.
     """
     arrays, clocks, titles = {}, {}, {}
     for table_name, table in log.tables.items():
@@ -156,16 +155,13 @@ def allowance(stored: int) -> int:
 
 def check_size(what: str, declared: int, stored: int, *, offset: int | None = None) -> None:
     """Raise ReadError where `stored` bytes declare that they unfold to too many."""
-    if declared > allowance(stored):
-        raise ReadError(oversize(what, declared, stored), offset=offset)
-
-
-def oversize(what: str, declared: int, stored: int) -> str:
-    """What the error says."""
-    return (
-        f"{what} declares {declared:.4g} bytes of numbers in {stored:.4g} bytes of file (limit "
-        f"{allowance(stored):.4g}): it is probably damaged; if it is not, cut it into parts"
-    )
+    limit = allowance(stored)
+    if declared > limit:
+        raise ReadError(
+            f"{what} declares {declared:.4g} bytes of numbers in {stored:.4g} bytes of file (limit "
+            f"{limit:.4g}): it is probably damaged; if it is not, cut it into parts",
+            offset=offset,
+        )
 
 
 def describe_skips(skipped: list[tuple[int, int]], place: int, end: int) -> list[str]:

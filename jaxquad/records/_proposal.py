@@ -357,40 +357,34 @@ def _in_flight(log: Log, setup: Setup, start: float | None, stop: float | None) 
     ends = setup._replace(start=start, stop=stop)
     if start is not None and stop is not None:
         return ends
-    flown = _flown_span(log)
-    if (flown.stop is not None and start is not None and start >= flown.stop) or (
-        flown.start is not None and stop is not None and stop <= flown.start
+    (begin, end), (before, after), remarks = _flown_span(log)
+    if (end is not None and start is not None and start >= end) or (
+        begin is not None and stop is not None and stop <= begin
     ):
         return ends
-    cut = (flown.before if start is None else "", flown.after if stop is None else "")
+    cut = (before if start is None else "", after if stop is None else "")
     left_out = " and ".join(filter(None, cut))
     said = f"left out, as no flight: {left_out}; --start and --stop take others"
     return setup._replace(
-        start=flown.start if start is None else start,
-        stop=flown.stop if stop is None else stop,
-        remarks=(*setup.remarks, *flown.remarks, *((said,) if left_out else ())),
+        start=begin if start is None else start,
+        stop=end if stop is None else stop,
+        remarks=(*setup.remarks, *remarks, *((said,) if left_out else ())),
     )
 
 
-class _FlownSpan(NamedTuple):
-    """First and last time of flight in s, and what is said of the parts that are not in it."""
-
-    start: float | None = None  # None: the log begins, ends in flight
-    stop: float | None = None
-    before: str = ""
-    after: str = ""
-    remarks: tuple[str, ...] = ()
+Ends = tuple[float | None, float | None]  # s, of flight; None: the log begins, ends in flight
+_UNKNOWN = (None, None), ("", ""), ()
 
 
-def _flown_span(log: Log) -> _FlownSpan:
-    """The time from take-off to landing or crash, as far as the log shows it.
+def _flown_span(log: Log) -> tuple[Ends, tuple[str, str], tuple[str, ...]]:
+    """Take-off and landing or crash, what lies before and after, and remarks.
 
     Flight is a window of 0.25 s with the throttle above 5 % in which the gyro moves twice as much
     as at its quietest without. Only the ends of a log are cut: a dive without throttle is flight.
     """
     signals, firmware = flattened(log), firmware_log(log.vehicle)
     if firmware is None:
-        return _FlownSpan()
+        return _UNKNOWN
 
     def logged(name: str) -> str:
         """The full name of a channel in a log of one flight; empty where it is not logged."""
@@ -402,11 +396,11 @@ def _flown_span(log: Log) -> _FlownSpan:
     names = [name for rate in firmware.rates if (name := logged(rate))]
     time = clock(names[0]) if throttle and names else None
     if time is None or not time.size or not np.isfinite(time).all():
-        return _FlownSpan()
+        return _UNKNOWN
     begin, end = float(time[0]), float(time[-1])
     count = int((end - begin) / _WINDOW)
     if not (begin < end and _SHORTEST / _WINDOW <= count < 1_000_000):
-        return _FlownSpan()
+        return _UNKNOWN
 
     def mean(name: str, values: np.ndarray) -> Float[np.ndarray, " windows"]:
         """Of values on the clock of a channel, by windows; NaN where one holds none."""
@@ -424,7 +418,7 @@ def _flown_span(log: Log) -> _FlownSpan:
     powered = np.nan_to_num(np.asarray(collective)) > _IDLE
     if not powered.any():
         remark = f"the throttle stays below {100 * _IDLE:.0f} %: the log seems to hold no flight"
-        return _FlownSpan(remarks=(remark,))
+        return *_UNKNOWN[:2], (remark,)
     # The gyro shows more than at rest; everywhere where the log does not show rest.
     power = np.zeros(count)
     controlled = np.ones(count, bool)  # where no rate is far from its set-point
@@ -450,11 +444,11 @@ def _flown_span(log: Log) -> _FlownSpan:
     first = np.flatnonzero(flying[:-1] & flying[1:])
     last = np.flatnonzero(controlled[:-1] & controlled[1:])
     if not first.size or not last.size or (last[-1] + 2 - first[0]) * _WINDOW < _SHORTEST:
-        return _FlownSpan()
+        return _UNKNOWN
     begins, ends = int(first[0]), int(last[-1]) + 2
     start = begin + begins * _WINDOW if begins > 0 else None
     stop = begin + ends * _WINDOW if ends + 1 < count else None
     kind = "a crash" if flying[ends:].any() else "landed"
     before = "" if start is None else f"t = {begin:.6g} .. {start:.6g} s (on the ground)"
     after = "" if stop is None else f"t = {stop:.6g} .. {end:.6g} s ({kind})"
-    return _FlownSpan(start, stop, before, after)
+    return (start, stop), (before, after), ()

@@ -260,41 +260,27 @@ def one_flight(log: Log) -> tuple[Flight, ...]:
 class FirmwareLog:
     """What the channels of a firmware's logs mean; it needs no JAX.
 
-    **Attributes:**
-
-    - `name`: the `vehicle` of its logs; `title`: as people write it.
-    - `setup`: the channels of the axis that is wanted, and what excited it; raises RecordError
-      where the log lacks them.
-    - `rates`, `setpoints`: of roll, pitch and yaw, by which take-off, landing and crash are seen.
-    - `throttle`: channels with their factors to 0 .. 1, what the motors had first, what they were
-      asked for last.
-    - `hold`: for how long the loop holds its command in s, None where the log does not say it; and
-      remarks.
-    - `of_loop`: how the names of the loop's parameters begin, whose change in flight splits a log;
-      `learned`: which of them the firmware itself changes.
-    - `settings`: whether its logs hold parameters; `release`: which of them is the version.
-    - `flights`: those of a file; `remarks_on`: what to say of the part that is used.
-    - `numbers_chirps`: whether a proposal lists all chirps with their numbers.
-    - `gyro_cutoffs`: parameters, one of which is in each log that tells the gyro's filters.
-    - `reader`: of its files, where no format of `jq.read` is theirs.
+    `setup` finds the channels of the axis that is wanted, and what excited it, and raises
+    RecordError where the log lacks them. `hold` is for how long the loop holds its command in s,
+    None where the log does not say it; with remarks.
     """
 
-    name: str
-    title: str
+    name: str  # the `vehicle` of its logs
+    title: str  # as people write it
     setup: Callable[[Log, Selection], Setup]
-    rates: Sequence[str] = ()
+    rates: Sequence[str] = ()  # of roll, pitch and yaw: they show take-off, landing and crash
     setpoints: Sequence[str] = ()
-    throttle: Sequence[tuple[str, float]] = ()
+    throttle: Sequence[tuple[str, float]] = ()  # factors to 0 .. 1; first what the motors had
     hold: Callable[[Log], tuple[float | None, tuple[str, ...]]] = lambda log: (None, ())
-    of_loop: tuple[str, ...] = ()
-    learned: tuple[str, ...] = ()
-    settings: bool = True
-    release: str = ""
+    of_loop: tuple[str, ...] = ()  # how names of parameters begin whose change splits a log
+    learned: tuple[str, ...] = ()  # those of them that the firmware itself changes
+    settings: bool = True  # whether its logs hold parameters
+    release: str = ""  # the parameter that is the version
     flights: Callable[[Log], tuple[Flight, ...]] = one_flight
     remarks_on: Callable[[Log, Setup, Spans], tuple[str, ...]] = lambda log, setup, spans: ()
-    numbers_chirps: bool = False
-    gyro_cutoffs: tuple[str, ...] = ()
-    reader: Reader | None = None
+    numbers_chirps: bool = False  # whether a proposal lists all chirps with their numbers
+    gyro_cutoffs: tuple[str, ...] = ()  # one of these is in each log that tells the gyro's filters
+    reader: Reader | None = None  # of its files, where no format of `jq.read` is theirs
 
 
 def hold_by_rate(log: Log, name: str) -> tuple[float | None, tuple[str, ...]]:

@@ -2,21 +2,6 @@
 
 from jaxquad._compile import run_ensemble as run_ensemble
 
-from ._authority import (
-    Authority as Authority,
-    authority as authority,
-    AuthorityWarning as AuthorityWarning,
-    beyond_authority as beyond_authority,
-    find_authority as find_authority,
-)
-from ._disturbances import (
-    ceti_gust as ceti_gust,
-    gauss_markov as gauss_markov,
-    Gust as Gust,
-    Pulse as Pulse,
-    WhiteNoise as WhiteNoise,
-)
-from ._evaluate import evaluate as evaluate, metrics as metrics
 from ._flight_metrics import (
     find_steps as find_steps,
     FlightMetrics as FlightMetrics,
@@ -24,13 +9,24 @@ from ._flight_metrics import (
     window as window,
 )
 from ._hardware import (
+    Authority as Authority,
+    authority as authority,
+    AuthorityWarning as AuthorityWarning,
+    beyond_authority as beyond_authority,
     Encoder as Encoder,
+    find_authority as find_authority,
     MotorDrive as MotorDrive,
     RotorDrive as RotorDrive,
     Saturation as Saturation,
 )
 from ._memory import in_slices as in_slices
-from ._metrics import Metrics as Metrics, Spread as Spread, Summary as Summary
+from ._metrics import (
+    evaluate as evaluate,
+    Metrics as Metrics,
+    metrics as metrics,
+    Spread as Spread,
+    Summary as Summary,
+)
 from ._parallel import (
     Devices as Devices,
     devices_for as devices_for,
@@ -41,14 +37,19 @@ from ._parallel import (
 )
 from ._scenario import excite as excite, Scenario as Scenario, scenario as scenario
 from ._signal import (
+    ceti_gust as ceti_gust,
     Clock as Clock,
+    gauss_markov as gauss_markov,
+    Gust as Gust,
     Motion as Motion,
+    Pulse as Pulse,
     Ramp as Ramp,
     ReferenceModel as ReferenceModel,
     Signal as Signal,
     Sine as Sine,
     SmoothStep as SmoothStep,
     Step as Step,
+    WhiteNoise as WhiteNoise,
 )
 from ._simulate import (
     check_run as check_run,

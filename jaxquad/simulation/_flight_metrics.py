@@ -2,7 +2,7 @@
 
 import functools as ft
 from collections.abc import Callable, Sequence
-from typing import NamedTuple, Protocol, runtime_checkable
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -10,6 +10,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Shaped
 
 from jaxquad._core import align, per_member, whole_samples
+
+from ._step import SampleResult
 
 
 _REST = 20  # the last of so many parts of the window, in which a step's reference stands still
@@ -115,24 +117,16 @@ def _inside(
     return jnp.broadcast_to((index >= first) & (index <= last), like.shape)
 
 
-@runtime_checkable
-class Sample(Protocol):
-    """What metrics need of a sample; `SampleResult` has it."""
+class Sample(NamedTuple):
+    """What metrics need of a sample."""
 
-    @property
-    def index(self) -> Int[Array, ""]: ...
-    @property
-    def angle(self) -> Float[Array, " axes *ensemble"]: ...
-    @property
-    def reference(self) -> Float[Array, " axes *ensemble"]: ...
-    @property
-    def disturbance(self) -> Float[Array, " axes *ensemble"]: ...
-    @property
-    def command(self) -> Float[Array, " axes *ensemble"]: ...
-    @property
-    def saturated(self) -> Bool[Array, " axes *ensemble"]: ...
-    @property
-    def signals(self) -> dict[str, Float[Array, " axes *ensemble"]]: ...
+    index: Int[Array, ""]
+    angle: Float[Array, " axes *ensemble"]
+    reference: Float[Array, " axes *ensemble"]
+    disturbance: Float[Array, " axes *ensemble"]
+    command: Float[Array, " axes *ensemble"]
+    saturated: Bool[Array, " axes *ensemble"]
+    signals: dict[str, Float[Array, " axes *ensemble"]]
 
 
 class FlightMetrics(eqx.Module):
@@ -168,7 +162,7 @@ class FlightMetrics(eqx.Module):
             sums["before"] = widened(self.steps.before[0], like)
         return sums
 
-    def update(self, sums: Sums, now: Sample) -> tuple[Sums, None]:
+    def update(self, sums: Sums, now: Sample | SampleResult) -> tuple[Sums, None]:
         """One sample more."""
         moment = _Moment(self, sums, now)
         after = {name: _UPDATES[name](moment, sums[name]) for name in sums}
@@ -190,7 +184,7 @@ class FlightMetrics(eqx.Module):
 class _Moment:
     """One sample, with what several numbers need of it."""
 
-    def __init__(self, of: FlightMetrics, sums: Sums, now: Sample):
+    def __init__(self, of: FlightMetrics, sums: Sums, now: Sample | SampleResult):
         self.of, self.sums, self.now = of, sums, now
         self.begins = now.index == of.window.first
         self.loaded = now.index >= of.window.loaded
@@ -278,11 +272,6 @@ def _saturated(at: _Moment) -> Array:
     return jnp.where(is_finite, share, 0)
 
 
-def _overshoot(at: _Moment, greatest: Array) -> Array:
-    counts = at.step[2] & (at.step[0] != at.before)
-    return jnp.where(counts, jnp.maximum(greatest, at.progress - 1), greatest)
-
-
 def _passed(at: _Moment, time: Array, level: float) -> Array:
     time = jnp.where(at.starts, _OPEN, time)
     passes = ((at.last < level) | at.starts) & (at.progress >= level) & (time < 0)
@@ -296,17 +285,12 @@ def _entered(at: _Moment, time: Array, band: float) -> Array:
     return jnp.where(jnp.abs(at.progress - 1) <= band, time, _OPEN)
 
 
-_NEEDS = {
-    "itae": ("itae",),
-    "iae": ("iae",),
-    "ise": ("ise",),
-    "energy": ("energy",),
+_TOTALS = (
+    "itae", "iae", "ise", "energy", "activity", "peak", "saturation_share", "rms",
+    "disturbance_rmse", "overshoot",
+)  # fmt: skip
+_NEEDS = {name: (name,) for name in _TOTALS} | {
     "activity": ("activity", "command"),
-    "saturation_share": ("saturation_share",),
-    "peak": ("peak",),
-    "rms": ("rms",),
-    "disturbance_rmse": ("disturbance_rmse",),
-    "overshoot": ("overshoot",),
     "rise_time": ("progress", "left", "arrived"),
     "settling_time": ("progress", "settled"),
     "settling_time_5": ("progress", "settled_5"),
@@ -328,7 +312,9 @@ _UPDATES: dict[str, Callable[[_Moment, Array], Array]] = {
     "peak": lambda at, most: jnp.maximum(most, jnp.where(at.loaded, jnp.abs(at.error), 0)),
     "rms": lambda at, total: total + jnp.where(at.loaded, at.error**2, 0),
     "disturbance_rmse": lambda at, total: total + jnp.where(at.loaded, at.missed**2, 0),
-    "overshoot": _overshoot,
+    "overshoot": lambda at, most: jnp.where(
+        at.step[2] & (at.step[0] != at.before), jnp.maximum(most, at.progress - 1), most
+    ),
     "before": lambda at, _: at.before,
     "progress": lambda at, _: at.progress,
     "left": lambda at, time: _passed(at, time, _LEVELS[0]),
@@ -354,24 +340,21 @@ def _final_overshoot(of: FlightMetrics, sums: Sums) -> Array:
     return percent if of.smooth else _only(_stepped(of, sums), percent)
 
 
-def _rise_time(of: FlightMetrics, sums: Sums) -> Array:
-    left, arrived = sums["left"], sums["arrived"]
-    return _only(_stepped(of, sums) & (left >= 0) & (arrived >= 0), arrived - left)
-
-
 def _settling_time(of: FlightMetrics, sums: Sums, name: str) -> Array:
     return _only(_stepped(of, sums) & (sums[name] >= 0), sums[name])
 
 
 def _rms(of: FlightMetrics, sums: Sums, name: str) -> Array:
     mean = sums[name] / of.count(of.window.loaded, sums[name])
-    root = jnp.sqrt(jnp.maximum(mean, _LEAST_SQUARE)) if of.smooth else _root(mean)
+    if of.smooth:
+        return _only(~jnp.isnan(mean), jnp.sqrt(jnp.maximum(mean, _LEAST_SQUARE)))
+    # With the gradient 0 at 0.
+    root = jnp.where(mean > 0, jnp.sqrt(jnp.where(mean > 0, mean, 1)), 0)
     return _only(~jnp.isnan(mean), root)
 
 
 _FINISHED: dict[str, Callable[[FlightMetrics, Sums], Array]] = {
-    name: lambda of, sums, name=name: sums[name]
-    for name in ("itae", "iae", "ise", "energy", "activity", "peak")
+    name: lambda of, sums, name=name: sums[name] for name in _TOTALS[:6]
 } | {
     "saturation_share": lambda of, sums: (
         sums["saturation_share"] / of.count(of.window.first, sums["saturation_share"])
@@ -379,7 +362,10 @@ _FINISHED: dict[str, Callable[[FlightMetrics, Sums], Array]] = {
     "overshoot": _final_overshoot,
     "rms": ft.partial(_rms, name="rms"),
     "disturbance_rmse": ft.partial(_rms, name="disturbance_rmse"),
-    "rise_time": _rise_time,
+    "rise_time": lambda of, sums: _only(
+        _stepped(of, sums) & (sums["left"] >= 0) & (sums["arrived"] >= 0),
+        sums["arrived"] - sums["left"],
+    ),
     "settling_time": ft.partial(_settling_time, name="settled"),
     "settling_time_5": ft.partial(_settling_time, name="settled_5"),
     "step": _step_size,
@@ -389,11 +375,6 @@ _FINISHED: dict[str, Callable[[FlightMetrics, Sums], Array]] = {
 
 def _only(there: Bool[Array, "..."], value: Float[Array, "..."]) -> Float[Array, "..."]:
     return jnp.where(there, value, jnp.nan)
-
-
-def _root(square: Float[Array, "..."]) -> Float[Array, "..."]:
-    """The square root, with the gradient 0 at 0."""
-    return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1)), 0)
 
 
 def _divisor(x: Float[Array, "..."]) -> Float[Array, "..."]:

@@ -1,8 +1,8 @@
 """What an ensemble needs, held against what there is, before an allocation fails."""
 
+import contextlib
 from collections.abc import Callable
 from pathlib import Path
-from typing import Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -14,22 +14,13 @@ _GB = 1e9
 _SIZED = (jax.Array, np.ndarray, jax.ShapeDtypeStruct)
 
 
-@runtime_checkable
-class Device(Protocol):
-    """What a device says of itself; a `jax.Device` does."""
-
-    @property
-    def platform(self) -> str: ...
-    def memory_stats(self) -> dict[str, int] | None: ...
-
-
 def require_memory(what: str, needed: float | int, remedy: str) -> None:
     """Raises ValueError where `needed` bytes are more than the default device has left.
 
     Where a machine does not tell what that is, nothing is refused.
     """
     chosen = getattr(jax.config, "jax_default_device", None)
-    free = free_memory(chosen if isinstance(chosen, Device) else jax.local_devices()[0])
+    free = free_memory(chosen if isinstance(chosen, jax.Device) else jax.local_devices()[0])
     if free is not None and needed > free:
         raise ValueError(
             f"{what} needs about {needed / _GB:.3g} GB, but {free / _GB:.3g} GB are free: {remedy}"
@@ -41,30 +32,20 @@ def size_of(tree: PyTree) -> int:
     return sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(tree) if isinstance(x, _SIZED))
 
 
-def free_memory(device: Device) -> float | None:
-    """In bytes; of the host for a CPU."""
+def free_memory(device: jax.Device) -> float | None:
+    """In bytes; of the host for a CPU, and of what a container may use of it."""
     if device.platform != "cpu":
         stats = device.memory_stats() or {}
         limit = stats.get("bytes_limit")
         return None if limit is None else limit - stats.get("bytes_in_use", 0)
-    free = [x for x in (_available(), _container_limit()) if x is not None]
-    return min(free, default=None)
-
-
-def _available() -> float | None:
-    try:
+    free: list[float] = []
+    with contextlib.suppress(OSError, StopIteration, ValueError):
         lines = Path("/proc/meminfo").read_text().splitlines()
-        return next(1024.0 * int(x.split()[1]) for x in lines if x.startswith("MemAvailable"))
-    except (OSError, StopIteration, ValueError):
-        return None
-
-
-def _container_limit() -> float | None:
-    """All that the container may use, of which the page cache is a part that can be freed."""
-    try:
-        return float(Path("/sys/fs/cgroup/memory.max").read_text())
-    except (OSError, ValueError):  # "max" where there is no limit
-        return None
+        free.append(next(1024.0 * int(x.split()[1]) for x in lines if x.startswith("MemAvailable")))
+    # Of all that the container may use ("max" without a limit) the page cache can be freed.
+    with contextlib.suppress(OSError, ValueError):
+        free.append(float(Path("/sys/fs/cgroup/memory.max").read_text()))
+    return min(free, default=None)
 
 
 def in_slices(

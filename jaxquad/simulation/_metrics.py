@@ -1,14 +1,32 @@
 """The numbers of a flight or an ensemble of flights, and their table."""
 
 import dataclasses
+from collections.abc import Sequence
 from typing import NamedTuple, TYPE_CHECKING
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Bool, Float
+from jaxtyping import Array, ArrayLike, Bool, Float, PyTree
 
-from jaxquad.records import AXES
+from jaxquad._compile import Jit, scan_members
+from jaxquad._core import as_float
+from jaxquad.loops import Loop
+
+from ._flight_metrics import (
+    find_steps,
+    FlightMetrics,
+    Sample,
+    share_beyond,
+    Sums,
+    widened,
+    Window,
+    window,
+)
+from ._hardware import Authority, find_authority, warn_beyond_authority
+from ._parallel import DeviceChoice, Devices, loop_over_devices, over_cores, placed, Run
+from ._scenario import axis_names, Scenario
+from ._simulate import check_run, scan_loop, Simulation
 
 
 if TYPE_CHECKING:
@@ -19,7 +37,6 @@ NUMBERS = (
     "itae", "iae", "ise", "overshoot", "rise_time", "settling_time", "settling_time_5", "peak",
     "rms", "disturbance_rmse", "activity", "energy", "saturation_share",
 )  # fmt: skip
-_TIMES = ("rise_time", "settling_time", "settling_time_5")
 
 
 class Spread(NamedTuple):
@@ -62,45 +79,25 @@ class Summary(eqx.Module):
     members: int = eqx.field(static=True)
 
 
-def summarise(metrics: "Metrics") -> Summary:
-    """`Metrics.summary`. A time that a member never reaches counts as infinite."""
-    spreads = {}
-    for name in NUMBERS:
-        values = vars(metrics)[name]
-        if name in _TIMES:
-            never = metrics.stepped & jnp.isnan(values)
-            values = jnp.where(never, jnp.inf, values)
-        spreads[name] = spread_of(values)
-    share = jnp.mean(metrics.diverged.astype(metrics.itae.dtype))
-    return Summary(**spreads, diverged_share=share, members=metrics.diverged.size)
-
-
 def spread_of(values: Float[Array, " axes *ensemble"]) -> Spread:
     """Mean, 95 % quantile, maximum and CVaR20 of each axis. nan members make the result nan."""
-    members = jnp.sort(values.reshape(values.shape[0], -1), axis=1)
-    spread = (quantile(members, 0.95), members[:, -1], cvar(members, 0.2))
-    unknown = jnp.isnan(members[:, -1])  # sorted to the end
-    return Spread(jnp.mean(members, axis=1), *(jnp.where(unknown, jnp.nan, x) for x in spread))
-
-
-def quantile(ordered: Float[Array, " axes members"], share: float) -> Float[Array, " axes"]:
-    """Of rising values, interpolated as numpy does; inf as soon as it rests on one."""
-    place = share * (ordered.shape[1] - 1)
+    rising = jnp.sort(values.reshape(values.shape[0], -1), axis=1)
+    members = rising.shape[1]
+    # The quantile is interpolated as numpy does, and inf as soon as it rests on one.
+    place = 0.95 * (members - 1)
     below, part = int(place), place - int(place)
-    low, high = ordered[:, below], ordered[:, min(below + 1, ordered.shape[1] - 1)]
+    low, high = rising[:, below], rising[:, min(below + 1, members - 1)]
     finite = jnp.isfinite(high) | (part == 0)
     step = jnp.where(finite, high, 0) - jnp.where(finite, low, 0)
-    return jnp.where(finite, low + part * step, high)
-
-
-def cvar(ordered: Float[Array, " axes members"], share: float) -> Float[Array, " axes"]:
-    """Mean of the worst `share` of rising values: the next one counts in part, so none is lost."""
-    members = ordered.shape[1]
-    count = share * members
-    parts = jnp.clip(count - jnp.arange(members, dtype=ordered.dtype), 0, 1)[::-1] / count
+    p95 = jnp.where(finite, low + part * step, high)
+    # The mean of the worst fifth: the next one counts in part, so none is lost.
+    count = 0.2 * members
+    parts = jnp.clip(count - jnp.arange(members, dtype=rising.dtype), 0, 1)[::-1] / count
     counted: Bool[Array, " members"] = parts > 0
-    weighed = jnp.where(counted[None], parts[None] * jnp.where(counted[None], ordered, 0), 0)
-    return jnp.sum(weighed, axis=1)
+    weighed = jnp.where(counted[None], parts[None] * jnp.where(counted[None], rising, 0), 0)
+    spread = (p95, rising[:, -1], jnp.sum(weighed, axis=1))
+    unknown = jnp.isnan(rising[:, -1])  # sorted to the end
+    return Spread(jnp.mean(rising, axis=1), *(jnp.where(unknown, jnp.nan, x) for x in spread))
 
 
 class Metrics(eqx.Module):
@@ -167,30 +164,110 @@ class Metrics(eqx.Module):
         return dataclasses.replace(self, **integrals, per_step=True)
 
     def summary(self) -> Summary:
-        """Mean, 95 % quantile, worst and CVaR20 of every number over the ensemble."""
-        return summarise(self)
+        """Mean, 95 % quantile, worst and CVaR20 of every number over the ensemble.
+
+        A time that a member never reaches counts as infinite.
+        """
+        spreads = {}
+        for name in NUMBERS:
+            values = vars(self)[name]
+            if name in ("rise_time", "settling_time", "settling_time_5"):
+                values = jnp.where(self.stepped & jnp.isnan(values), jnp.inf, values)
+            spreads[name] = spread_of(values)
+        share = jnp.mean(self.diverged.astype(self.itae.dtype))
+        return Summary(**spreads, diverged_share=share, members=self.diverged.size)
 
     def to_xarray(self) -> "xarray.Dataset":
         """Every number with its dimensions `axis` and `member`, for xarray (extra `interop`).
 
         Each variable has its unit in `attrs`, the dataset the window in s.
         """
-        return _labelled(self, axis_names(self.itae.shape[0]))
+        import xarray
+
+        depth = self.diverged.ndim
+        members = ("member",) if depth == 1 else tuple(f"member_{k}" for k in range(depth))
+        units = _UNITS | (_OF_A_UNIT_STEP if self.per_step else {})
+        variables = {}
+        for name, unit in units.items():
+            values = np.asarray(vars(self)[name])
+            dims = members if name == "diverged" else ("axis", *members)
+            variables[name] = (dims, values, {"units": unit} if unit else {})
+        counts = {n: np.arange(k) for n, k in zip(members, self.diverged.shape, strict=True)}
+        window = {name: vars(self)[name] for name in ("start", "stop", "load_start")}  # s
+        axes = list(axis_names(self.itae.shape[0]))
+        return xarray.Dataset(variables, coords={"axis": axes, **counts}, attrs=window)
 
     @property
     def remarks(self) -> tuple[str, ...]:
-        """What a reader has to know before using the numbers."""
-        return tuple(remarks(self))
+        """What a reader has to know: a number is missing, who diverged, what a drive cannot do."""
+        names, texts = axis_names(self.itae.shape[0]), []
+        count, members = int(np.sum(self.diverged)), self.diverged.size
+        if count:
+            who = (
+                f"{count} of {members} members ({count / members:.1%})"
+                if members > 1
+                else "the loop"
+            )
+            texts.append(
+                f"{who} diverged: the numbers count its angle as held where it left the bound"
+            )
+        stepped = _flat(self.stepped)
+        missing = ~stepped.any(axis=1) & ~at_rest(self)
+        without = [name for name, there in zip(names, missing, strict=True) if there]
+        if without:
+            texts.append(
+                f"{', '.join(without)}: the reference makes no step that it holds, hence no "
+                "overshoot, rise or settling"
+            )
+        for field, what in (
+            ("rise_time", "does not reach 90 % of the step"),
+            ("settling_time", "is outside 2 % of the step at the end"),
+        ):
+            never = np.isnan(_flat(vars(self)[field])) & stepped
+            of_many = never.shape[1] > 1
+            for name, share in zip(names, never.mean(axis=1), strict=True):
+                if share:
+                    who = f"{name}: {share:.1%} of the members: the angle" if of_many else name
+                    texts.append(f"{who} {what}")
+        if np.isnan(np.asarray(self.disturbance_rmse)).all():
+            texts.append(
+                "no error of the disturbance estimate: the controller makes none, or the plant's "
+                "torque per unit of command is not known (give torque_gain)"
+            )
+        for field, what in (
+            ("beyond_authority", "exceed the torque of the drive"),
+            ("reversing", "need motors that turn backwards"),
+        ):
+            shares = np.nan_to_num(_flat(vars(self)[field])).mean(axis=1)
+            where = [f"{x:.1%} on {name}" for name, x in zip(names, shares, strict=True) if x]
+            if where:
+                texts.append(f"disturbances {what}: samples {', '.join(where)}")
+        return tuple(texts)
 
     def __str__(self) -> str:
-        return described(self)
-
-
-if TYPE_CHECKING:
-    from ._metrics import Metrics
+        names, members, still = axis_names(self.itae.shape[0]), self.diverged.size, at_rest(self)
+        head = f"metrics, {self.start:.6g} .. {self.stop:.6g} s"
+        if self.load_start != self.start:
+            head += f", under load from {self.load_start:.6g} s"
+        if self.per_step:
+            head += ", integrals of a unit step"
+        if not self.diverged.ndim:
+            values = [np.asarray(vars(self)[row[0]]) for row in _ROWS]
+            table = _table("", list(names), values, self.per_step)
+        else:
+            head += f", {members} member{'s' * (members > 1)}"
+            spreads, table = vars(self.summary()), []
+            for k, name in enumerate(names):
+                if still[k]:
+                    table.append(f"  {name}: at rest")
+                    continue
+                values = [np.array([x[k] for x in spreads[row[0]]]) for row in _ROWS]
+                table += _table(name, ["mean", "p95", "worst", "CVaR20"], values, self.per_step)
+        return "\n".join([head, *table, *(f"  ! {remark}" for remark in self.remarks)])
 
 
 _NOTHING = 1e-9  # in every unit of the table
+_MISSING = {"nan": "-", "inf": "never", "-inf": "never"}
 _DEGREE = float(np.degrees(1.0))
 # Field, title, unit and factor of the absolute number, unit and factor of that of a unit step.
 _ROWS = (
@@ -208,43 +285,6 @@ _ROWS = (
     ("energy", "energy", ("", 1.0), None),
     ("saturation_share", "saturated", ("%", 100.0), None),
 )
-_STATISTICS = (("mean", "mean"), ("p95", "p95"), ("worst", "worst"), ("cvar20", "CVaR20"))
-
-
-def described(metrics: "Metrics") -> str:
-    """A table of one loop, or one for each axis of an ensemble, and the remarks."""
-    names = axis_names(metrics.itae.shape[0])
-    members = metrics.diverged.size
-    head = f"metrics, {metrics.start:.6g} .. {metrics.stop:.6g} s"
-    if metrics.load_start != metrics.start:
-        head += f", under load from {metrics.load_start:.6g} s"
-    if metrics.per_step:
-        head += ", integrals of a unit step"
-    if metrics.diverged.ndim:
-        head += f", {members} member{'s' * (members > 1)}"
-        table = _ensemble_tables(metrics, names)
-    else:
-        values = [np.asarray(vars(metrics)[row[0]]) for row in _ROWS]
-        table = _table("", list(names), values, metrics.per_step)
-    return "\n".join([head, *table, *(f"  ! {remark}" for remark in remarks(metrics))])
-
-
-def axis_names(count: int) -> tuple[str, ...]:
-    return AXES[:count] if count <= len(AXES) else tuple(f"axis {k}" for k in range(count))
-
-
-def _ensemble_tables(metrics: "Metrics", names: tuple[str, ...]) -> list[str]:
-    summary, lines, still = metrics.summary(), [], at_rest(metrics)
-    for k, name in enumerate(names):
-        if still[k]:
-            lines.append(f"  {name}: at rest")
-            continue
-        values = []
-        for row in _ROWS:
-            spread = vars(summary)[row[0]]._asdict()
-            values.append(np.array([spread[field][k] for field, _ in _STATISTICS]))
-        lines += _table(name, [title for _, title in _STATISTICS], values, metrics.per_step)
-    return lines
 
 
 def at_rest(metrics: "Metrics") -> np.ndarray:
@@ -258,56 +298,10 @@ def _table(name: str, columns: list[str], values: list[np.ndarray], per_step: bo
     lines = [f"  {name:<28}" + "".join(f"{column:>11}" for column in columns)]
     for (_, title, absolute, relative), numbers in zip(_ROWS, values, strict=True):
         unit, scale = relative if per_step and relative is not None else absolute
-        texts = "".join(f"{_text(x * scale):>11}" for x in numbers)
+        shown = (f"{0 if abs(x) <= _NOTHING else x:.4g}" for x in scale * np.asarray(numbers))
+        texts = "".join(f"{_MISSING.get(x, x):>11}" for x in shown)
         lines.append(f"  {title:<19}{unit:<9}{texts}")
     return lines
-
-
-def _text(x: float) -> str:
-    if np.isnan(x):
-        return "-"
-    return "never" if np.isinf(x) else f"{x if abs(x) > _NOTHING else 0:.4g}"
-
-
-def remarks(metrics: "Metrics") -> list[str]:
-    """Why a number is missing, who diverged, and what the drive cannot do."""
-    names, texts = axis_names(metrics.itae.shape[0]), []
-    count, members = int(np.sum(metrics.diverged)), metrics.diverged.size
-    if count:
-        who = f"{count} of {members} members ({count / members:.1%})" if members > 1 else "the loop"
-        texts.append(f"{who} diverged: the numbers count its angle as held where it left the bound")
-    stepped = _flat(metrics.stepped)
-    missing = ~stepped.any(axis=1) & ~at_rest(metrics)
-    without = [name for name, there in zip(names, missing, strict=True) if there]
-    if without:
-        texts.append(
-            f"{', '.join(without)}: the reference makes no step that it holds, hence no "
-            "overshoot, rise or settling"
-        )
-    for field, what in (
-        ("rise_time", "does not reach 90 % of the step"),
-        ("settling_time", "is outside 2 % of the step at the end"),
-    ):
-        never = np.isnan(_flat(vars(metrics)[field])) & stepped
-        of_many = never.shape[1] > 1
-        for name, share in zip(names, never.mean(axis=1), strict=True):
-            if share:
-                who = f"{name}: {share:.1%} of the members: the angle" if of_many else name
-                texts.append(f"{who} {what}")
-    if np.isnan(np.asarray(metrics.disturbance_rmse)).all():
-        texts.append(
-            "no error of the disturbance estimate: the controller makes none, or the plant's "
-            "torque per unit of command is not known (give torque_gain)"
-        )
-    for field, what in (
-        ("beyond_authority", "exceed the torque of the drive"),
-        ("reversing", "need motors that turn backwards"),
-    ):
-        shares = np.nan_to_num(_flat(vars(metrics)[field])).mean(axis=1)
-        where = [f"{x:.1%} on {name}" for name, x in zip(names, shares, strict=True) if x]
-        if where:
-            texts.append(f"disturbances {what}: samples {', '.join(where)}")
-    return texts
 
 
 def _flat(values: ArrayLike) -> np.ndarray:
@@ -324,18 +318,145 @@ _UNITS = {
 _OF_A_UNIT_STEP = {"itae": "s^2", "iae": "s", "ise": "s"}
 
 
-def _labelled(metrics: "Metrics", axes: tuple[str, ...]) -> "xarray.Dataset":
-    """`Metrics.to_xarray`, with names for the axes."""
-    import xarray
+def metrics(
+    simulation: Simulation,
+    *,
+    start: float = 0.0,
+    stop: float | None = None,
+    load_start: float | None = None,
+    torque_gain: ArrayLike | Sequence[float] | None = None,
+) -> Metrics:
+    """The `Metrics` of a stored `jq.simulation.Simulation`, for start <= t < stop.
 
-    depth = metrics.diverged.ndim
-    members = ("member",) if depth == 1 else tuple(f"member_{k}" for k in range(depth))
-    units = _UNITS | (_OF_A_UNIT_STEP if metrics.per_step else {})
-    variables = {}
-    for name, unit in units.items():
-        values = np.asarray(vars(metrics)[name])
-        dims = members if name == "diverged" else ("axis", *members)
-        variables[name] = (dims, values, {"units": unit} if unit else {})
-    counts = {name: np.arange(n) for name, n in zip(members, metrics.diverged.shape, strict=True)}
-    window = {name: vars(metrics)[name] for name in ("start", "stop", "load_start")}  # s
-    return xarray.Dataset(variables, coords={"axis": list(axes), **counts}, attrs=window)
+    Differentiable with respect to the simulation.
+
+    **Arguments:**
+
+    - `simulation`: from `jq.simulate`.
+    - `start`, `stop`: s; None is the end. ITAE counts time from `start`, which is best the instant
+        of a step.
+    - `load_start`: s. Peak, rms and the error of the disturbance's estimate count from here on
+        (None: from `start`); the step's overshoot, rise and settling end here, if that is later
+        than `start`.
+    - `torque_gain`: N m per unit of command [axes], to make a torque of the estimate where the
+        simulation does not know it from its plant.
+
+    **Returns:** `jq.simulation.Metrics` of each axis and member.
+
+    **Raises:** ValueError for a window that does not lie in the simulation.
+    """
+    gain = None if torque_gain is None else jnp.atleast_1d(as_float(torque_gain))
+    dt, samples = simulation.dt, len(simulation.angle)
+    place = window(samples, dt, start=start, stop=stop, load_start=load_start)
+    numbers = _replay(simulation, Window(*map(jnp.asarray, place)), gain)
+    return _metrics(numbers, place, dt)
+
+
+def evaluate(
+    loop: Loop,
+    scenario: Scenario,
+    *,
+    start: float = 0.0,
+    stop: float | None = None,
+    load_start: float | None = None,
+    devices: DeviceChoice = None,
+) -> Metrics:
+    """The `Metrics` of a loop without its trajectories: what is kept does not grow with time.
+
+    The same numbers as `jq.simulation.metrics(jq.simulate(loop, scenario), ...)` in the memory of
+    one sample: about 0.5 kB per axis and member, and what the scenario holds for each member. Where
+    that is too much, `jq.simulation.in_slices`. Differentiable with respect to plant, controller,
+    scenario and delay; a gradient needs memory as the square root of the number of samples, and
+    `jq.simulation.over_devices` splits a cost of your own as `devices` splits this.
+
+        loop = jq.Loop(plant, jq.LADRC(10.0, 30.0, 0.85), delay=0.004)
+        print(jq.evaluate(loop, scenario, start=1.0, load_start=5.0))
+
+    **Arguments:**
+
+    - `loop`, `scenario`, `devices`: as in `jq.simulate`.
+    - `start`, `stop`, `load_start`: s, as in `jq.simulation.metrics`.
+
+    **Returns:** `jq.simulation.Metrics` of each axis and member.
+
+    **Raises:** ValueError as `jq.simulate` and `jq.simulation.metrics` do. Warns of disturbances
+    beyond the torque of the drive.
+    """
+    check_run(loop, scenario)
+    place = window(len(scenario.reference), loop.dt, start=start, stop=stop, load_start=load_start)
+    span = Window(*map(jnp.asarray, place))
+    run, places = placed(loop, scenario, devices)
+    drive_authority, numbers = over_cores(_run, run, (span,), places)
+    warn_beyond_authority(drive_authority, scenario)
+    return _metrics(numbers, place, loop.dt)
+
+
+def _metrics(numbers: dict[str, PyTree], place: tuple[int, int, int, int], dt: float) -> Metrics:
+    first, last, loaded, _ = place
+    return Metrics(**numbers, start=first * dt, stop=(last + 1) * dt, load_start=loaded * dt)
+
+
+@Jit
+def _run(
+    loop: Loop, scenario: Scenario, span: Window, devices: Devices | None = None
+) -> tuple[Authority | None, dict[str, Array]]:
+    drive_authority = find_authority(loop.plant, loop.drive, loop.controller)
+    return drive_authority, loop_over_devices(_measure, (loop, scenario), span, devices)
+
+
+def _measure(run: Run, span: Window) -> dict[str, Array]:
+    loop, scenario = run
+    drive_authority = find_authority(loop.plant, loop.drive, loop.controller)
+    gain = None if drive_authority is None else drive_authority.torque_gain
+    sums = _accumulator(scenario, span, loop.dt, drive_authority, gain)
+    total, _, running = scan_loop(loop, scenario, sums)
+    return _numbers(sums, total, ~running, scenario, drive_authority)
+
+
+@eqx.filter_jit
+def _replay(simulation: Simulation, span: Window, gain: Array | None) -> dict[str, Array]:
+    scenario, drive_authority = simulation.scenario, simulation.authority
+    if gain is None and drive_authority is not None:
+        gain = drive_authority.torque_gain
+    sums = _accumulator(scenario, span, simulation.dt, drive_authority, gain)
+    index = jnp.arange(simulation.angle.shape[0])
+    stored = (simulation.angle, simulation.command, simulation.saturated, simulation.signals)
+    signals = (index, scenario.reference, scenario.disturbance, *stored)
+    arrays, static = eqx.partition(sums, eqx.is_array)
+
+    def sample(total: Sums, arrays: PyTree, now: tuple) -> tuple[Sums, None]:
+        index, reference, disturbance, angle, *others = now
+        wide = widened(reference, angle), widened(disturbance, angle)
+        return eqx.combine(arrays, static).update(total, Sample(index, angle, *wide, *others))
+
+    start = sums.begin(jnp.zeros_like(simulation.angle[0]))
+    total, _ = scan_members(sample, start, arrays, signals)
+    return _numbers(sums, total, simulation.diverged, scenario, drive_authority)
+
+
+def _accumulator(
+    scenario: Scenario, span: Window, dt: float, authority: Authority | None, gain: Array | None
+) -> FlightMetrics:
+    return FlightMetrics(
+        wanted=(*NUMBERS, "step", "stepped"), window=span, dt=dt,
+        steps=find_steps(scenario.reference, [(span.first, span.until)]),
+        from_first=jnp.asarray(span.first == 0), torque_gain=gain,
+        limit=None if authority is None else authority.command,
+    )  # fmt: skip
+
+
+def _numbers(
+    sums: FlightMetrics, total: Sums, diverged: Bool[Array, "*ensemble"], scenario: Scenario,
+    authority: Authority | None,
+) -> dict[str, Array]:  # fmt: skip
+    """What `Metrics` hold, of finished sums and of what the scenario asks of the drive."""
+    values = sums.finish(total)
+    for name in ("settling_time", "settling_time_5"):
+        values[name] = jnp.where(diverged[None], jnp.nan, values[name])
+    like, torque = values["itae"], scenario.disturbance
+    shares = [jnp.full_like(like, jnp.nan)] * 2
+    if authority is not None:
+        limits = (authority.torque, authority.forward)
+        shares = [widened(share_beyond(x, torque, sums.window), like) for x in limits]
+    named = {"beyond_authority": shares[0], "reversing": shares[1], "diverged": diverged}
+    return values | named

@@ -1,3 +1,5 @@
+"""What happens to a loop: scenarios from signals of single axes, and experiments."""
+
 import functools as ft
 import math
 from collections.abc import Mapping, Sequence
@@ -13,9 +15,8 @@ from jaxquad._core import as_float, ensemble_shape, per_member, require_all_posi
 from jaxquad.excitation import Excitation
 from jaxquad.records import AXES
 
-from ._disturbances import gauss_markov_of
 from ._memory import require_memory
-from ._signal import as_signal, Clock, fit, Motion, Signal
+from ._signal import as_signal, Clock, fit, gauss_markov_of, Motion, Signal
 
 
 class Scenario(eqx.Module):
@@ -39,21 +40,13 @@ class Scenario(eqx.Module):
     **Raises:** ValueError for arrays of different numbers of samples, axes or members.
     """
 
-    reference: Float[Array, "samples axes ..."] = per_member(rank=2)  # attitude set-point, rad
-    injection: Float[Array, "samples axes ..."] = per_member(
-        rank=2
-    )  # added to the command, in its unit
-    disturbance: Float[Array, "samples axes ..."] = per_member(rank=2)  # torque, N m
-    noise: Float[Array, "samples axes ..."] = per_member(rank=2)  # on the measured angle, rad
-    rate: Float[Array, "samples axes ..."] | None = per_member(
-        rank=2, default=None
-    )  # of the reference, rad/s
-    acceleration: Float[Array, "samples axes ..."] | None = per_member(
-        rank=2, default=None
-    )  # of the reference, rad/s^2
-    payload: Float[Array, "samples axes ..."] | None = per_member(
-        rank=2, default=None
-    )  # added inertia, kg m^2
+    reference: Float[Array, "samples axes ..."] = per_member(rank=2)
+    injection: Float[Array, "samples axes ..."] = per_member(rank=2)
+    disturbance: Float[Array, "samples axes ..."] = per_member(rank=2)
+    noise: Float[Array, "samples axes ..."] = per_member(rank=2)
+    rate: Float[Array, "samples axes ..."] | None = per_member(rank=2, default=None)
+    acceleration: Float[Array, "samples axes ..."] | None = per_member(rank=2, default=None)
+    payload: Float[Array, "samples axes ..."] | None = per_member(rank=2, default=None)
     dt: float | None = eqx.field(static=True, default=None, kw_only=True)  # s
 
     def __check_init__(self):
@@ -133,11 +126,21 @@ def scenario(
     **Raises:** ValueError for unknown axes, for times outside, and for arrays that do not fit.
     """
     require_all_positive(duration=duration, dt=dt)
-    names = _names(axes)
+    if isinstance(axes, int) and axes < 1:
+        raise ValueError(f"axes is {axes}: give 1 or more")
+    if isinstance(axes, str) or not axes or isinstance(axes, Sequence) and len({*axes}) < len(axes):
+        raise ValueError(f"axes is {axes!r}: give their number, or their names, each once")
+    names = axis_names(axes, "") if isinstance(axes, int) else tuple(axes)
     members = (ensemble,) if isinstance(ensemble, int) else tuple(ensemble)
     clock = Clock(whole_samples("duration", duration, 1 / dt, fewest=2), dt, members)
     signals = (reference, injection, disturbance, noise, payload)
-    _require_room(signals, clock, len(names))
+    # Room for what each member draws for itself: as columns, and then side by side.
+    some = [list(x.values()) if isinstance(x, Mapping) else [x] for x in signals]
+    drawn = sum(any(isinstance(x, Signal) and x.random for x in part) for part in some)
+    count = math.prod(members)
+    needed = 2 * drawn * clock.samples * len(names) * count * as_float(0.0).dtype.itemsize
+    remedy = "draw the noise of fewer members at a time, in jq.simulation.in_slices"
+    require_memory(f"a scenario of {clock.samples} samples for {count} members", needed, remedy)
     parts = {
         name: _sampled(name, part, names, clock, _fold(key, k))
         for k, (name, part) in enumerate(zip(_PARTS, signals, strict=True))
@@ -151,54 +154,33 @@ def scenario(
     return Scenario(**arrays, dt=float(dt))
 
 
-def _require_room(parts: tuple[Given, ...], clock: Clock, axes: int) -> None:
-    """For what each member draws for itself: as columns, and then side by side."""
-    signals = [list(x.values()) if isinstance(x, Mapping) else [x] for x in parts]
-    drawn = sum(any(isinstance(x, Signal) and x.random for x in part) for part in signals)
-    numbers = drawn * clock.samples * axes * math.prod(clock.ensemble)
-    what = f"a scenario of {clock.samples} samples for {math.prod(clock.ensemble)} members"
-    remedy = "draw the noise of fewer members at a time, in jq.simulation.in_slices"
-    require_memory(what, 2 * numbers * as_float(0.0).dtype.itemsize, remedy)
-
-
-def _names(axes: int | Sequence[str]) -> tuple[str, ...]:
-    if isinstance(axes, int):
-        if axes < 1:
-            raise ValueError(f"axes is {axes}: give 1 or more")
-        return AXES[:axes] if axes <= len(AXES) else tuple(str(k) for k in range(axes))
-    if isinstance(axes, str) or not axes or len(set(axes)) != len(axes):
-        raise ValueError(f"axes is {axes!r}: give their number, or their names, each once")
-    return tuple(axes)
+def axis_names(count: int, prefix: str = "axis ") -> tuple[str, ...]:
+    """Roll, pitch and yaw, or a number for each of more axes."""
+    return AXES[:count] if count <= len(AXES) else tuple(f"{prefix}{k}" for k in range(count))
 
 
 def _sampled(
     name: str, part: Given, names: tuple[str, ...], clock: Clock, key: Key[Array, ""] | None
 ) -> list[Motion | None]:
-    def motion(axis: str, one: One, key: Key[Array, ""] | None) -> Motion:
-        try:
-            return as_signal(one).sample(clock, key)
-        except ValueError as error:
-            raise ValueError(f"{name} of {axis}: {error}") from error
-
     if part is not None and not isinstance(part, Mapping):
         part = dict.fromkeys(names, part)
-    signals = {_place(name, axis, names): x for axis, x in (part or {}).items()}
+    signals: dict[int, One] = {}
+    for axis, one in (part or {}).items():
+        if axis not in names and not (isinstance(axis, int) and 0 <= axis < len(names)):
+            raise ValueError(
+                f"{name} of the axis {axis!r}: choose one of {', '.join(names)}, or give other "
+                "axes="
+            )
+        signals[names.index(axis) if axis in names else int(axis)] = one
     if len(signals) < len(part or {}):
         raise ValueError(f"{name}: an axis is given twice, by name and by number")
-    return [
-        motion(axis, signals[k], _fold(key, k)) if k in signals else None
-        for k, axis in enumerate(names)
-    ]
-
-
-def _place(name: str, axis: str | int, names: tuple[str, ...]) -> int:
-    if axis in names:
-        return names.index(axis)
-    if isinstance(axis, int) and 0 <= axis < len(names):
-        return axis
-    raise ValueError(
-        f"{name} of the axis {axis!r}: choose one of {', '.join(names)}, or give other axes="
-    )
+    motions: list[Motion | None] = [None] * len(names)
+    for k, one in sorted(signals.items(), key=lambda item: item[0]):
+        try:
+            motions[k] = as_signal(one).sample(clock, _fold(key, k))
+        except ValueError as error:
+            raise ValueError(f"{name} of {names[k]}: {error}") from error
+    return motions
 
 
 def _fold(key: Key[Array, ""] | None, k: int) -> Key[Array, ""] | None:

@@ -1,15 +1,23 @@
-"""Signals of one axis on a clock: arrays, excitations, sums, and set-points of references."""
+"""Signals of one axis on a clock: arrays, excitations, sums, set-points, and disturbances."""
 
 import abc
+import functools as ft
 from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float, Int, Key
+from jaxtyping import Array, ArrayLike, Float, Int, Key, PyTree
 
-from jaxquad._core import as_float, on_host, require_all_positive, require_finite, whole_samples
+from jaxquad._core import (
+    as_float,
+    on_host,
+    require_all_positive,
+    require_finite,
+    require_nonnegative,
+    whole_samples,
+)
 from jaxquad.excitation import Excitation
 
 
@@ -82,7 +90,8 @@ class Sum(Signal):
         second = self.second.sample(clock, keys[1])
         value = _total(first.value, second.value)
         rates = (first.rate, second.rate), (first.acceleration, second.acceleration)
-        return Motion(value, *(_total_or_none(*both) for both in rates))
+        some = ([x for x in both if x is not None] for both in rates)
+        return Motion(value, *(ft.reduce(_total, x) if x else None for x in some))
 
 
 class Samples(Signal):
@@ -159,12 +168,6 @@ def widened(x: Float[Known, "..."], shape: tuple[int, ...]) -> Float[Known, "...
     return (jnp if isinstance(x, jax.Array) else np).broadcast_to(x, shape)
 
 
-def _total_or_none(a: Known | None, b: Known | None) -> Known | None:
-    if a is None or b is None:
-        return b if a is None else a
-    return _total(a, b)
-
-
 def _total(a: Known, b: Known) -> Known:
     members = np.broadcast_shapes(a.shape[1:], b.shape[1:])
     return fit(a, members) + fit(b, members)
@@ -221,51 +224,30 @@ class Ramp(Signal):
         require_finite("before", self.before)
 
     def sample(self, clock: Clock, key: Key[Array, ""] | None) -> Motion:
-        share = _progress(clock, self.at, self.within)
+        share = self._progress(clock)
         change = on_host(self.after) - on_host(self.before)
         moving = (share >= 0) & (share < 1)
         value = _between(np.clip(share, 0, 1), self.before, self.after)
         return Motion(value, spread(moving / self.within, change))
 
+    def _progress(self, clock: Clock) -> Float[np.ndarray, " samples"]:
+        return clock.since(self.at) / clock.count("within", self.within, fewest=1)
 
-class SmoothStep(Signal):
-    """From `before` to `after` with the least jerk.
+
+class SmoothStep(Ramp):
+    """As `Ramp`, with the least jerk.
 
     The polynomial s^3 (10 - 15 s + 6 s^2) starts and ends at rest, with no acceleration (Flash and
     Hogan, 1985). Its rate and acceleration are exact, for feed-forward.
-
-    **Arguments:**
-
-    - `after`, `before`: in the unit of what it is given for (a reference: rad); one value, or one
-        per member.
-    - `within`: s that the change lasts.
-    - `at`: s from the start.
-
-    **Raises:**
-
-    - `ValueError`: a value is not finite, or `within` is not above 0.
     """
 
-    after: Float[Array, "..."] = eqx.field(converter=as_float)
-    within: float = eqx.field(static=True, kw_only=True)  # s
-    before: Float[Array, "..."] = eqx.field(converter=as_float, default=0.0, kw_only=True)
-    at: float = eqx.field(static=True, default=0.0, kw_only=True)  # s
-
-    def __check_init__(self):
-        require_all_positive(within=self.within)
-        require_finite("after", self.after)
-        require_finite("before", self.before)
-
     def sample(self, clock: Clock, key: Key[Array, ""] | None) -> Motion:
-        s = np.clip(_progress(clock, self.at, self.within), 0, 1)
+        s = np.clip(self._progress(clock), 0, 1)
         change = on_host(self.after) - on_host(self.before)
         rate = 30 * s**2 * (1 - s) ** 2 / self.within
         acceleration = 60 * s * (1 - s) * (1 - 2 * s) / self.within**2
-        return Motion(
-            _between(s**3 * (10 - 15 * s + 6 * s**2), self.before, self.after),
-            spread(rate, change),
-            spread(acceleration, change),
-        )
+        value = _between(s**3 * (10 - 15 * s + 6 * s**2), self.before, self.after)
+        return Motion(value, spread(rate, change), spread(acceleration, change))
 
 
 class Sine(Signal):
@@ -340,19 +322,13 @@ class ReferenceModel(Signal):
 
 
 @jax.jit
-def _follow(
-    advance: Float[Array, "2 3"], command: Float[Array, " samples *ensemble"]
-) -> tuple[Float[Array, " samples *ensemble"], Float[Array, " samples *ensemble"]]:
+def _follow(advance: Float[Array, "2 3"], command: Float[Array, " samples *ensemble"]) -> PyTree:
     def sample(state, now):
         joined = jnp.concatenate([state, now[None]])
         return jnp.tensordot(advance, joined, 1, precision="highest"), (state[0], state[1])
 
     start = jnp.zeros((2, *command.shape[1:]), command.dtype)
     return jax.lax.scan(sample, start, command)[1]
-
-
-def _progress(clock: Clock, at: float, within: float) -> Float[np.ndarray, " samples"]:
-    return clock.since(at) / clock.count("within", within, fewest=1)
 
 
 def _between(
@@ -363,3 +339,160 @@ def _between(
     members = np.broadcast_shapes(before.shape, after.shape)
     start, end = (widened(on_host(x), members) for x in (before, after))
     return spread(1 - share, start) + spread(share, end)
+
+
+def gauss_markov(
+    key: Key[Array, ""],
+    shape: tuple[int, ...],
+    *,
+    deviation: float | Float[Array, ""],
+    corner: float | Float[Array, ""],
+    dt: float,
+) -> Float[Array, "samples ..."]:
+    """Stationary first-order Gauss-Markov noise along the first axis, such as gusts of torque.
+
+    `deviation` is its standard deviation, `corner` its bandwidth in rad/s.
+    """
+    white = jax.random.normal(key, shape, dtype=float)
+    return gauss_markov_of(white, deviation=deviation, corner=corner, dt=dt)
+
+
+def gauss_markov_of(
+    white: Float[Array, "samples ..."],
+    *,
+    deviation: float | Float[Array, ""],
+    corner: float | Float[Array, ""],
+    dt: float,
+) -> Float[Array, "samples ..."]:
+    """`gauss_markov` that white noise of unit variance drives."""
+    keep = jnp.exp(jnp.asarray(-corner * dt))
+    drive = deviation * jnp.sqrt(1 - keep**2)
+
+    def advance(level, kick):
+        return keep * level + drive * kick, level
+
+    return jax.lax.scan(advance, deviation * white[0], jnp.roll(white, -1, axis=0))[1]
+
+
+class Pulse(Signal):
+    """A pulse, or a train of pulses: `amplitude` for `width` s from the time `at` on.
+
+    As a payload it is picked up and set down.
+
+    **Arguments:**
+
+    - `amplitude`: in the unit of what it is given for (a disturbance: N m, a payload: kg m^2); one
+        value, or one per member.
+    - `width`: s.
+    - `period`: s; the pulse is repeated in every period, by default it is not.
+    - `share`: the part of the period that a pulse lasts, instead of `width`; rounded to samples.
+    - `at`: s from the start.
+
+    **Raises:** ValueError for a pulse longer than its period, and for both or none of `width` and
+    `share`.
+    """
+
+    amplitude: Float[Array, "..."] = eqx.field(converter=as_float)
+    width: float | None = eqx.field(static=True, default=None, kw_only=True)  # s
+    share: float | None = eqx.field(static=True, default=None, kw_only=True)
+    period: float | None = eqx.field(static=True, default=None, kw_only=True)  # s
+    at: float = eqx.field(static=True, default=0.0, kw_only=True)  # s
+
+    def __check_init__(self):
+        require_finite("amplitude", self.amplitude)
+        if (self.width is None) == (self.share is None):
+            raise ValueError("a pulse has either a width in s or a share of its period: give one")
+        if self.period is not None:
+            require_all_positive(period=self.period)
+        share, width, period = self.share, self.width, self.period
+        if share is not None and period is None:
+            raise ValueError(f"share is {share} of a period: give the period in s, or a width")
+        if share is not None and not 0 < share <= 1:
+            raise ValueError(f"share is {share}: a pulse lasts between 0 and 1 of its period")
+        if width is not None:
+            require_all_positive(width=width)
+            if period is not None and width > period:
+                raise ValueError(f"a pulse of {width} s is longer than its period of {period} s")
+
+    def sample(self, clock: Clock, key: Key[Array, ""] | None) -> Motion:
+        since = clock.since(self.at)
+        place, count = since, 0
+        if self.period is not None:
+            repeated = clock.count("period", self.period, fewest=1)
+            place, count = since % repeated, round((self.share or 0.0) * repeated)
+        if self.width is not None:
+            count = clock.count("width", self.width, fewest=1)
+        return Motion(spread(((since >= 0) & (place < count)).astype(np.float64), self.amplitude))
+
+
+class WhiteNoise(Signal):
+    """Independent normal values, each axis and member with its own.
+
+    **Arguments:**
+
+    - `deviation`: standard deviation in the unit of the signal, rad for a measurement.
+
+    **Raises:**
+
+    - `ValueError`: the deviation is below 0.
+    """
+
+    deviation: Float[Array, "..."] = eqx.field(converter=as_float)
+
+    def __check_init__(self):
+        require_nonnegative("deviation", self.deviation, "it is a standard deviation")
+
+    @property
+    def random(self) -> bool:
+        return True
+
+    def sample(self, clock: Clock, key: Key[Array, ""] | None) -> Motion:
+        if key is None:
+            raise ValueError("a gust or noise is drawn at random: give a key=jax.random.key(0)")
+        members = jnp.broadcast_shapes(self.deviation.shape, clock.ensemble)
+        unit = self._draw_unit(key, (clock.samples, *members), clock.dt)
+        return Motion(unit * jnp.broadcast_to(self.deviation, members)[None])
+
+    def _draw_unit(self, key: Key[Array, ""], shape: tuple[int, ...], dt: float) -> Array:
+        return jax.random.normal(key, shape, self.deviation.dtype)
+
+
+class Gust(WhiteNoise):
+    """First-order Gauss-Markov noise: stationary from the first sample, exact at the samples.
+
+    The spectrum is that of white noise through K / (s + corner), with K = deviation sqrt(2 corner).
+    Each axis and member draws its own.
+
+    **Arguments:**
+
+    - `deviation`: standard deviation in the unit of the signal, N m for a torque.
+    - `corner`: bandwidth in rad/s.
+
+    **Raises:**
+
+    - `ValueError`: the deviation is below 0, or the corner is not above 0.
+    """
+
+    corner: float = eqx.field(static=True, default=2.0, kw_only=True)  # rad/s
+
+    def __check_init__(self):
+        require_all_positive(corner=self.corner)
+
+    def _draw_unit(self, key: Key[Array, ""], shape: tuple[int, ...], dt: float) -> Array:
+        return _gauss_markov(key, shape, deviation=1.0, corner=self.corner, dt=dt)
+
+
+def ceti_gust(gain: ArrayLike, pole: float, *, torque_gain: ArrayLike = 1.0) -> Gust:
+    """Control-equivalent turbulence input: white noise through gain / (s + pole).
+
+    The white noise has unit intensity, E[w(t) w(s)] = delta(t - s), so the input has a standard
+    deviation of gain / sqrt(2 pole) and the two-sided spectrum gain^2 / (omega^2 + pole^2) per Hz.
+    `pole` is in rad/s. With the plant's `torque_gain` (N m per unit of command) `gain` is in units
+    of command per sqrt(s), without it in N m per sqrt(s).
+    Source: Lusardi et al., J. American Helicopter Society 49 (2004), for a helicopter in hover.
+    """
+    require_all_positive(pole=pole)
+    return Gust(as_float(gain) * as_float(torque_gain) / np.sqrt(2 * pole), corner=pole)
+
+
+_gauss_markov = eqx.filter_jit(gauss_markov)

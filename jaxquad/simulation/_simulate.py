@@ -15,9 +15,9 @@ from jaxquad._core import align, ensemble_shape, is_concrete, mark_members, pytr
 from jaxquad.loops import CarriesPayload, Loop, Plant
 from jaxquad.records import AXES, Record
 
-from ._authority import Authority, find_authority, warn_beyond_authority
+from ._hardware import Authority, find_authority, warn_beyond_authority
 from ._memory import require_memory, size_of
-from ._parallel import DeviceChoice, Devices, loop_over_devices, over_cores, placed, Run
+from ._parallel import DeviceChoice, Devices, loop_over_devices, over_cores, placed
 from ._scenario import Scenario
 from ._step import are_sound, Carry, guarded, LoopStep, make_step, require_runnable, SampleResult
 
@@ -31,15 +31,11 @@ class Simulation:
 
     **Arguments:**
 
-    - `time`: s.
-    - `angle`: true, rad.
-    - `measurement`: rad.
-    - `command`: achieved, V.
+    - `time`, `dt`: s; `angle`: true, rad; `measurement`: rad; `command`: achieved, V.
     - `saturated`: whether the drive gave less than was asked.
     - `signals`: of the controller, [samples, axes, *ensemble].
     - `diverged`: whether the member left the bound.
     - `scenario`: as it was given.
-    - `dt`: s.
     - `authority`: the torque that the drive can hold; None for a plant that does not tell it.
     """
 
@@ -75,7 +71,10 @@ class Simulation:
         `member` picks one of an ensemble. Raises `ValueError` for an axis that does not exist, and
         for a member that diverged.
         """
-        k = self._index(axis)
+        names = AXES[: self.angle.shape[1]]
+        if axis not in names:
+            raise ValueError(f"axis {axis!r}: choose one of {', '.join(names)}")
+        k = names.index(axis)
         if member is None and self.angle.ndim > 2:
             raise ValueError(
                 f"an ensemble of shape {self.angle.shape[2:]} has many records: pick one, member=0"
@@ -94,12 +93,6 @@ class Simulation:
             input_units="V", output_units="rad", reference_units="V" if excited else None,
             source="simulation", hold=self.dt, time_unit="s",
         )  # fmt: skip
-
-    def _index(self, axis: str) -> int:
-        names = AXES[: self.angle.shape[1]]
-        if axis not in names:
-            raise ValueError(f"axis {axis!r}: choose one of {', '.join(names)}")
-        return names.index(axis)
 
     def _wide(self, x: Float[Array, "samples axes ..."]) -> Array:
         return jnp.broadcast_to(align(x, self.angle), self.angle.shape)
@@ -141,19 +134,7 @@ def simulate(loop: Loop, scenario: Scenario, *, devices: DeviceChoice = None) ->
     ((angle, *others), diverged), authority = flown
     warn_beyond_authority(authority, scenario)
     time = _times(loop.dt, angle.shape[0], angle.dtype)
-    measurement, command, saturated, signals = others
-    return Simulation(
-        time=time,
-        angle=angle,
-        measurement=measurement,
-        command=command,
-        saturated=saturated,
-        signals=signals,
-        diverged=diverged,
-        scenario=scenario,
-        dt=loop.dt,
-        authority=authority,
-    )
+    return Simulation(time, angle, *others, diverged, scenario, dt=loop.dt, authority=authority)
 
 
 @ft.lru_cache(maxsize=8)
@@ -168,7 +149,8 @@ _Flown = tuple[tuple[PyTree, Bool[Array, "*ensemble"]], Authority | None]
 @Jit
 def _run(loop: Loop, scenario: Scenario, devices: Devices | None = None) -> _Flown:
     drive_authority = find_authority(loop.plant, loop.drive, loop.controller)
-    stored, running = loop_over_devices(_store, (loop, scenario), None, devices)
+    store = lambda run, _: scan_loop(*run, _Store())[1:]
+    stored, running = loop_over_devices(store, (loop, scenario), None, devices)
     result = (stored, ~running), drive_authority
     _require_room(result)
     return result
@@ -181,10 +163,6 @@ def _require_room(result: PyTree) -> None:
     require_memory(
         what, size_of(stored), "take jq.evaluate, which stores none, or jq.simulation.in_slices"
     )
-
-
-def _store(run: Run, nothing: None) -> tuple[PyTree, Bool[Array, "*ensemble"]]:
-    return scan_loop(*run, _Store())[1:]
 
 
 class _Store(eqx.Module):

@@ -88,7 +88,7 @@ def test_every_option_of_a_filter_can_be_stored_and_gives_the_loop_it_describes(
 ):
     version = (4, 5, 0)
     choices = filter_choices(firmware, values, version, axis=1, change=2.0, line_hz=110.0)
-    assert [choice.names for choice in choices] == names
+    assert [tuple(choice.flown_parameters) for choice in choices] == names
     before = flown_loop(firmware, values, version).law
     f = np.array([3.0, 40.0, 140.0])
     for choice in choices:

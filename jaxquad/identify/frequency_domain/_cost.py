@@ -351,21 +351,13 @@ def unmixed(shape: tuple[int, ...]) -> Mixing:
     return Mixing(*along, *across, idle=np.array(True))
 
 
-def mix(
-    mixing: Mixing | None, weighted: Float[np.ndarray, "frequencies outputs inputs 2 *columns"]
-) -> Float[np.ndarray, "frequencies outputs inputs 2 *columns"]:
-    """Weighted misfits, or their slopes, taken together."""
-    return weighted if mixing is None else _mixed(mixing, weighted, twice=False)
+Columns = Float[np.ndarray, "frequencies outputs inputs 2 *columns"]
 
 
-def mix_twice(
-    mixing: Mixing | None, weighted: Float[np.ndarray, "frequencies outputs inputs 2 *columns"]
-) -> Float[np.ndarray, "frequencies outputs inputs 2 *columns"]:
-    """The same by the factors and then by their adjoints."""
-    return weighted if mixing is None else _mixed(mixing, weighted, twice=True)
-
-
-def _mixed(mixing: Mixing, weighted: np.ndarray, twice: bool) -> np.ndarray:
+def mix(mixing: Mixing | None, weighted: Columns, *, twice: bool = False) -> Columns:
+    """Weighted misfits, or their slopes, taken together; `twice`: by the adjoints, too."""
+    if mixing is None:
+        return weighted
     joined = np.moveaxis(weighted[:, :, :, 0] + 1j * weighted[:, :, :, 1], 0, 2)
     flat = joined.reshape(*joined.shape[:3], -1)
     outputs, inputs, count, columns = flat.shape

@@ -15,7 +15,7 @@ from jaxquad.spectra import FrequencyResponse
 from ..uncertainty._assess import assess, DOUBT, unfitted
 from ..uncertainty._error_budget import weighting_at
 from ..uncertainty._verdict import without_numbers
-from ..uncertainty._zero_bounds import settle_at_bounds, solve_within_bounds
+from ..uncertainty._zero_bounds import solve_within_bounds
 from ._cost import (
     Band,
     Cost,
@@ -223,7 +223,7 @@ def _fit(model: PyTree, frfs: Sequence[FrequencyResponse], options: Options, rou
         fastest = max(float(one.frf.omega[-1]) for one in points)
         starts = spread_starts(parameters, options.starts, fastest=fastest)
         solution, minima = solve_from_many(problem, starts, solver, max_steps)
-        solution = settle_at_bounds(problem, solution, solver, max_steps)
+        solution = solve_within_bounds(problem, solution, solver, max_steps)
     again = weigh(points, solution)
     if not are_close(weights, again, 1e-4):
         problem = weighted(points, again)

@@ -16,7 +16,7 @@ from ..uncertainty._error_budget import FOLLOWS
 from ._cost import Band, Cost, MaximumLikelihood
 from ._fit import check_options, fit_with, require_responses
 from ._parameters import Free, Parameters, Positive, select_parameters, Tie
-from ._refits import free_again, model_to_start_from, Options, Origin, require_origin
+from ._refits import free_again, model_to_start_from, Options, require_origin
 from ._result import counted, Fit
 
 
@@ -199,7 +199,21 @@ def fit_damped(fit: Fit, *, unmodelled: float = 0.05) -> Fit:
         return fit
     origin, best = require_origin(fit), None
     low, high = origin.band
-    for start in (damping_by_phase(fit, origin), float(np.sqrt(low * high))):
+    # The phase at the lowest frequencies: s / (s + c) leads by c / w, which counts as the square of
+    # what its error lets it.
+    turned = weight = 0.0
+    for points in origin.points:
+        omega, used = np.asarray(points.frf.omega), np.asarray(points.used)[:, 0, 0]
+        slow = used & (omega < _SLOW * low)
+        some, response = omega[slow], np.asarray(points.frf.response)[slow, 0, 0]
+        flat = response * (1j * some) ** fit.model.integrators / np.sign(float(fit.model.gain))
+        late = float(fit.model.lag) + float(fit.model.delay)
+        lead = np.angle(flat * np.exp(1j * late * some))
+        share = (1 / (some * np.asarray(points.frf.random_error)[slow, 0, 0])) ** 2
+        turned, weight = turned + float(share @ (some * lead)), weight + float(np.sum(share))
+    by_phase = turned / weight if weight else 0.0
+    by_phase = float(np.clip(by_phase, _LOWEST * low, high))
+    for start in (by_phase, float(np.sqrt(low * high))):
         start_model = dataclasses.replace(model_to_start_from(fit), damping=start)
         free = [*free_again(fit.parameters), Positive(_NAME)]
         damped = origin.fit_again(start_model, origin.options._replace(free=free, starts=1))
@@ -222,26 +236,6 @@ def fit_damped(fit: Fit, *, unmodelled: float = 0.05) -> Fit:
     units = dict(zip(fit.names, fit.parameter_units, strict=False)) | {_NAME: "1/s"}
     units = tuple(units[name] for name in best.names) if fit.parameter_units else ()
     return dataclasses.replace(best, parameter_units=units)
-
-
-def damping_by_phase(fit: Fit, origin: Origin) -> float:
-    """A damping in 1/s by the phase at the lowest frequencies: s / (s + c) leads by c / w.
-
-    Which counts as the square of what its error lets it.
-    """
-    low, high = origin.band
-    turned = weight = 0.0
-    for points in origin.points:
-        omega, used = np.asarray(points.frf.omega), np.asarray(points.used)[:, 0, 0]
-        slow = used & (omega < _SLOW * low)
-        some, response = omega[slow], np.asarray(points.frf.response)[slow, 0, 0]
-        flat = response * (1j * some) ** fit.model.integrators / np.sign(float(fit.model.gain))
-        late = float(fit.model.lag) + float(fit.model.delay)
-        lead = np.angle(flat * np.exp(1j * late * some))
-        share = (1 / (some * np.asarray(points.frf.random_error)[slow, 0, 0])) ** 2
-        turned, weight = turned + float(share @ (some * lead)), weight + float(np.sum(share))
-    by_phase = turned / weight if weight else 0.0
-    return float(np.clip(by_phase, _LOWEST * low, high))
 
 
 def _with_unmodelled(damped: Fit, plain: Fit, damping: float) -> Fit:

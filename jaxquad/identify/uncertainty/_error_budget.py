@@ -23,7 +23,7 @@ from jaxtyping import Complex, Float
 from jaxquad._core import pytree_node
 from jaxquad.spectra import FrequencyResponse
 
-from ..frequency_domain._cost import expected_cost, mix, mix_twice, Mixing, Points
+from ..frequency_domain._cost import expected_cost, mix, Mixing, Points
 from ..frequency_domain._problem import Problem
 from ..frequency_domain._solve import Solution
 
@@ -141,7 +141,7 @@ class ResponseTerm:
     def pulls(self) -> Float[np.ndarray, "frequencies outputs inputs 2 parameters"]:
         """How far a misfit of each point moves the gradient by each free parameter."""
         rows = self.weights[..., None] * self.slopes[..., : self.count]
-        return self.weights[..., None] * mix_twice(self.mixing, rows)
+        return self.weights[..., None] * mix(self.mixing, rows, twice=True)
 
     @ft.cached_property
     def ratio(self) -> Complex[np.ndarray, "frequencies outputs inputs"]:

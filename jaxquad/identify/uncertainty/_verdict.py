@@ -185,36 +185,35 @@ class Verdict:
             kind, why = self._refusal()
             lines = [f"{kind.upper()} {why}"]
         else:
+            it = "it" if len(self.undetermined) == 1 else "them"
+            determined = f"nothing about {it} is determined by this record"
+            if self.combinations:
+                names = " and ".join(combination.name for combination in self.combinations)
+                rows = self.null_directions
+                every = all(name in self.undetermined for row in rows for name in row)
+                only = "only " if every else ""  # else one in it is determined, too
+                determined = f"{only}{names} is determined by this record"
+            elif self.curved and not self.reasons:
+                curved = ", ".join(self.curved)
+                determined = (
+                    f"what it determines of {curved} is neither a product nor a sum of them"
+                )
             lines = [
                 "NOT IDENTIFIABLE from this record, individually: " + ", ".join(self.undetermined),
-                *self._determined(),
-                *(f"  {reason}" for reason in self.reasons),
-                *(f"  {bound}" for bound in self.bounds),
+                f"  {determined}",
+                *(f"    {combination}" for combination in self.combinations),
             ]
+            for direction in self.null_directions:
+                parts = ", ".join(f"{share:+.3f} {name}" for name, share in direction.items())
+                lines.append(
+                    "  null direction (relative changes that leave the responses unchanged): "
+                    f"{parts}"
+                )
+            lines += [f"  {line}" for line in (*self.reasons, *self.bounds)]
         if self.remedies:
             first, *others = self.remedies
             lines += [f"  to resolve it: {first}", *(f"  or {other}" for other in others)]
         return "\n".join(lines)
-
-    def _determined(self) -> list[str]:
-        it = "it" if len(self.undetermined) == 1 else "them"
-        lines = [f"  nothing about {it} is determined by this record"]
-        if self.combinations:
-            names = " and ".join(combination.name for combination in self.combinations)
-            rows = self.null_directions
-            every = all(name in self.undetermined for row in rows for name in row)
-            only = "only " if every else ""  # else one in it is determined, too
-            lines = [f"  {only}{names} is determined by this record"]
-        elif self.curved and not self.reasons:
-            curved = ", ".join(self.curved)
-            lines = [f"  what it determines of {curved} is neither a product nor a sum of them"]
-        lines += [f"    {combination}" for combination in self.combinations]
-        for direction in self.null_directions:
-            parts = ", ".join(f"{share:+.3f} {name}" for name, share in direction.items())
-            lines.append(
-                f"  null direction (relative changes that leave the responses unchanged): {parts}"
-            )
-        return lines
 
 
 def without_numbers(kind: Kind, names: tuple[str, ...], reason: str, *remedies: str) -> Verdict:

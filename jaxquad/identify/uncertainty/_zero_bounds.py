@@ -61,17 +61,14 @@ def linearise(problem: Problem, solution: Solution) -> Linearised:
 
 
 def solve_within_bounds(
-    problem: Problem, z: Vector, solver: eqx.Module | None, max_steps: int
+    problem: Problem, start: Vector | Solution, solver: eqx.Module | None, max_steps: int
 ) -> Solution:
-    """Solve from `z`; parameters that belong at zero are there, wherever the path to it ended."""
-    solution = solve(problem, z, solver, max_steps)
-    return settle_at_bounds(problem, solution, solver, max_steps)
+    """Solve from `z`, or go on from a solution, until all that belongs at zero is marked as there.
 
-
-def settle_at_bounds(
-    problem: Problem, solution: Solution, solver: eqx.Module | None, max_steps: int
-) -> Solution:
-    """The solution with its parameters at zero marked; a better one if they do not belong there."""
+    It is so wherever the path to it ended; what does not belong there is released.
+    """
+    is_solved = isinstance(start, Solution)
+    solution = start if is_solved else solve(problem, start, solver, max_steps)
     logarithmic = np.array(problem.parameters.logarithmic[: solution.z.size])
     least = np.asarray(problem.parameters.start)[: solution.z.size] - _SMALLEST
     for _ in range(_ROUNDS):

@@ -22,7 +22,7 @@ import numpy as np
 
 from .._errors import located, printable, ReadError, warn
 from .._firmwares import registered_logs
-from .._log import allowance, flattened, Log as Log, oversize, Signals, Table as Table
+from .._log import allowance, check_size, flattened, Log as Log, Signals, Table as Table
 from . import (
     _arrays,
     _betaflight,
@@ -73,7 +73,7 @@ def _in_child(name: str, per_megabyte: float, path: Path) -> Log:
         )
     if "oversize" in answer:
         what, declared = answer["oversize"]
-        raise ReadError(oversize(what, declared, stored))
+        check_size(what, declared, stored)
     if "error" in answer:
         raise ReadError(
             f"cannot be read as {kind}: the file is cut off or damaged "

@@ -22,7 +22,6 @@ from ._betaflight_frames import (
     Header,
     headers,
     MARKER,
-    Payload,
     payload,
     RESUME,
     STRAY,
@@ -75,12 +74,12 @@ def _log(data: bytes, header: Header) -> tuple[dict[str, Table], list[str]]:
             f"{count(len(damage), 'damaged block')} ({size} bytes) without frames skipped, "
             f"the first at byte {damage[0][0]}"
         )
-    frames = main.offsets.size
-    if frames > rows.size:
-        mask = np.ones(frames, bool)
+    logged = main.offsets.size
+    if logged > rows.size:
+        mask = np.ones(logged, bool)
         mask[rows] = False
         remarks.append(
-            f"{frames - rows.size} of {frames} frames were left out, because they refer "
+            f"{logged - rows.size} of {logged} frames were left out, because they refer "
             f"to lost or damaged ones or are out of order, the first at byte "
             f"{main.offsets[mask.argmax()]}"
         )
@@ -102,32 +101,8 @@ def _log(data: bytes, header: Header) -> tuple[dict[str, Table], list[str]]:
     table = _table(main.coded, "I", time, header)
     columns = with_mixed_axes(with_derived(table.columns), header.settings, time)
     tables = {"": dataclasses.replace(table, columns=columns)}
-    return tables | _slow_tables(content, main, time, header), remarks
-
-
-def _table(
-    values: Int[np.ndarray, "samples fields"],
-    letter: str,
-    time: Float[np.ndarray, " samples"],
-    header: Header,
-) -> Table:
-    """Views of the decoded columns with the units that the header gives them."""
-    frame = header.frames[letter]
-    columns = {
-        name: values[:, i] if frame.signed[i] else values[:, i].view(np.uint32)
-        for i, name in enumerate(frame.names)
-        if name != "time"
-    }
-    factors = scaled(frame.names, header.settings)
-    units = {name: unit for name, (_, unit) in factors.items()}
-    return Table(columns, time, units, {name: factor for name, (factor, _) in factors.items()})
-
-
-def _slow_tables(
-    content: Payload, main: Frames, time: Float[np.ndarray, " samples"], header: Header
-) -> dict[str, Table]:
-    """Flight modes and positions, stamped with the last main frame before; relative to a home."""
-    tables = {}
+    # Flight modes and positions are stamped with the last main frame before. GPS frames that no
+    # home position precedes are left out, as they are relative to it.
     for letter, name in (("S", "slow"), ("G", "gps")):
         frames = content.slow.get(letter)
         if frames is None or not frames.offsets.size:
@@ -153,7 +128,25 @@ def _slow_tables(
             values[:, from_home] += home
         values[:, frame.predictors == 10] += main.coded[before[rows], 1][:, None]
         tables[name] = _table(values, letter, time[before[rows]], header)
-    return tables
+    return tables, remarks
+
+
+def _table(
+    values: Int[np.ndarray, "samples fields"],
+    letter: str,
+    time: Float[np.ndarray, " samples"],
+    header: Header,
+) -> Table:
+    """Views of the decoded columns with the units that the header gives them."""
+    frame = header.frames[letter]
+    columns = {
+        name: values[:, i] if frame.signed[i] else values[:, i].view(np.uint32)
+        for i, name in enumerate(frame.names)
+        if name != "time"
+    }
+    factors = scaled(frame.names, header.settings)
+    units = {name: unit for name, (_, unit) in factors.items()}
+    return Table(columns, time, units, {name: factor for name, (factor, _) in factors.items()})
 
 
 # Where bytes were lost, a frame spliced of two may by chance end where another seems to begin,

@@ -158,6 +158,13 @@ _NIBBLES = np.array([0, 1, 2, 4], np.int32)
 _PAIRS = np.stack([(np.arange(256, dtype=np.int32) << s) >> 30 for s in (26, 28, 30)], axis=1)
 
 
+# TAG2_3S32 and TAG2_3SVARIABLE: first bit and bits of three fields, in two and in three bytes.
+_WIDTHS = {
+    7: (((4, 4), (8, 4), (12, 4)), ((2, 6), (10, 6), (18, 6))),
+    10: (((2, 5), (7, 5), (12, 4)), ((2, 8), (10, 7), (17, 7))),
+}
+
+
 class _Numbers(NamedTuple):
     """A piece of the log and, for every byte of it, the number that would begin there."""
 
@@ -165,20 +172,6 @@ class _Numbers(NamedTuple):
     length: np.ndarray  # uint8, bytes of a variable-byte number
     unsigned: np.ndarray  # int32, its value with the bits of a uint32
     signed: np.ndarray  # int32, after ZigZag
-
-
-def _numbers(raw: np.ndarray) -> _Numbers:
-    value, length = (raw & 0x7F).astype(np.uint32), np.ones(raw.size, np.uint8)
-    first = np.flatnonzero(raw[:-_SLACK] & 0x80)
-    following = first + 1
-    for shift in (7, 14, 21, 28):
-        value[first] |= (raw[following] & 0x7F).astype(np.uint32) << np.uint32(shift)
-        length[first] += 1
-        more = raw[following] >= 0x80
-        first, following = first[more], following[more] + 1
-    length[first] = _TOO_LONG
-    signed = (value >> 1) ^ -(value & 1)
-    return _Numbers(raw, length, value.view(np.int32), signed.view(np.int32))
 
 
 def _decode(data: _Numbers, frame: Frame, starts: Positions) -> tuple[np.ndarray, Positions]:
@@ -216,33 +209,24 @@ def _decode(data: _Numbers, frame: Frame, starts: Positions) -> tuple[np.ndarray
                 nibble += width
             at += 1
             at[rows] = nibble + 1 >> 1
-        elif encoding != 9:
-            at = _three(data.raw, at, part, variable=encoding == 10)
+        elif encoding != 9:  # three fields of 2 bits, of the widths below, or of 1 to 4 bytes each
+            tags = data.raw[at]
+            part[:] = _PAIRS[tags]
+            for choice, widths in enumerate(_WIDTHS[encoding], start=1):
+                rows = np.flatnonzero(tags >> 6 == choice)
+                word = _word(data.raw, at[rows], (24, 16, 8))
+                for field, (begin, width) in enumerate(widths):
+                    part[rows, field] = word << begin >> (32 - width)
+            rows = np.flatnonzero(tags >> 6 == 3)
+            here = at[rows] + 1
+            for field in range(3):
+                size = (tags[rows] >> 2 * field & 3).astype(np.int32)
+                word = _word(data.raw, here, (0, 8, 16, 24)) << 8 * (3 - size)
+                part[rows, field] = word >> 8 * (3 - size)
+                here += size + 1
+            at += 1 + (tags >> 6).clip(max=2)
+            at[rows] = here
     return out, np.where(worst < _TOO_LONG, at, -1)
-
-
-def _three(raw: np.ndarray, at: Positions, out: np.ndarray, *, variable: bool) -> Positions:
-    """TAG2_3S32 or TAG2_3SVARIABLE: three fields of 2 bits, of some, or of 1 to 4 bytes each."""
-    widths = ((5, 5, 4), (8, 7, 7)) if variable else ((4, 4, 4), (6, 6, 6))
-    begins = ((2, 7, 12), (2, 10, 17)) if variable else ((4, 8, 12), (2, 10, 18))
-    tags = raw[at]
-    out[:] = _PAIRS[tags]
-    for choice in (1, 2):
-        rows = np.flatnonzero(tags >> 6 == choice)
-        word = _word(raw, at[rows], (24, 16, 8))
-        for field in range(3):
-            left = word << begins[choice - 1][field]
-            out[rows, field] = left >> (32 - widths[choice - 1][field])
-    end = at + 1 + (tags >> 6).clip(max=2)
-    rows = np.flatnonzero(tags >> 6 == 3)
-    here = at[rows] + 1
-    for field in range(3):
-        size = (tags[rows] >> 2 * field & 3).astype(np.int32)
-        word = _word(raw, here, (0, 8, 16, 24)) << 8 * (3 - size)
-        out[rows, field] = word >> 8 * (3 - size)
-        here += size + 1
-    end[rows] = here
-    return end
 
 
 def _word(raw: np.ndarray, at: Positions, shifts: tuple[int, ...]) -> np.ndarray:
@@ -299,7 +283,18 @@ def payload(data: bytes, header: Header) -> Payload:
         places = np.flatnonzero(begins[raw[: stop - base]])
         if places.size > most_places:
             stop, places = base + int(places[most_places]), places[:most_places]
-        numbers, reach, coded = _numbers(raw), np.full(places.size, -1), {}
+        value, length = (raw & 0x7F).astype(np.uint32), np.ones(raw.size, np.uint8)
+        first = np.flatnonzero(raw[:-_SLACK] & 0x80)
+        following = first + 1
+        for shift in (7, 14, 21, 28):
+            value[first] |= (raw[following] & 0x7F).astype(np.uint32) << np.uint32(shift)
+            length[first] += 1
+            more = raw[following] >= 0x80
+            first, following = first[more], following[more] + 1
+        length[first] = _TOO_LONG
+        signed = (value >> 1) ^ -(value & 1)
+        numbers = _Numbers(raw, length, value.view(np.int32), signed.view(np.int32))
+        reach, coded = np.full(places.size, -1), {}
         for letter, frame in header.frames.items():
             rows = np.flatnonzero(raw[places] == ord(letter))
             values, reach[rows] = _decode(numbers, frame, places[rows])

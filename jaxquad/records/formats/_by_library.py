@@ -187,40 +187,35 @@ class _Topic:
 
     def __init__(self, first: Any, begin: int):
         self.begin = begin  # ns
-        paths = list(_leaves(first, "", 0))
-        self.numbers = [path for path, value in paths if not isinstance(value, np.ndarray)]
-        self.arrays = {path: value.shape for path, value in paths if isinstance(value, np.ndarray)}
-        self.stamped = {"header.stamp.sec", "header.stamp.nanosec"} <= set(self.numbers)
+        shapes = [(path, getattr(x, "shape", ())) for path, x in _leaves(first, "", 0)]
+        self.shapes = dict(sorted(shapes, key=lambda item: len(item[1])))  # first the numbers
+        self.stamped = {"header.stamp.sec", "header.stamp.nanosec"} <= self.shapes.keys()
         self.rows: list[tuple[Any, ...]] = []
         self.stamps: list[float] = []
         self.odd = 0
-        self._get = attrgetter(*self.numbers, *self.arrays) if paths else None
+        self._get = attrgetter(*self.shapes) if self.shapes else None
 
     def add(self, recorded: int, message: Any) -> int:
         """Take one message; returns how many bytes its numbers are."""
         if self._get is None:
             return 0
         row: Any = self._get(message)
-        row = row if len(self.numbers) + len(self.arrays) > 1 else (row,)
-        ours = row[len(self.numbers) :]
-        if any(a.shape != shape for a, shape in zip(ours, self.arrays.values(), strict=True)):
+        row = row if len(self.shapes) > 1 else (row,)
+        if [getattr(x, "shape", ()) for x in row] != list(self.shapes.values()):
             self.odd += 1
             return 0
         self.rows.append(row)
         stamp = message.header.stamp if self.stamped else None
         nanoseconds = stamp.sec * 10**9 + stamp.nanosec if stamp is not None else recorded
         self.stamps.append((nanoseconds - self.begin) * 1e-9)
-        return 8 * len(self.numbers) + sum(array.nbytes for array in ours)
+        return sum(getattr(x, "nbytes", 8) for x in row)
 
     def columns(self) -> dict[str, tuple[np.ndarray, str]]:
-        named = {}
-        for i, name in enumerate(self.numbers):
+        columns = {}
+        for i, name in enumerate(self.shapes):
             if not name.startswith("header.stamp"):
-                named[name] = np.array([row[i] for row in self.rows])
-        for i, name in enumerate(self.arrays, start=len(self.numbers)):
-            named[name] = np.stack([row[i] for row in self.rows])
-        units = {name: _UNITS.get(name.split(".")[-2], "") for name in named if "." in name}
-        columns = {name: (values, units.get(name, "")) for name, values in named.items()}
+                unit = _UNITS.get(name.split(".")[-2], "") if "." in name else ""
+                columns[name] = np.array([row[i] for row in self.rows]), unit
         # Last, for a field of the message may be called time as well.
         return columns | {"time": (np.array(self.stamps), "s")}
 

@@ -21,13 +21,10 @@ def sniff(head: bytes, path: Path) -> bool:
 
 
 def load(path: Path) -> Log:
-    """The columns of a text table by the names in its header row.
+    """The columns of a text table by the names in its header row, with the units in these.
 
-    Cells are separated by commas, semicolons, tabs or blanks; lines with # are comments, the
-    last of which may be the header. A known unit in brackets behind a name, as in `q [deg/s]` or
-    `time (us)`, is that of its column, which both `q` and the whole title select. Without a header
-    the columns are those of a matrix `data`. In a table of several topics the cells of a column are
-    blank where its topic has no message. Raises ReadError with the line and the column.
+    The last comment, with #, may be the header; without one the columns are a matrix `data`. In a
+    table of several topics the cells of a column are blank where its topic has no message.
     """
     content = path.read_bytes()
     if content.startswith((b"\xff\xfe", b"\xfe\xff")):

@@ -66,6 +66,9 @@ class _Scaling(NamedTuple):
     letters: Mapping[str, tuple[str, str]]  # by message: one letter per column, of either kind
 
 
+_RATES = ("RDes", "R", "PDes", "P", "YDes", "Y")  # of RATE: set-points and rates
+_GYROS = {"R": "GyrX", "P": "GyrY", "Y": "GyrZ"}  # of IMU, in rad/s
+_DEGREES = {1.0: ("rad/s", 1.0), 57.3: ("deg/s", 1.0), 5730.0: ("deg/s", 0.01)}  # rate over gyro
 _FIRMWARE = re.compile(r"\b[A-Z][\w:]*\w V\d+\.\d+[^\0,]*")
 
 
@@ -78,10 +81,9 @@ def _log(
     *,
     applied: bool,
 ) -> Log:
-    """The messages of each type as a table, or one table per instance: `IMU[0]`, `IMU[1]`, ...
+    """The messages of each type with a time stamp as a table, or one per instance: `IMU[0]`.
 
-    They are columns by name, with their own scale `applied` or not. Messages without a time stamp
-    (formats, parameters) make no table. The `texts` of VER and MSG name the firmware.
+    Their columns have their own scale `applied` or not; `texts` of VER and MSG name the firmware.
     """
     tables: dict[str, Table] = {}
     for layout, rows in messages:
@@ -110,46 +112,37 @@ def _log(
             kept = columns[instance] == number
             values = {name: column[kept] for name, column in columns.items() if name != instance}
             tables[f"{layout.name}[{number:.0f}]"] = Table(values, time[kept], units, scales)
-    if not scaling.letters.get("RATE"):
-        remarks = [*remarks, *_find_rate_unit(tables)]
+    rate = tables.get("RATE")
+    if rate is not None and not scaling.letters.get("RATE"):
+        # Logs before FMTU do not say its unit: it follows from the deviations over all axes of the
+        # first gyro, `IMU` or `IMU[0]`.
+        imus = (name for name in tables if name.partition("[")[0] == "IMU")
+        imu = tables.get(min(imus, default=""))
+        gyros = {} if imu is None else imu.columns
+        pairs = [(rate.columns.get(r), gyros.get(g)) for r, g in _GYROS.items()]
+        pairs = [(r, g) for r, g in pairs if r is not None and g is not None]
+        turned = np.sqrt(sum(float(np.var(r)) for r, _ in pairs))
+        measured = np.sqrt(sum(float(np.var(g)) for _, g in pairs))
+        usual, why = 57.3, "as ArduPilot 3.4 and later log it"
+        if measured > 1e-3 and turned > 0:
+            ratio = float(turned / measured)
+            usual = min(_DEGREES, key=lambda usual: abs(np.log(ratio / usual)))
+            why = f"because its rates are {ratio:.3g} times those of IMU's gyro in rad/s"
+        unit, scale = _DEGREES[usual]
+        named = [name for name in _RATES if name in rate.columns]
+        tables["RATE"] = dataclasses.replace(
+            rate,
+            units={**rate.units, **dict.fromkeys(named, unit)},
+            scales={**rate.scales, **dict.fromkeys(named, scale)},
+        )
+        hundredths = " (logged in hundredths)" if scale != 1.0 else ""
+        remark = f"the log does not say the unit of RATE: taken as {unit}{hundredths}, {why}"
+        remarks = [*remarks, remark]
     settings = {name: value for _, name, value in stamped}
     changes = changes_of(stamped, lambda time: time)
     hit = next(filter(None, map(_FIRMWARE.search, texts)), None)
     firmware = "" if hit is None else hit.group().strip()
     return Log(tables, tuple(remarks), "ardupilot", settings, changes, firmware)
-
-
-_RATES = ("RDes", "R", "PDes", "P", "YDes", "Y")  # of RATE: set-points and rates
-_GYROS = {"R": "GyrX", "P": "GyrY", "Y": "GyrZ"}  # of IMU, in rad/s
-_DEGREES = {1.0: ("rad/s", 1.0), 57.3: ("deg/s", 1.0), 5730.0: ("deg/s", 0.01)}  # rate over gyro
-
-
-def _find_rate_unit(tables: dict[str, Table]) -> list[str]:
-    """Give RATE its unit in logs before FMTU, by the size of IMU's gyro; returns the remark."""
-    rate = tables.get("RATE")
-    if rate is None:
-        return []
-    # The first gyro, as `IMU` or `IMU[0]`; by the deviations over all axes.
-    imu = tables.get(min((name for name in tables if name.partition("[")[0] == "IMU"), default=""))
-    gyros = {} if imu is None else imu.columns
-    pairs = [(rate.columns.get(r), gyros.get(g)) for r, g in _GYROS.items()]
-    pairs = [(r, g) for r, g in pairs if r is not None and g is not None]
-    turned = np.sqrt(sum(float(np.var(r)) for r, _ in pairs))
-    measured = np.sqrt(sum(float(np.var(g)) for _, g in pairs))
-    unit, scale = _DEGREES[57.3]
-    why = "as ArduPilot 3.4 and later log it"
-    if measured > 1e-3 and turned > 0:
-        ratio = float(turned / measured)
-        unit, scale = _DEGREES[min(_DEGREES, key=lambda usual: abs(np.log(ratio / usual)))]
-        why = f"because its rates are {ratio:.3g} times those of IMU's gyro in rad/s"
-    named = [name for name in _RATES if name in rate.columns]
-    tables["RATE"] = dataclasses.replace(
-        rate,
-        units={**rate.units, **dict.fromkeys(named, unit)},
-        scales={**rate.scales, **dict.fromkeys(named, scale)},
-    )
-    hundredths = " (logged in hundredths)" if scale != 1.0 else ""
-    return [f"the log does not say the unit of RATE: taken as {unit}{hundredths}, {why}"]
 
 
 @dataclasses.dataclass
@@ -230,14 +223,38 @@ def load(path: Path) -> Log:
             "there is no FMT message: the file is not a DataFlash log, or its beginning is missing",
             offset=0,
         )
-    formats, offsets, left_out = _one_log(data, parts)
+    ends = [*(part.begin for part in parts[1:]), len(data)]
+    for part, end in zip(parts, ends, strict=True):
+        part.end = end
+        stored = [x for kind, x in part.formats.items() if part.offsets.get(kind)]
+        part.chirped = any(layout.name == "SIDD" for layout in stored)
+        timed = [x for x in stored if x.columns[0] in _CLOCKS and x.name not in _ABOUT]
+        timed = [layout for layout in timed if layout.dtype() is not None]
+        if timed:
+            most = max(timed, key=lambda layout: len(part.offsets[layout.kind]))
+            rows, _ = _rows(data, {most.kind: most}, part.offsets)
+            clock = most.columns[0]
+            part.span = _span(_CLOCKS[clock] * rows[most.name][clock].astype(np.float64))
+    numbers, left_out = _choose_log(parts)
+    offsets: Offsets = collections.defaultdict(list)
+    for i in numbers:
+        if parts[i].redefined and (i == 0 or i - 1 in numbers):
+            place, old, new = parts[i].redefined[0]
+            raise ReadError(
+                f"message type {new.kind} ({old.name}) is defined a second time, differently "
+                f"({new.name}): if the file holds two logs, cut it there",
+                offset=place,
+            )
+        for kind, places in parts[i].offsets.items():
+            offsets[kind] += places
+    formats = parts[numbers[-1]].formats
     rows, odd = _rows(data, formats, offsets)
     remarks += left_out
     if odd:
         remarks.append(f"messages with an inconsistent format were left out: {', '.join(odd)}")
     units, mults = _cells(rows.get("UNIT"), "Id", "Label"), _cells(rows.get("MULT"), "Id", "Mult")
     scaling = _Scaling(
-        {chr(letter & 0xFF): _text(label) for letter, label in units},
+        {chr(letter & 0xFF): _text(label) for letter, label in dict(units).items()},
         {chr(letter & 0xFF): mult for letter, mult in dict(mults).items() if 0 < mult < np.inf},
         {
             formats[kind].name: (_text(units), _text(mults))
@@ -309,70 +326,36 @@ def _scan(data: bytes) -> tuple[list[_Part], list[str]]:
         elif place + length > end:
             break
         else:
-            if kind == _FORMAT_TYPE:
-                part = _define(data, place, parts, lengths)
+            if kind == _FORMAT_TYPE:  # which begins a part where it defines its type once more
+                body = data[place + 3 : place + _FMT_LENGTH]
+                new_kind, size = body[0], body[1]
+                if new_kind in part.defined and part.offsets.keys() != {_FORMAT_TYPE}:
+                    if len(parts) == _MOST_PARTS:
+                        raise ReadError(
+                            f"the file defines its messages more than {_MOST_PARTS} times: "
+                            f"{_CUT_IT}",
+                            offset=place,
+                        )
+                    parts.append(part := _Part(place, dict(part.formats)))
+                part.defined.add(new_kind)
+                name, codes, columns = (_text(body[a:b]) for a, b in ((2, 6), (6, 22), (22, 86)))
+                old = part.formats.get(new_kind)
+                new = _Format(new_kind, size, name, codes, tuple(columns.split(",")))
+                if old is not None and old != new:
+                    part.redefined.append((place, old, new))
+                part.formats[new_kind] = new
+                if new_kind == _FORMAT_TYPE and size != _FMT_LENGTH:
+                    raise ReadError(
+                        f"the FMT message declares a length of {size} bytes; it has 89",
+                        offset=place,
+                    )
+                lengths[new_kind] = size if size > 3 else 0
             part.offsets[kind].append(place)
             last = place
             place += length
     if skipped and skipped[-1][1] == end and not data[skipped[-1][0] :].strip(b"\0\xff"):
         skipped.pop()  # what a file was prepared with, and not written
     return parts, describe_skips(skipped, end, end)
-
-
-def _define(data: bytes, place: int, parts: list[_Part], lengths: list[int]) -> _Part:
-    """Take a FMT message; returns its part: a new one where it defines its type once more."""
-    body, part = data[place + 3 : place + _FMT_LENGTH], parts[-1]
-    kind, length = body[0], body[1]
-    if kind in part.defined and part.offsets.keys() != {_FORMAT_TYPE}:
-        if len(parts) == _MOST_PARTS:
-            raise ReadError(
-                f"the file defines its messages more than {_MOST_PARTS} times: {_CUT_IT}",
-                offset=place,
-            )
-        parts.append(part := _Part(place, dict(part.formats)))
-    part.defined.add(kind)
-    name, codes, columns = (_text(body[a:b]) for a, b in ((2, 6), (6, 22), (22, 86)))
-    old = part.formats.get(kind)
-    new = part.formats[kind] = _Format(kind, length, name, codes, tuple(columns.split(",")))
-    if old is not None and old != new:
-        part.redefined.append((place, old, new))
-    if kind == _FORMAT_TYPE and length != _FMT_LENGTH:
-        raise ReadError(
-            f"the FMT message declares a length of {length} bytes; it has 89", offset=place
-        )
-    lengths[kind] = length if length > 3 else 0
-    return part
-
-
-def _one_log(
-    data: bytes, parts: Sequence[_Part]
-) -> tuple[Mapping[int, _Format], Offsets, list[str]]:
-    """Formats and offsets of one of the logs that a file holds, and a remark on the others."""
-    ends = [*(part.begin for part in parts[1:]), len(data)]
-    for part, end in zip(parts, ends, strict=True):
-        part.end = end
-        stored = [x for kind, x in part.formats.items() if part.offsets.get(kind)]
-        part.chirped = any(layout.name == "SIDD" for layout in stored)
-        timed = [x for x in stored if x.columns[0] in _CLOCKS and x.name not in _ABOUT]
-        timed = [layout for layout in timed if layout.dtype() is not None]
-        if timed:
-            most = max(timed, key=lambda layout: len(part.offsets[layout.kind]))
-            rows, _ = _rows(data, {most.kind: most}, part.offsets)
-            clock = most.columns[0]
-            part.span = _span(_CLOCKS[clock] * rows[most.name][clock].astype(np.float64))
-    numbers, remarks = _choose_log(parts)
-    offsets: Offsets = collections.defaultdict(list)
-    for i in numbers:
-        if parts[i].redefined and (i == 0 or i - 1 in numbers):
-            place, old, new = parts[i].redefined[0]
-            raise ReadError(
-                f"message type {new.kind} ({old.name}) is defined a second time, differently "
-                f"({new.name}): if the file holds two logs, cut it there",
-                offset=place,
-            )
-        for kind, places in parts[i].offsets.items():
-            offsets[kind] += places
-    return parts[numbers[-1]].formats, offsets, remarks
 
 
 def _text(field: bytes) -> str:
@@ -398,7 +381,6 @@ def _cells(rows: np.ndarray | None, *columns: str) -> Iterator[tuple]:
 _MOST_TYPES = 1000
 _MOST_COLUMNS = 64
 _BEGIN = re.compile(rb"^[ \t]*FMT, *128,", re.MULTILINE)
-Lines = dict[str, list[bytes]]  # what follows the name of a message, by name
 
 
 def sniff_text(head: bytes, path: Path) -> bool:
@@ -481,8 +463,8 @@ def load_text(path: Path) -> Log:
     return _log(messages, _Scaling(units, factors, letters), remarks, stamped, texts, applied=True)
 
 
-def _lines(content: bytes) -> tuple[Lines, int]:
-    """The lines by the name of their message; and how many have none."""
+def _lines(content: bytes) -> tuple[dict[str, list[bytes]], int]:
+    """What follows the name of a message on its lines, by name; and how many lines have none."""
     lines: dict[bytes, list[bytes]] = {}
     skipped = 0
     for line in content.split(b"\n"):
@@ -498,7 +480,7 @@ def _split(lines: Sequence[bytes]) -> list[list[str]]:
     return [[cell.strip() for cell in line.decode("latin-1").split(",")] for line in lines]
 
 
-def _text_formats(lines: Lines) -> list[_Format]:
+def _text_formats(lines: dict[str, list[bytes]]) -> list[_Format]:
     """From `140, 27, RATE, Qfff, TimeUS,RDes,R,ROut`; the first of a name counts."""
     formats: dict[str, _Format] = {}
     for kind, length, name, codes, *columns in (c for c in _split(lines.get("FMT", [])) if c[4:]):

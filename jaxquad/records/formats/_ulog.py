@@ -229,8 +229,8 @@ def _interpret(kind: int, body: bytes, place: int, messages: _Messages) -> None:
             matches = [_FIELD.fullmatch(part) for part in parts]
             if not name or not colon or not parts or not all(matches):
                 raise ReadError(f"{text[:60]!r} is not a definition of a format", offset=place)
-            fields = tuple((m[1], int(m[2]) if m[2] else None, m[3]) for m in matches if m)
-            if messages.formats.setdefault(name, fields) != fields:
+            defined = tuple((m[1], int(m[2]) if m[2] else None, m[3]) for m in matches if m)
+            if messages.formats.setdefault(name, defined) != defined:
                 raise ReadError(f"the format {name!r} is defined twice, differently", offset=place)
         elif letter == "A":
             instance, number = struct.unpack_from("<BH", body)
