@@ -188,7 +188,24 @@ class AutopilotProposal:
         if again is not None and again.kind == "flown":  # else the verdict says it
             lines += ["", f"flown loop: {again.verdict}"]
         if self.stages:
-            lines += ["", _stage_table(self.stages)]
+            relaxed, angle = self.stages[0].relaxed is not None, self.stages[0].angle
+            heads = "stable   worst Ms   resonance   crossover   delay margin   torque   noise"
+            heads += "   Ms held" if relaxed else ""
+            heads += "" if angle is None else "   Ms angle"
+            lines += ["", f"{'on fresh plants':<20} {heads}"]
+            for name, stage in zip(WAYS, self.stages, strict=False):
+                row = (
+                    f"{name:<20} {100 * stage.stable:5.1f} % {stage.peak:9.2f} "
+                    f"{stage.resonance:9.2f}   {stage.crossover / (2 * np.pi):8.1f} Hz "
+                    f"{stage.margin_text:>9} ms {stage.rejection:8.2f} {stage.noise:7.2f}"
+                )
+                row += "" if stage.relaxed is None else f" {stage.relaxed:9.2f}"
+                lines.append(row + ("" if stage.angle is None else f" {stage.angle.peak:10.2f}"))
+            lines += [_OF_STAGES, *([_OF_HELD] if relaxed else [])]
+            if angle is not None:
+                flew = "as it flew" if angle.closed else "which was open in this flight"
+                which = f"{angle.parameter} {angle.value:.3g}, {flew}"
+                lines.append(f"(Ms angle: of the angle loop around it, {which})")
         throttle, curve = self.throttle, None
         if throttle is not None:
             curve = throttle.curve
@@ -214,28 +231,6 @@ _OF_STAGES = """(fresh plants: drawn from what the log leaves possible, not tune
 resonance: peaks of |S| and of the response to the set-point; torque: the rate after a step of
 torque, noise: that of the command, both over those of what flew)"""
 _OF_HELD = "(Ms held: without the integral, which iterm_relax holds while the set-point moves)"
-
-
-def _stage_table(stages: tuple[Stage, ...]) -> str:
-    first = stages[0]
-    relaxed = "   Ms held" if first.relaxed is not None else ""
-    around = "   Ms angle" if first.angle is not None else ""
-    heads = "stable   worst Ms   resonance   crossover   delay margin   torque   noise"
-    rows = [f"{'on fresh plants':<20} {heads}{relaxed}{around}"]
-    for name, stage in zip(WAYS, stages, strict=False):
-        row = (
-            f"{name:<20} {100 * stage.stable:5.1f} % {stage.peak:9.2f} {stage.resonance:9.2f} "
-            f"  {stage.crossover / (2 * np.pi):8.1f} Hz {stage.margin_text:>9} ms "
-            f"{stage.rejection:8.2f} {stage.noise:7.2f}"
-        )
-        row += "" if stage.relaxed is None else f" {stage.relaxed:9.2f}"
-        rows.append(row + ("" if stage.angle is None else f" {stage.angle.peak:10.2f}"))
-    rows += [_OF_STAGES, *([_OF_HELD] if relaxed else [])]
-    if (angle := first.angle) is not None:
-        flew = "as it flew" if angle.closed else "which was open in this flight"
-        which = f"{angle.parameter} {angle.value:.3g}, {flew}"
-        rows.append(f"(Ms angle: of the angle loop around it, {which})")
-    return "\n".join(rows)
 
 
 _ORDER: tuple[Kind, ...] = ("proposed", "kept", "not to be flown", "cannot tell")

@@ -134,67 +134,6 @@ def motion(
     return Past(measurement, change, command, jnp.minimum(past.samples + 1, 2)), equation
 
 
-class FilterState(NamedTuple):
-    past: Past
-    stages: tuple[Float[Array, " signals axes *ensemble"], ...]
-
-
-class MatchedFilters(eqx.Module):
-    """The equation of motion, every term of it through the same discrete low-pass filter.
-
-    `order` equal stages (1 - a) / (1 - a/z), a = exp(-bandwidth dt), so that the filtered equation
-    is as exact as the sampled one. The terms are 1, rate, angle (if `angle`), acceleration and
-    torque; the filtered 1 carries a constant disturbance through the start.
-    Source: Eq. (19) of the paper, discretised exactly (docs/equations.md). A filter of the rate
-    under zero-order hold, q0' = bandwidth (rate - q0), would bias the inertia by bandwidth dt / 2.
-    """
-
-    torque_gain: Gain = per_member(rank=1, converter=as_float)  # N m per unit of command
-    bandwidth: Float[Array, ""] = eqx.field(converter=as_float)  # rad/s
-    order: int = eqx.field(static=True)
-    dt: float = eqx.field(static=True)
-    angle: bool = eqx.field(static=True)
-
-    def __check_init__(self):
-        require_positive("bandwidth", self.bandwidth, "give rad/s, 10 for an encoder of 8192")
-        if self.order not in (1, 2, 3):
-            raise ValueError(
-                f"order is {self.order}: filter by 1, 2 or 3 stages; behind an encoder take 3."
-            )
-
-    @property
-    def signals(self) -> int:
-        return 5 if self.angle else 4
-
-    def init(self, like: Signal) -> FilterState:
-        stage = jnp.zeros((self.signals, *like.shape), like.dtype)
-        return FilterState(empty_past(like), (stage,) * self.order)
-
-    def __call__(
-        self, state: FilterState, command: Signal, measurement: Signal
-    ) -> tuple[FilterState, Float[Array, " signals axes *ensemble"]]:
-        """The filtered terms after one more sample."""
-        past, now = motion(state.past, self.torque_gain, command, measurement, self.dt)
-        middle = (now.rate, now.angle) if self.angle else (now.rate,)
-        terms = (jnp.ones_like(measurement), *middle, now.acceleration, now.torque)
-        out = now.valid * jnp.stack(terms)
-        leak = -jnp.expm1(-self.bandwidth * self.dt).astype(out.dtype)
-        stages = []
-        for stage in state.stages:
-            out = stage + leak * (out - stage)
-            stages.append(out)
-        return FilterState(past, tuple(stages)), out
-
-
-def has_settled(terms: Float[Array, " signals axes *ensemble"]) -> Signal:
-    """1 once the filter has forgotten its start, 0 before.
-
-    The first difference of a counted angle is wrong by up to a count per sample interval, which
-    the filter takes for a jump of the rate, 0.4 rad/s on the Hover.
-    """
-    return (terms[0] > 0.999).astype(terms.dtype)
-
-
 class ProbeState(NamedTuple):
     index: Int[Array, ""]  # samples
     exciting: Signal  # 1 while the tones are on

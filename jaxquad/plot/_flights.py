@@ -281,8 +281,9 @@ class Filters(Protocol):
 def filters_figure(
     chains: Mapping[str, Sequence[Filters]], *, ax: AxesLike = None, title: str = ""
 ) -> Panels:
-    """Draw magnitude and delay of filters over the frequency, in two panels: by the text of the
-    legend, of those that a signal passes one after the other.
+    """Draw magnitude and delay of filters over the frequency, in two panels.
+
+    `chains` are those that a signal passes one after the other, by the text of the legend.
     """
     level, delay = panels = lay.stacked(2, ax)
     highest = min(chain.rate_hz for group in chains.values() for chain in group) / 2

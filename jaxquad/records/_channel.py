@@ -170,7 +170,7 @@ def unwrap(counter: np.ndarray) -> tuple[np.ndarray, int]:
     return counter.astype(np.float64) + span * turns, int(wraps.sum())
 
 
-RepairedTime = tuple[Times, np.ndarray | None, str]  # stamps, which rows (None: all), a remark
+RepairedTime = tuple[np.ndarray, np.ndarray | None, str]  # stamps, which rows (None: all), a remark
 
 
 def repair_time(time: Times) -> RepairedTime:

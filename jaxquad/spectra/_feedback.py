@@ -111,8 +111,9 @@ def remarks_on_feedback(
             level = np.zeros(omega.size)
             level[coherent >= COHERENT] = share.output_first > _NEARLY_ALL
             moved = phase_slope(omega, values, doubt, level)
-            by_controller = moved is not None and moved.value * moved.span >= -_FALLS
-            by_controller = by_controller and moved.order >= -_LESS
+            by_controller = moved is not None and (
+                moved.value * moved.span >= -_FALLS and moved.order >= -_LESS
+            )
         if rises:
             where = used if by_controller else omega[slope.top]
             remarks.append(Remark(_RISES.format(lead=lead), where, pair, DOMINATED))

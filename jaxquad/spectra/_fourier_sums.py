@@ -310,10 +310,11 @@ class _Channel:
     def _running(self, waves: _Waves, edges: np.ndarray) -> Complex[np.ndarray, "waves edges"]:
         """Sums from the first of these blocks to before each of them."""
         running, count = np.zeros((len(waves.even), edges.size), complex), edges.size - 1
+        even, odd = self.coefficients
         groups = min(-(-(edges[-1] - edges[0]) // _AT_ONCE), count)
         for few in np.array_split(np.arange(count), groups) if count else ():
             used = slice(edges[few[0]], edges[few[-1] + 1])
-            sums = waves.sums(*(rows[:, used] for rows in self.coefficients), used)
+            sums = waves.sums(even[:, used], odd[:, used], used)
             running[:, few + 1] = np.add.reduceat(sums, edges[few] - used.start, axis=1)
         return np.cumsum(running, axis=1)
 
@@ -329,8 +330,8 @@ class _Channel:
             place = windows.place[windows.part]
             samples = (self.blocks[place] * windows.inside).T
             functions = _block_functions(self.shared.size, self.shared.reach)
-            few = [function.T @ samples for function in functions]
-            parts = [wave.sums(*few, place) for wave in (still, shifted)]
+            even, odd = (function.T @ samples for function in functions)
+            parts = [wave.sums(even, odd, place) for wave in (still, shifted)]
             running[:, windows.part] += np.concatenate(parts)
         plain = running[:, windows.last] - running[:, windows.first]
         return plain.reshape(3, -1, windows.start.size)

@@ -399,9 +399,10 @@ def frequency_response(
         estimate = average_windows(records, grid, estimator, method)
     else:
         check_excitation(records, method)
-        periodic = isinstance(estimator, Periodic)
-        of_records = estimate_periodic if periodic else estimate_local_polynomial
-        estimate = of_records(records, grid, estimator, method)
+        if isinstance(estimator, Periodic):
+            estimate = estimate_periodic(records, grid, estimator, method)
+        else:
+            estimate = estimate_local_polynomial(records, grid, estimator, method)
 
     def find_remarks() -> tuple[Remark, ...]:
         from ._feedback import remarks_on_feedback

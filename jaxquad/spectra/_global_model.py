@@ -80,7 +80,9 @@ class GlobalModel(NamedTuple):
         """The modelled output at some bins, and its derivatives with respect to the parameters."""
         return self._output(bins.omega[rows], bins.values[rows, inputs].T, _owner(bins, rows))
 
-    def _output(self, omega: Grid, u: np.ndarray, owner: np.ndarray) -> tuple[np.ndarray, ...]:
+    def _output(
+        self, omega: Grid, u: np.ndarray, owner: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
         powers = powers_of((np.exp(-1j * omega * self.dt) - 1) / self.scale, self.order + 1)
         powers /= self.solved.denominator @ powers
         columns = columns_of(powers, u, owner)
@@ -360,10 +362,8 @@ def with_models(
     used = [(c, model) for c, model in enumerate(rest.models) if model is not None]
     if not used:
         return errors
-    omega, counts = (
-        errors.omega,
-        [0 if model is None else len(model.drive) for model in rest.models],
-    )
+    omega = np.asarray(errors.omega)
+    counts = [0 if model is None else len(model.drive) for model in rest.models]
     ends, inputs = np.cumsum([0, *counts]).tolist(), fit.response.shape[2]
     slopes = np.zeros((omega.size, len(counts), inputs, ends[-1]), complex)
     effect = np.nan_to_num(fit.effect)

@@ -108,19 +108,12 @@ def _table(rows: Sequence[Sequence[str]]) -> list[str]:
 
 
 class Bands(NamedTuple):
-    """One model fitted to the lower and to the upper half of the band; prints as a table.
+    """One model fitted to the lower and to the upper half of the band; prints as a table."""
 
-    **Attributes:**
-
-    - `full`, `lower`, `upper`: each a `jq.identify.Fit`; the halves are None where the solver
-      diverged.
-    - `split`: the frequency between them, in rad/s.
-    """
-
-    full: PyTree
-    lower: PyTree
+    full: PyTree  # `jq.identify.Fit`
+    lower: PyTree  # likewise, or None where the solver diverged
     upper: PyTree
-    split: float
+    split: float  # frequency between them, rad/s
 
     def overlap(self, name: str) -> bool | None:
         """Whether the 95 % intervals of both halves overlap; None where one determines nothing."""
@@ -150,9 +143,7 @@ class Bands(NamedTuple):
 
 
 def _determines(fit: PyTree, name: str) -> bool:
-    if not fit.verdict.fitted:
-        return False
-    return bool(fit.determined[fit.names.index(name)])
+    return bool(fit.verdict.fitted and fit.determined[fit.names.index(name)])
 
 
 def fit_bands(fit: PyTree) -> Bands:
@@ -252,16 +243,12 @@ class Candidate(NamedTuple):
 class Explanation(eqx.Module):
     """Structures that were tried on a misfit, and the one that the responses want, if any.
 
-    **Attributes:**
-
-    - `fit`: the one that was to be explained.
-    - `candidates`: what was tried, the best first.
-    - `best`: a `jq.identify.Fit` of the preferred structure, whose model is an `Extended` one; None
-      where no term lowers BIC by 6 or more.
+    `best` is a `jq.identify.Fit` of it, whose model is an `Extended` one; None where no term lowers
+    BIC by 6 or more.
     """
 
-    fit: PyTree
-    candidates: tuple[Candidate, ...]
+    fit: PyTree  # the one that was to be explained
+    candidates: tuple[Candidate, ...]  # what was tried, the best first
     best: PyTree
 
     @property

@@ -187,7 +187,7 @@ class FilteredPoint:
         misfits, slopes = np.zeros(0), np.zeros((0, z.size))
         if problem.base.quantities:
             [priors] = evaluate(problem.base, z)
-            misfits, slopes = priors.misfits, priors.slopes.T[:, : z.size]
+            misfits, slopes = priors.prior_misfits, priors.prior_slopes[:, : z.size]
         return FilteredPoint(problem, programs, z, records, misfits, slopes)
 
     @property
