@@ -153,9 +153,9 @@ def upper_bound(count: int, draws: int, *, level: float = 0.95) -> float:
 
 
 def share_interval(count: int, draws: int, *, level: float = 0.95) -> tuple[float, float]:
-    """The lower and the upper end of a share, outside of each of which the true one lies with
-    (1 - `level`) / 2 at most; arguments, source and errors as of `jq.tuning.upper_bound`.
+    """The lower and the upper end of a share; the true one lies beyond each with (1 - `level`) / 2.
 
+    Arguments, source and errors are those of `jq.tuning.upper_bound`.
     171 of 256 bound the share by 60.7 and 72.5 %, 1408 of 2000 by 68.3 and 72.4 %.
     """
     one_sided = 0.5 * (1 + level)
