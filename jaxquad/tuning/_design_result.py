@@ -153,11 +153,9 @@ def upper_bound(count: int, draws: int, *, level: float = 0.95) -> float:
 
 
 def share_interval(count: int, draws: int, *, level: float = 0.95) -> tuple[float, float]:
-    """The exact two-sided confidence interval of a share: its lower and its upper end.
+    """The lower and the upper end of a share; the true one lies beyond each with (1 - `level`) / 2.
 
-    The true share lies outside of each with (1 - `level`) / 2 at most. Arguments, source and errors
-    are those of `jq.tuning.upper_bound`.
-
+    Arguments, source and errors are those of `jq.tuning.upper_bound`.
     171 of 256 bound the share by 60.7 and 72.5 %, 1408 of 2000 by 68.3 and 72.4 %.
     """
     one_sided = 0.5 * (1 + level)

@@ -73,7 +73,7 @@ _FIRMWARE = re.compile(r"\b[A-Z][\w:]*\w V\d+\.\d+[^\0,]*")
 
 
 def _log(
-    messages: Iterable[tuple[_Format, Mapping[str, np.ndarray]]],
+    logged: Iterable[tuple[_Format, Mapping[str, np.ndarray]]],
     scaling: _Scaling,
     remarks: list[str],
     stamped: Stamped,
@@ -86,7 +86,7 @@ def _log(
     Their columns have their own scale `applied` or not; `texts` of VER and MSG name the firmware.
     """
     tables: dict[str, Table] = {}
-    for layout, rows in messages:
+    for layout, rows in logged:
         clock = next((name for name in layout.columns if name in _CLOCKS), None)
         if clock is None or clock not in rows:
             continue
@@ -262,7 +262,7 @@ def load(path: Path) -> Log:
             if kind in formats
         },
     )
-    messages = [
+    logged = [
         (layout, {name: rows[layout.name][name] for name in layout.columns})
         for layout in formats.values()
         if layout.name in rows and layout.name not in _ABOUT
@@ -275,7 +275,7 @@ def load(path: Path) -> Log:
     ]
     named = (*_cells(rows.get("VER"), "FWS"), *_cells(rows.get("MSG"), "Message"))
     texts = (_text(message) for (message,) in named)
-    return _log(messages, scaling, remarks, stamped, texts, applied=False)
+    return _log(logged, scaling, remarks, stamped, texts, applied=False)
 
 
 def _rows(
@@ -433,7 +433,7 @@ def load_text(path: Path) -> Log:
     }
     factors = {letter: number_in(text) for letter, text in mults.items()}
     factors = {letter: factor for letter, factor in factors.items() if 0 < factor < np.inf}
-    messages = []
+    logged = []
     for layout in formats:
         if layout.name not in lines or layout.name in _ABOUT:
             continue
@@ -450,7 +450,7 @@ def load_text(path: Path) -> Log:
             texts = zip(layout.columns, zip(*_split(fitting), strict=True), strict=True)
             columns = {name: np.array([number_in(cell) for cell in cells]) for name, cells in texts}
             columns = {name: x for name, x in columns.items() if np.isfinite(x).any()}
-        messages.append((layout, columns))
+        logged.append((layout, columns))
     remarks += [f"{skipped} lines that match no format were left out"] if skipped else []
     columns = next((layout.columns for layout in formats if layout.name == "PARM"), ())
     name, value = -2, -1  # Later versions log a parameter's default behind its value.
@@ -460,7 +460,7 @@ def load_text(path: Path) -> Log:
     timed = columns[:1] == ("TimeUS",)
     stamped = [(1e-6 * number_in(c[0]) if timed else None, c[name], c[value]) for c in cells]
     texts = (line.decode("latin-1") for name in ("VER", "MSG") for line in lines.get(name, []))
-    return _log(messages, _Scaling(units, factors, letters), remarks, stamped, texts, applied=True)
+    return _log(logged, _Scaling(units, factors, letters), remarks, stamped, texts, applied=True)
 
 
 def _lines(content: bytes) -> tuple[dict[str, list[bytes]], int]:
