@@ -93,6 +93,7 @@ def test_another_filter_of_the_derivative_is_refused(closed, fit):
     assert jq.autopilot.reproduce_flight(fit, law, closed, unit="deg/s").kind == "not flown"
 
 
+@pytest.mark.slow
 def test_a_filter_counts_in_the_law_and_in_what_was_logged(closed, fit):
     chain = FilterChain((PT1(200.0),), RATE)
     share = 1 - 1 / (1 + 2 * np.pi * 200.0 * DT)

@@ -71,6 +71,7 @@ def test_a_step_after_that_is_the_same_for_all_inertias_and_hardly_overshoots(st
     assert peaks[3.0][1] == pytest.approx(0.341, abs=0.02)
 
 
+@pytest.mark.slow
 def test_signals_are_recorded_for_every_member_and_sample(stepped):
     signals = stepped[1.6].signals
     assert set(signals) == {"disturbance", "b0", "inertia", "inertia_deviation"}
@@ -88,6 +89,7 @@ def test_the_disturbance_times_the_torque_gain_is_in_newton_metres_at_any_b0():
     np.testing.assert_allclose(GAIN * torque[late], 0.1, rtol=0.02)
 
 
+@pytest.mark.slow
 def test_the_probe_stays_within_the_controllers_limit():
     run = fly(adaptive(limit=0.2), reference=np.where(TIME >= 1.0, 0.5, 0.0))
     assert np.abs(run.command).max() == pytest.approx(0.2, rel=1e-12)

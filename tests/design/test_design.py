@@ -352,6 +352,7 @@ def test_what_no_excitation_can_tell_apart_is_named():
         design_of([])
 
 
+@pytest.mark.slow
 def test_information_grows_with_the_length_of_the_flight(sharp):
     slopes = np.ones((2, 1, 1), complex)
     unit = information_per_energy(slopes, np.full((2, 1, 1), 4.0 + 0j))

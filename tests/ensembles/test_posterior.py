@@ -104,6 +104,7 @@ def test_draws_of_logarithms_are_log_normal_and_never_negative():
     assert np.median(lag) == pytest.approx(fit.values[1], rel=0.01)
 
 
+@pytest.mark.slow
 def test_errors_widened_by_model_error_widen_the_draws():
     """A second lag that the model does not have."""
     truth = jq.TransferFunction([280.0], np.convolve([0.016, 1.0], [0.1, 1.0, 0.0]), 0.011)
@@ -257,6 +258,7 @@ def test_plants_are_drawn_from_an_attitude_axis_with_a_believed_inertia():
     assert spread(members.plant.lag) == pytest.approx(fit.standard_errors[2], rel=0.03)
 
 
+@pytest.mark.slow
 def test_a_plant_that_needs_what_is_not_determined_is_refused():
     with pytest.raises(
         jq.identify.UndeterminedError, match="inertia, torque_gain .*J_x, K_t.*believed="

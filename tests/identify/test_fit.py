@@ -157,6 +157,7 @@ def test_a_users_own_module_with_two_outputs_fits():
     assert fit.average_cost == pytest.approx(fit.cost / 2)
 
 
+@pytest.mark.slow
 def test_a_model_that_cannot_explain_the_response_says_so_and_widens_its_errors():
     frf = response_of(jq.LaggedIntegrator(280.0, 0.2, 0.011), seed=0)
     lacking = jq.fit(jq.LaggedIntegrator(280.0, 0.0, 0.02), frf, free=("gain", "delay"))

@@ -156,6 +156,7 @@ def test_points_of_no_weight_may_hold_anything():
     np.testing.assert_array_equal(dirty.z, clean.z)
 
 
+@pytest.mark.slow
 def test_a_member_that_is_no_minimum_says_so():
     _, responses = measured()
     short = solved(responses, max_steps=1)

@@ -99,6 +99,7 @@ def test_drawn_plants_scatter_as_the_band_says_and_follow_a_curve(found):
     assert b0.std() == pytest.approx(float(reach.high[0] - reach.low[0]) / 2 / 1.96, rel=0.1)
 
 
+@pytest.mark.slow
 def test_b0_at_hover_is_that_of_gain_and_lag(found):
     law = found.adrc_b0(0.4)
     rad = found.over(np.array([0.4])).value[0] * np.pi / 180

@@ -122,6 +122,7 @@ def test_a_tie_may_follow_an_earlier_one_and_no_later_one():
         jq.fit(START, response_of(TRUTH), tied=TIED | second | first, cost=ML)
 
 
+@pytest.mark.slow
 def test_each_pair_has_a_band_of_its_own():
     frf = response_of(TRUTH)
     fit = jq.fit(START, frf, tied=TIED, cost=ML, band={("y1", "u0"): (2.0, 10.0)})

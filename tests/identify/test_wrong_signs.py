@@ -73,6 +73,7 @@ class Leading:
         return (80.0 / (1j * omega) * np.exp(0.004j * omega))[:, None, None]
 
 
+@pytest.mark.slow
 def test_two_at_zero_have_errors_that_fit_their_limits():
     """A response that leads: the lag and the delay do the same to it, and both end at zero."""
     frf = response_of(Leading(), error=0.02, seed=0, omega=OMEGA)

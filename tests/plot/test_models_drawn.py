@@ -45,6 +45,7 @@ def lines(panel) -> dict[str, Any]:
     return {line.get_label(): line for line in panel.get_lines()}
 
 
+@pytest.mark.slow
 def test_a_fit_shows_its_points_its_model_and_what_it_did_not_use(fit):
     magnitude = jq.plot.bode(fit)[0]
     drawn = lines(magnitude)

@@ -65,6 +65,7 @@ HEADS = (b"", b"\xa3\x95\x80", b"ULog\x01\x12\x35", b"\x93NUMPY\x01\0", b"PK\x03
 SUFFIXES = (".npz", ".npy", ".mat", ".bin", ".log", ".ulg", ".csv", ".txt", ".bbl", "")
 
 
+@pytest.mark.slow
 @settings(
     max_examples=200,
     deadline=None,

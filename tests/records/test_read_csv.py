@@ -51,6 +51,7 @@ def test_odd_rows_are_what_they_are_row_by_row(tmp_path, monkeypatch, small_bloc
     assert agree(path, monkeypatch)
 
 
+@pytest.mark.slow
 def test_every_double_comes_back_bit_by_bit(tmp_path, monkeypatch):
     bits = np.random.default_rng(0).integers(0, 2**64, (20_000, 3), dtype=np.uint64)
     numbers = bits.view(np.float64)

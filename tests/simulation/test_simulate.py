@@ -186,6 +186,7 @@ def test_without_an_injection_a_record_has_no_reference():
     assert idle.record("roll").reference_names == ()
 
 
+@pytest.mark.slow
 def test_a_record_is_of_one_member_and_of_an_axis_that_exists():
     found = fleet()
     np.testing.assert_array_equal(

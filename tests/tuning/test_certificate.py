@@ -118,6 +118,7 @@ def test_a_design_within_its_limits_holds_and_says_what_that_proves():
     assert convergence == "  --   CONVERGENCE: the gains were given, not tuned here"
 
 
+@pytest.mark.slow
 def test_a_missed_limit_is_named_first_with_how_much_and_in_which_member():
     limits = (
         Limit("itae", at_most=np.radians(100.0), over=Mean()),

@@ -28,6 +28,7 @@ def test_the_worst_take_the_places_of_others():
         np.testing.assert_array_equal(pick(found), [c[2], b[0], a[2], a[3], a[4], c[4]])
 
 
+@pytest.mark.slow
 def test_members_are_taken_from_several_draws_with_the_noise_that_is_theirs():
     drawn = [ensemble().draw(loop(), 6, jax.random.key(seed)) for seed in range(3)]
     places = [(2, 1), (0, 5), (2, 0), (0, 2)]

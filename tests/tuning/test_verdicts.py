@@ -54,6 +54,7 @@ def test_a_controller_that_is_saturated_all_the_time_is_no_performance():
     assert "24 of 24 members have the command at its limit for more than a quarter" in text
 
 
+@pytest.mark.slow
 def test_doing_nothing_is_the_flight_of_the_plant_alone():
     """A step of 4 deg for 1 s, then the clock of ITAE starts again: 2 deg s^2 each, undisturbed."""
     found = flown(jq.LADRC(4.0, 20.0, 1.0), limit=10.0)

@@ -34,6 +34,7 @@ def results(out: Path) -> dict[str, dict]:
     return {path.stem: json.loads(path.read_text()) for path in out.glob("results/*.json")}
 
 
+@pytest.mark.slow
 def test_ten_thousand_logs_are_planned_and_none_is_opened(tmp_path):
     for k in range(10_000):
         os.close(os.open(tmp_path / f"flight_{k:05}.bin", os.O_CREAT))

@@ -128,6 +128,7 @@ def test_the_sum_of_lag_and_delay_has_its_unit_in_the_report(folder):
     assert row and re.sub(r"<[^>]+>", " ", row[1]).split()[0] == "s"
 
 
+@pytest.mark.slow
 def test_a_stored_model_is_that_of_the_fit(found, folder):
     stored = load_result(folder / "result.json")
     assert stored.band == pytest.approx(found.band) and stored.doubts == ()
