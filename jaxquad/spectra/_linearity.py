@@ -322,7 +322,7 @@ def _say_change(left: _LeftOver, omega: Grid, method: Method) -> str:
 
 def _say_harmonics(
     records: Sequence[Record],
-    tones: Sequence[Tone],
+    tones: Sequence[np.ndarray],
     omega: Grid,
     response: OfInputs,
     pair: tuple[int, int],

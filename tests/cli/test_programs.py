@@ -73,4 +73,4 @@ def test_a_tune_of_a_stored_result_compiles_at_most_40_programs(command, tmp_pat
     sizes = ["--members", "16", "--fresh", "32", "--duration", "2"]
     plant = ["--inertia", "0.05", "--limit", "1"]
     found = programs(command, "tune", str(tmp_path), *plant, *sizes)
-    assert len(found) <= 40, found
+    assert len(found) <= 40, " ".join(found)

@@ -297,7 +297,7 @@ def _frame(
     return frame, scaled, scaled.b0.value
 
 
-def _third(before: Design, designs: Designs) -> Designs:
+def _third(before: Design, designs: Float[np.ndarray, "*designs 3"]) -> np.ndarray:
     return before + 1 / 3 * (designs - before)
 
 
