@@ -149,14 +149,13 @@ class Tuner:
             limited = linear_loops(wide, self.devices)
             self.problem = dataclasses.replace(self.problem, limited=limited)
         wanted = self.objective.quantities | {limit.quantity for limit in self.limits}
-        steps = find_steps(self.problem.flight.reference, self.problem.parts)
-        if "overshoot" in wanted and not np.any(
-            np.asarray(steps.is_single & (steps.target != steps.before))
-        ):
-            raise ValueError(
-                "overshoot is wanted, but the reference makes no step from event to event: give a "
-                "scenario with one, and its times as Objective(events=...)"
-            )
+        if "overshoot" in wanted:
+            steps = find_steps(self.problem.flight.reference, self.problem.parts)
+            if not np.any(np.asarray(steps.is_single & (steps.target != steps.before))):
+                raise ValueError(
+                    "overshoot is wanted, but the reference makes no step from event to event: "
+                    "give a scenario with one, and its times as Objective(events=...)"
+                )
         count, everyone = len(start), np.ones(len(start), bool)
         self.objectives, self.stacked = objectives, stack_copies(self.aims, count)
         sizes = [count_members(self.problem, limit) for limit in self.limits]
