@@ -192,7 +192,7 @@ def _replayed(flown: FlownLoop, rows: _Row):
 
 
 @eqx.filter_jit
-def _flown_again(flown: FlownLoop, step: tuple[Array, ...], wait: int, rows: _Row):
+def _flown_again(flown: FlownLoop, step: tuple[Array | np.ndarray, ...], wait: int, rows: _Row):
     zero = jnp.zeros_like(rows.setpoint[0])
     queue = jnp.zeros((wait + 1, *zero.shape))
     matrix, before, now = map(jnp.asarray, step)

@@ -1,7 +1,5 @@
 """What varies between the members of an ensemble, and how they are drawn."""
 
-from typing import Any
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -99,10 +97,6 @@ def _require_key(n: int, key: Key[Array, ""]) -> None:
 _FRESH = 0x5EED  # folded into the key of members that certify what was tuned on others
 
 
-def _optional() -> Any:
-    return eqx.field(converter=distribution_or_none, default=None, kw_only=True)
-
-
 class Ensemble(eqx.Module):
     """What varies between the members of an ensemble; a `jq.Loop` holds what is nominal.
 
@@ -152,13 +146,25 @@ class Ensemble(eqx.Module):
     inertia: Distribution = eqx.field(converter=as_distribution, default=1.0, kw_only=True)
     torque_gain: Distribution = eqx.field(converter=as_distribution, default=1.0, kw_only=True)
     assumed_inertia: Distribution = eqx.field(converter=as_distribution, default=1.0, kw_only=True)
-    lag: Distribution | None = _optional()
-    delay: Distribution | None = _optional()
-    damping: Distribution | None = _optional()
-    stiffness: Distribution | None = _optional()
-    coulomb: Distribution | None = _optional()
-    noise: Distribution | None = _optional()
-    gust: Distribution | None = _optional()
+    lag: Distribution | None = eqx.field(converter=distribution_or_none, default=None, kw_only=True)
+    delay: Distribution | None = eqx.field(
+        converter=distribution_or_none, default=None, kw_only=True
+    )
+    damping: Distribution | None = eqx.field(
+        converter=distribution_or_none, default=None, kw_only=True
+    )
+    stiffness: Distribution | None = eqx.field(
+        converter=distribution_or_none, default=None, kw_only=True
+    )
+    coulomb: Distribution | None = eqx.field(
+        converter=distribution_or_none, default=None, kw_only=True
+    )
+    noise: Distribution | None = eqx.field(
+        converter=distribution_or_none, default=None, kw_only=True
+    )
+    gust: Distribution | None = eqx.field(
+        converter=distribution_or_none, default=None, kw_only=True
+    )
     gust_corner: float = eqx.field(static=True, default=2.0, kw_only=True)  # rad/s
     payload: Payload | None = eqx.field(default=None, kw_only=True)
     sampling: str = eqx.field(static=True, default="latin", kw_only=True)

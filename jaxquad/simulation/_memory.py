@@ -3,6 +3,7 @@
 import contextlib
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -32,8 +33,8 @@ def size_of(tree: PyTree) -> int:
     return sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(tree) if isinstance(x, _SIZED))
 
 
-def free_memory(device: jax.Device) -> float | None:
-    """In bytes; of the host for a CPU, and of what a container may use of it."""
+def free_memory(device: Any) -> float | None:
+    """Of a `jax.Device` in bytes; of the host for a CPU, and of what a container may use of it."""
     if device.platform != "cpu":
         stats = device.memory_stats() or {}
         limit = stats.get("bytes_limit")

@@ -131,10 +131,22 @@ def simulate(loop: Loop, scenario: Scenario, *, devices: DeviceChoice = None) ->
     check_run(loop, scenario)
     run, places = placed(loop, scenario, devices)
     flown = over_cores(_run, run, (), places, check=_require_room)
-    ((angle, *others), diverged), authority = flown
+    (stored, diverged), authority = flown
+    angle, measurement, command, saturated, signals = stored
     warn_beyond_authority(authority, scenario)
     time = _times(loop.dt, angle.shape[0], angle.dtype)
-    return Simulation(time, angle, *others, diverged, scenario, dt=loop.dt, authority=authority)
+    return Simulation(
+        time,
+        angle,
+        measurement,
+        command,
+        saturated,
+        signals,
+        diverged,
+        scenario,
+        loop.dt,
+        authority,
+    )
 
 
 @ft.lru_cache(maxsize=8)
@@ -149,7 +161,7 @@ _Flown = tuple[tuple[PyTree, Bool[Array, "*ensemble"]], Authority | None]
 @Jit
 def _run(loop: Loop, scenario: Scenario, devices: Devices | None = None) -> _Flown:
     drive_authority = find_authority(loop.plant, loop.drive, loop.controller)
-    store = lambda run, _: scan_loop(*run, _Store())[1:]
+    store = lambda run, _: scan_loop(run[0], run[1], _Store())[1:]
     stored, running = loop_over_devices(store, (loop, scenario), None, devices)
     result = (stored, ~running), drive_authority
     _require_room(result)

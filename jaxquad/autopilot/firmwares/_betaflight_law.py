@@ -1,7 +1,7 @@
 """Betaflight's PID, its proposed ADRC, its angle mode, and what changes them in flight."""
 
 import dataclasses
-from typing import ClassVar, Literal
+from typing import ClassVar, Literal, TYPE_CHECKING
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -115,7 +115,10 @@ class BetaflightRate(RateLoop):
     firmware: ClassVar[str] = "betaflight"
     feed_forward: ClassVar[tuple[str, ...]] = ("f",)
     of_sticks: ClassVar[bool] = True
-    filters: eqx.AbstractVar[tuple[Filter, ...]]  # of the gyro, at the loop's rate
+    if TYPE_CHECKING:
+
+        @property
+        def filters(self) -> tuple[Filter, ...]: ...  # of the gyro, at the loop's rate
 
     def gyro_chains(self) -> list[FilterChain]:
         return [self.gyro, FilterChain(self.filters, 1 / self.dt)] if self.filters else [self.gyro]
