@@ -12,6 +12,9 @@ import jaxquad as jq
 from jaxquad.autopilot import BetaflightPID, FilterChain, PT1
 
 
+pytestmark = pytest.mark.slow
+
+
 RATE = 1000.0  # Hz, of gyro, loop and log
 DT, LAG, GAIN, LATE = 1 / RATE, 0.025, 60.0, 3  # s, s, deg/s^2 per pidsum, samples
 P, I, D, CUTOFF = 45.0, 80.0, 30.0, 105.0
@@ -59,7 +62,6 @@ def closed(log):
     return jq.frequency_response(chosen, 2 * np.pi * np.geomspace(1.0, 50.0, 30))
 
 
-@pytest.mark.slow
 def test_the_loop_that_flew_is_reproduced_within_the_errors(log, fit):
     found = jq.autopilot.reproduce_flight(fit, LAW, log, unit="deg/s")
     assert found.kind == "flown" and "is the one that flew" in str(found)
@@ -69,7 +71,6 @@ def test_the_loop_that_flew_is_reproduced_within_the_errors(log, fit):
     assert content["kind"] == "flown"
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("factor", [0.8, 1.25])
 def test_other_gains_are_refused_with_the_factor_between_them(closed, fit, factor):
     law = dataclasses.replace(LAW, p=factor * P, i=factor * I, d=factor * D)
@@ -78,7 +79,6 @@ def test_other_gains_are_refused_with_the_factor_between_them(closed, fit, facto
     assert found.scale == pytest.approx(1 / factor, rel=0.1)  # of first order in the factor
 
 
-@pytest.mark.slow
 def test_a_plant_that_is_not_explained_does_not_say_that_other_gains_flew(closed, fit):
     law = dataclasses.replace(LAW, p=1.25 * P, i=1.25 * I, d=1.25 * D)
     doubtful = dataclasses.replace(fit, chi_squared=4.8)
@@ -87,13 +87,11 @@ def test_a_plant_that_is_not_explained_does_not_say_that_other_gains_flew(closed
     assert "fly a chirp" in found.verdict and "is not the one" not in found.verdict
 
 
-@pytest.mark.slow
 def test_another_filter_of_the_derivative_is_refused(closed, fit):
     law = dataclasses.replace(LAW, dterm=(PT1(CUTOFF / 3),))
     assert jq.autopilot.reproduce_flight(fit, law, closed, unit="deg/s").kind == "not flown"
 
 
-@pytest.mark.slow
 def test_a_filter_counts_in_the_law_and_in_what_was_logged(closed, fit):
     chain = FilterChain((PT1(200.0),), RATE)
     share = 1 - 1 / (1 + 2 * np.pi * 200.0 * DT)

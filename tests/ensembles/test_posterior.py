@@ -16,6 +16,9 @@ import jaxquad as jq
 from jaxquad.ensembles import Ensemble, LogUniform, make_plant, Normal, Posterior, Uniform
 
 
+pytestmark = pytest.mark.slow
+
+
 ML, KEY = jq.identify.MaximumLikelihood(), jax.random.key(0)
 RIG = jq.models.AttitudeAxis(L=0.197, K_t=0.1188, J_x=0.0552, lag=0.02)
 START = jq.models.AttitudeAxis(L=0.197, K_t=0.2, J_x=0.1, lag=0.03)
@@ -82,7 +85,6 @@ def spread(values):
     return float(np.std(np.asarray(values)))
 
 
-@pytest.mark.slow
 def test_draws_have_the_mean_and_covariance_of_the_fit():
     fit = sharp_fit()
     drawn = fit.ensemble(MANY, KEY)
@@ -94,7 +96,6 @@ def test_draws_have_the_mean_and_covariance_of_the_fit():
     np.testing.assert_allclose(cov, fit.correlation, atol=0.03)
 
 
-@pytest.mark.slow
 def test_draws_of_logarithms_are_log_normal_and_never_negative():
     fit = integrator_fit(error=0.2)
     lag = np.asarray(fit.ensemble(MANY, KEY).lag)
@@ -104,7 +105,6 @@ def test_draws_of_logarithms_are_log_normal_and_never_negative():
     assert np.median(lag) == pytest.approx(fit.values[1], rel=0.01)
 
 
-@pytest.mark.slow
 def test_errors_widened_by_model_error_widen_the_draws():
     """A second lag that the model does not have."""
     truth = jq.TransferFunction([280.0], np.convolve([0.016, 1.0], [0.1, 1.0, 0.0]), 0.011)
@@ -114,7 +114,6 @@ def test_errors_widened_by_model_error_widen_the_draws():
     assert spread(drawn.gain) == pytest.approx(fit.standard_errors[0], rel=0.05)
 
 
-@pytest.mark.slow
 def test_only_what_is_free_or_tied_gets_a_last_axis():
     """And a parameter that may cross zero is drawn as it is."""
     free = ("K_t", jq.identify.Real("K_af", scale=1e-2))
@@ -128,7 +127,6 @@ def test_only_what_is_free_or_tied_gets_a_last_axis():
     assert drawn.K_af.min() < 0 < drawn.K_af.max()
 
 
-@pytest.mark.slow
 def test_elements_of_an_array_are_drawn_in_place():
     fit = transfer_function_fit()
     drawn = fit.ensemble(MANY, KEY)
@@ -143,7 +141,6 @@ def test_the_key_alone_decides_the_draws():
     assert not np.intersect1d(one.lag, other.lag).size
 
 
-@pytest.mark.slow
 def test_what_is_not_determined_is_not_drawn():
     with pytest.raises(
         jq.identify.UndeterminedError, match=r"J_x, K_t \(only L K_t / J_x is\).*jq.identify.Prior"
@@ -151,7 +148,6 @@ def test_what_is_not_determined_is_not_drawn():
         ratio_fit().ensemble(5, KEY)
 
 
-@pytest.mark.slow
 def test_held_directions_leave_the_spread_of_what_is_determined():
     fit = ratio_fit()
     drawn = fit.ensemble(MANY, KEY, hold_undetermined=True)
@@ -210,7 +206,6 @@ def test_a_parameter_at_zero_is_drawn_on_its_side_of_it():
     assert np.sqrt(np.mean(drawn**2)) == pytest.approx(fit.standard_errors[2], rel=0.05)
 
 
-@pytest.mark.slow
 def test_the_truth_lies_in_the_range_of_the_draws_as_often_as_it_should():
     """Of 100 records the 95 % range of b holds the truth in 95, known to 2.2."""
     held = 0
@@ -246,7 +241,6 @@ def posterior_of(fit, **options) -> Around:
     return Around(loop, Ensemble(posterior, **distributions))
 
 
-@pytest.mark.slow
 def test_plants_are_drawn_from_an_attitude_axis_with_a_believed_inertia():
     fit = ratio_fit()
     members = posterior_of(fit, believed=0.0552).draw(4096, KEY)
@@ -258,7 +252,6 @@ def test_plants_are_drawn_from_an_attitude_axis_with_a_believed_inertia():
     assert spread(members.plant.lag) == pytest.approx(fit.standard_errors[2], rel=0.03)
 
 
-@pytest.mark.slow
 def test_a_plant_that_needs_what_is_not_determined_is_refused():
     with pytest.raises(
         jq.identify.UndeterminedError, match="inertia, torque_gain .*J_x, K_t.*believed="
@@ -296,7 +289,6 @@ def test_factors_multiply_what_is_drawn_and_the_inertia_told_is_the_believed_one
     assert np.std(error) == pytest.approx(0.1, rel=0.05)
 
 
-@pytest.mark.slow
 def test_a_transfer_function_and_a_lagged_integrator_give_the_same_plants():
     fits = sharp_fit(), transfer_function_fit()
     ours, theirs = (posterior_of(fit, believed=0.05).draw(1024, KEY) for fit in fits)
@@ -308,7 +300,6 @@ def test_a_transfer_function_and_a_lagged_integrator_give_the_same_plants():
     assert np.mean(ours.plant.gain) == pytest.approx(fits[0].values[0], rel=1e-3)
 
 
-@pytest.mark.slow
 def test_a_model_of_ones_own_with_such_a_transfer_function_is_drawn_like_it():
     frf = response_of(INTEGRATOR, error=0.01, seed=0, omega=WIDE)
     fits = sharp_fit(), jq.fit(Rotor(280.0, 0.02, 0.02), frf, cost=ML)

@@ -12,6 +12,9 @@ from jaxquad.autopilot import adrc_b0
 from jaxquad.identify import curve_of_parameter, throttle_levels
 
 
+pytestmark = pytest.mark.slow
+
+
 DT = 0.004
 LAG, DELAY, CURVE, SLOPE = 0.025, 0.004, 0.55, 80.0  # s, s, -, deg/s^2 per unit of command
 LEVELS = (0.25, 0.4, 0.6)
@@ -55,7 +58,6 @@ def found():
     return identify(flight())
 
 
-@pytest.mark.slow
 def test_stretches_are_where_each_level_was_flown(found):
     assert len(found.stretches) == found.throttle.size
     for spans, seconds in zip(found.stretches, found.seconds, strict=True):
@@ -64,7 +66,6 @@ def test_stretches_are_where_each_level_was_flown(found):
     np.testing.assert_allclose(starts, SECONDS * np.arange(3), atol=0.05)
 
 
-@pytest.mark.slow
 def test_gains_lag_delay_and_curve_are_recovered_within_their_errors(found):
     np.testing.assert_allclose(found.throttle, LEVELS, atol=0.005)
     assert np.all(np.abs(found.gain - gain(found.throttle)) < 3.5 * found.gain_errors)
@@ -75,7 +76,6 @@ def test_gains_lag_delay_and_curve_are_recovered_within_their_errors(found):
     assert abs(found.curve.value - CURVE) < 3.5 * found.curve.standard_error < 0.1
 
 
-@pytest.mark.slow
 def test_the_gain_between_the_levels_follows_the_curve_with_its_band(found):
     grid = np.linspace(0.25, 0.6, 8)
     band = found.over(grid)
@@ -85,7 +85,6 @@ def test_the_gain_between_the_levels_follows_the_curve_with_its_band(found):
     assert middle.value[0] == pytest.approx(found.b0(1).value, rel=0.02)
 
 
-@pytest.mark.slow
 def test_drawn_plants_scatter_as_the_band_says_and_follow_a_curve(found):
     grid = np.array([0.3, 0.45, 0.6])
     plants, band = found.draw(grid, 4000, seed=3), found.over(grid)
@@ -99,7 +98,6 @@ def test_drawn_plants_scatter_as_the_band_says_and_follow_a_curve(found):
     assert b0.std() == pytest.approx(float(reach.high[0] - reach.low[0]) / 2 / 1.96, rel=0.1)
 
 
-@pytest.mark.slow
 def test_b0_at_hover_is_that_of_gain_and_lag(found):
     law = found.adrc_b0(0.4)
     rad = found.over(np.array([0.4])).value[0] * np.pi / 180
@@ -157,7 +155,6 @@ def test_a_throttle_that_never_rests_says_what_to_fly():
         jq.identify.gain_over_throttle(record)
 
 
-@pytest.mark.slow
 def test_levels_that_are_close_or_single_hold_too_little_and_say_so():
     single = identify(flight((0.4,)))
     assert single.curve is None and single.b0(0).value > 0
@@ -169,7 +166,6 @@ def test_levels_that_are_close_or_single_hold_too_little_and_say_so():
         close.firmware_value("px4")
 
 
-@pytest.mark.slow
 def test_a_curve_that_the_firmware_inverts_already_is_found_again():
     record = flight()
     x = record.channel("throttle") / 1000
@@ -183,7 +179,6 @@ def test_a_curve_that_the_firmware_inverts_already_is_found_again():
     assert curve is not None and abs(curve.value - CURVE) < 3.5 * curve.standard_error
 
 
-@pytest.mark.slow
 def test_known_filters_are_divided_out():
     record = flight()
     smooth = lfilter([0.5], [1, -0.5], record.outputs[:, 0])

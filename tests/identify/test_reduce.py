@@ -10,6 +10,9 @@ import jaxquad as jq
 from jaxquad.models import imaginary
 
 
+pytestmark = pytest.mark.slow
+
+
 class Roll(eqx.Module):
     """Roll mode, perhaps with a spring and a lag: L / (s + p + k / s) / (T s + 1)."""
 
@@ -44,27 +47,23 @@ def reduced():
     return jq.identify.reduce_structure(START, measured(0.0, 0.0), free=FREE, cost=ML)
 
 
-@pytest.mark.slow
 def test_what_is_not_there_is_left_out(reduced):
     assert set(reduced.dropped) == {"spring", "lag"}
     assert reduced.fit.names == ("gain", "damping")
     assert reduced.fit.model.spring == 0 and reduced.fit.model.lag == 0
 
 
-@pytest.mark.slow
 def test_what_is_left_holds_the_truth(reduced):
     error = np.abs(reduced.fit.values - [6.0, 3.0]) / reduced.fit.standard_errors
     assert np.all(error < 3)
 
 
-@pytest.mark.slow
 def test_the_most_insensitive_goes_first(reduced):
     first = int(np.argmax(reduced.first.insensitivity))
     assert reduced.steps[0].parameter == reduced.first.names[first]
     assert reduced.steps[0].reason.startswith("I ")
 
 
-@pytest.mark.slow
 def test_the_protocol_is_printed(reduced):
     text = str(reduced)
     assert text.startswith("start: 4 parameters, J_ave")
@@ -72,7 +71,6 @@ def test_the_protocol_is_printed(reduced):
     assert "2 parameters left:" in text
 
 
-@pytest.mark.slow
 def test_what_is_there_is_kept_and_the_protocol_says_so():
     # A Cramer-Rao limit that every parameter exceeds: all are tried.
     found = jq.identify.reduce_structure(
@@ -86,7 +84,6 @@ def test_what_is_there_is_kept_and_the_protocol_says_so():
     assert gone["lag"] == "kept: needed"
 
 
-@pytest.mark.slow
 def test_a_rise_that_is_allowed_drops_what_the_criterion_would_keep():
     frf = measured(0.0, 0.003, seed=2)
     strict = jq.identify.reduce_structure(

@@ -12,6 +12,9 @@ from jaxquad.models import StateSpace
 from jaxquad.plot import compare, headless
 
 
+pytestmark = pytest.mark.slow
+
+
 DT = 0.01
 MODEL = jq.LaggedIntegrator(30.0, 0.05, 0.03)  # the delay is three samples
 TIME = np.arange(1500) * DT
@@ -27,7 +30,6 @@ def flight(seed=0, noise=0.0):
     return u, y + noise * rng.standard_normal(TIME.size)
 
 
-@pytest.mark.slow
 def test_a_true_model_fits_entirely():
     u, y = flight()
     check = jq.verify(MODEL, jq.Record(TIME, u, y), hold="zero")
@@ -35,7 +37,6 @@ def test_a_true_model_fits_entirely():
     assert check.tic < 1e-8 and check.rms < 1e-8
 
 
-@pytest.mark.slow
 def test_input_bias_and_reference_shift_are_estimated():
     """A bias of the input drifts through the integrator; the output starts anywhere."""
     u, y = flight()
@@ -68,7 +69,6 @@ def test_a_wrong_gain_shows():
     assert 70 < check.fit_percent < 90 and check.tic > 0.05
 
 
-@pytest.mark.slow
 def test_a_band_leaves_drift_out():
     u, y = flight()
     drift = 8 * np.sin(0.4 * TIME)
@@ -102,7 +102,6 @@ def test_models_and_bands_that_cannot_be_verified_are_refused():
         jq.verify(MODEL, two)
 
 
-@pytest.mark.slow
 def test_the_antx_model_verifies_on_the_other_flight(data):
     """Fitted on the PRBS flight, verified on the sweep flight, between 0.7 and 12 Hz."""
     band = (2 * np.pi * 0.7, 2 * np.pi * 12)
@@ -186,7 +185,6 @@ def test_a_drift_does_not_pass_for_a_fast_transient_at_the_start():
     assert np.ptp(wander) < 0.1 * np.std(check.measured - check.simulated)
 
 
-@pytest.mark.slow
 def test_a_fit_is_verified_in_the_band_that_it_used():
     u, y = flight(noise=0.02)
     fit = jq.fit(MODEL, jq.frequency_response(jq.Record(TIME, u, y, hold=DT)), band=(1.0, 30.0))

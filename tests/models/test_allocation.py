@@ -17,6 +17,9 @@ from jaxquad.models import (
 )
 
 
+pytestmark = pytest.mark.slow
+
+
 ARM, THRUST, TORQUE = 0.2, 0.12, 0.004
 FORWARD, LEFT, UP = np.eye(3)
 RIGHT = -LEFT
@@ -124,7 +127,6 @@ def test_a_motor_step_solves_its_differential_equation():
     np.testing.assert_array_equal(motor.step(start, command, 0.0), start)
 
 
-@pytest.mark.slow
 def test_the_hover_answers_with_the_gains_of_its_data_sheet():
     plant = quanser_hover(lag=None)
     still = jnp.zeros(3)

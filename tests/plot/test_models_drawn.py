@@ -12,7 +12,7 @@ from tuning_case import B, flight as case_flight, ladrc, loop as case_loop
 import jaxquad as jq
 
 
-pytestmark = pytest.mark.usefixtures("compiled_quickly")
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("compiled_quickly")]
 TRUTH = jq.LaggedIntegrator(280.0, 0.016, 0.011)
 TWO = jq.StateSpace(F=[[-1.0, 1.0], [-10.0, -1.0]], G=[[1.0, 0.0], [0.0, 2.0]], H0=np.eye(2))
 
@@ -45,7 +45,6 @@ def lines(panel) -> dict[str, Any]:
     return {line.get_label(): line for line in panel.get_lines()}
 
 
-@pytest.mark.slow
 def test_a_fit_shows_its_points_its_model_and_what_it_did_not_use(fit):
     magnitude = jq.plot.bode(fit)[0]
     drawn = lines(magnitude)
@@ -59,7 +58,6 @@ def test_a_fit_shows_its_points_its_model_and_what_it_did_not_use(fit):
     np.testing.assert_allclose(reach, fit.response_band(np.array([omega])).decibels[0, 0, 0])
 
 
-@pytest.mark.slow
 def test_two_inputs_and_two_outputs_are_a_grid_of_all_pairs():
     panels = jq.plot.bode(TWO)
     names = [panel.get_ylabel() for panel in panels]
@@ -100,7 +98,6 @@ def test_the_step_response_of_a_first_order_lag_is_exponential():
     assert panel.get_xlabel() == "time, s" and panel.get_ylabel() == "answer to a unit step"
 
 
-@pytest.mark.slow
 def test_a_loop_is_drawn_open_closed_and_by_its_poles():
     loop = case_loop(ladrc(8.0, 25.0))
     [panel] = jq.plot.step(loop, duration=2.0)
@@ -194,7 +191,6 @@ def test_what_cannot_be_drawn_is_refused_with_what_to_give(record):
             draw(thing)
 
 
-@pytest.mark.slow
 def test_the_worst_members_of_a_certificate_fly_again_as_they_flew():
     from tuning_case import ensemble, equivalent
 

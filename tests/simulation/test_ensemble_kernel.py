@@ -15,6 +15,9 @@ from jaxquad.models import DecoupledAxes
 from jaxquad.simulation import evaluate, Pulse, run_ensemble, Saturation, scenario, simulate, Step
 
 
+pytestmark = pytest.mark.slow
+
+
 MEMBERS = 70  # one chunk, as all members are on a GPU
 QUICK = {"xla_backend_optimization_level": 0}
 GAINS = np.array([10.0, 30.0, 0.8478])

@@ -9,6 +9,9 @@ import jaxquad as jq
 from jaxquad.spectra import ErrorCovariance
 
 
+pytestmark = pytest.mark.slow
+
+
 FREQUENCIES, OUTPUTS, INPUTS, PARAMETERS = 70, 2, 3, 4
 WIDTH, ATOMS = 40, 9000
 SHAPE = (FREQUENCIES, OUTPUTS, INPUTS)
@@ -71,7 +74,6 @@ def plain():
     return plain_covariance(WHOLE).reshape(*SHAPE, *SHAPE)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("errors", (ERRORS, WHOLE), ids=("reach", "whole"))
 def test_all_forms_of_the_covariance_are_the_plain_one(errors, plain):
     for first, second in (((0, 0), (0, 0)), ((1, 2), (1, 2)), ((0, 1), (1, 2))):
@@ -86,7 +88,6 @@ def test_all_forms_of_the_covariance_are_the_plain_one(errors, plain):
     )
 
 
-@pytest.mark.slow
 def test_projections_and_pairs_do_not_depend_on_the_form(plain):
     columns = draw(np.random.default_rng(1), *SHAPE, 5)
     expected = WHOLE.project(columns)
@@ -95,7 +96,6 @@ def test_projections_and_pairs_do_not_depend_on_the_form(plain):
     np.testing.assert_allclose(one.between((0, 0), (0, 0)), 4 * plain[:, 1, 2, :, 1, 2], rtol=1e-9)
 
 
-@pytest.mark.slow
 def test_the_projection_is_the_variance_of_a_weighted_sum(plain):
     """The two columns are the real and the imaginary part of one sum."""
     columns = np.zeros((*SHAPE, 2), complex)

@@ -16,7 +16,7 @@ from jaxquad.report import write_json
 from jaxquad.tuning import certify, CVaR, Limit, Mean, paper_designs, peers, QUANTITIES, upper_bound
 
 
-pytestmark = pytest.mark.usefixtures("compiled_quickly")
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("compiled_quickly")]
 RIG = jq.DecoupledAxes([0.0468], [0.0552])
 MEMBERS, EVENTS = 24, (0.0, 1.0)
 FLIGHT = jq.scenario(
@@ -42,7 +42,6 @@ def certificate():
     return judged(peers=peers(RIG) | {"twin": FIXED})
 
 
-@pytest.mark.slow
 def test_members_are_unstable_where_the_eigenvalues_of_an_independent_loop_leave_the_circle(
     certificate,
 ):
@@ -58,7 +57,6 @@ def test_members_are_unstable_where_the_eigenvalues_of_an_independent_loop_leave
     assert 0 < certificate.designs["paper b0 = 3"].unstable_count < MEMBERS
 
 
-@pytest.mark.slow
 def test_itae_starts_its_clock_at_every_event_and_activity_does_not(certificate):
     members = OPEN.fresh(LOOP, MEMBERS, jax.random.key(3))
     flown = jq.simulate(
@@ -81,14 +79,12 @@ def test_itae_starts_its_clock_at_every_event_and_activity_does_not(certificate)
     np.testing.assert_allclose(found.of("overshoot"), 100 * np.maximum(*past), rtol=1e-6, atol=1e-9)
 
 
-@pytest.mark.slow
 def test_all_designs_meet_the_same_members_and_noise(certificate):
     own, twin = certificate.design, certificate.designs["twin"]
     for name, values in own.by_axis.items():
         np.testing.assert_array_equal(twin.by_axis[name], values)
 
 
-@pytest.mark.slow
 def test_the_members_are_fresh_and_those_of_the_key(certificate):
     trained = OPEN.draw(LOOP, MEMBERS, jax.random.key(3))
     seen = np.asarray(trained.assumed_inertia)[0]
@@ -100,7 +96,6 @@ def test_the_members_are_fresh_and_those_of_the_key(certificate):
     assert certificate.provenance["key"] == jax.random.key_data(jax.random.key(3)).tolist()
 
 
-@pytest.mark.slow
 def test_a_design_within_its_limits_holds_and_says_what_that_proves():
     limits = (Limit("sensitivity_peak", at_most=10.0), Limit("phase_margin", at_least=0.1))
     slow = jq.LADRC(4.0, 20.0, 1.0)
@@ -118,7 +113,6 @@ def test_a_design_within_its_limits_holds_and_says_what_that_proves():
     assert convergence == "  --   CONVERGENCE: the gains were given, not tuned here"
 
 
-@pytest.mark.slow
 def test_a_missed_limit_is_named_first_with_how_much_and_in_which_member():
     limits = (
         Limit("itae", at_most=np.radians(100.0), over=Mean()),
@@ -202,7 +196,6 @@ def test_a_bound_of_0_and_a_margin_that_is_any_are_printed_as_such():
     assert str(any_gain).startswith("gain margin up, worst, at least 3.522 dB: any, met, 0 of 24")
 
 
-@pytest.mark.slow
 def test_a_payload_counts_in_the_linear_loop():
     """LADRC(10, 30, 0.848) is stable for b/b0 from 0.216: not with six times the inertia."""
     carrying = lambda added: Ensemble(payload=Payload(added, at=0.5))
@@ -252,7 +245,6 @@ def test_every_quantity_that_can_be_limited_is_computed_and_printed(certificate)
         certificate.design.of("mass")
 
 
-@pytest.mark.slow
 def test_a_loop_too_fast_for_its_lag_is_told_so():
     """wo/wc is 3; a PID has no such bound."""
     lag = lambda seconds: Ensemble(lag=seconds, delay=0.004)
