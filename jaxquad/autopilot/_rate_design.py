@@ -176,9 +176,13 @@ class _Design:
         return FilterBank(self.choices, self.flown.law, self.noise, loops.omega)
 
     def flown_filters(self, names: Mapping[str, float]) -> dict[str, float]:
-        """What flew of these filters."""
-        flown = {}
-        for choice in self.choices if names else ():
+        """What flew of these filters; a notch may be for a line of another axis alone."""
+        if not names:
+            return {}
+        kind, flown = firmware_named(self.flown.firmware), {}
+        for pair, values in zip(kind.notches, kind.flown_notches(self.flown.values), strict=False):
+            flown |= dict(zip(pair, values, strict=True))
+        for choice in self.choices:
             flown |= choice.flown_parameters
         return {name: flown[name] for name in names}
 

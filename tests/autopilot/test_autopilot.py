@@ -13,9 +13,9 @@ from px4_flights import GYRO_HZ as SAMPLED_HZ, Vehicle, write_log
 from scipy import signal
 
 from jaxquad._core import Message
-from jaxquad.autopilot import AutopilotProposal, betaflight_loop, px4_loop
+from jaxquad.autopilot import AutopilotProposal, betaflight_loop, design_gains, px4_loop
 from jaxquad.cli import main
-from jaxquad.workflows import AutopilotSettings, SettingsError
+from jaxquad.workflows import autopilot, AutopilotSettings, SettingsError
 
 
 VEHICLE = Vehicle()
@@ -278,6 +278,22 @@ def test_a_line_of_the_gyro_gets_a_notch_and_the_low_passes_open(tmp_path, capsy
     at = np.array([2 * np.pi * 5.0])
     late = [-np.angle(gyro_of(x, at))[0] for x in ({}, new)]
     assert late[1] <= late[0]
+
+
+@pytest.mark.slow
+def test_a_notch_for_the_line_of_another_axis_is_taken_where_this_one_has_no_line(tmp_path):
+    flown = fly_betaflight(gyro_hz=GYRO_HZ)
+    off = {"gyro_lpf1_static_hz": "80", "gyro_notch_hz": "0,0", "gyro_notch_cutoff": "0,0"}
+    path = write_blackbox(tmp_path / "flight.bbl", flown, off)
+    roll = autopilot(path, AutopilotSettings(axis="roll"))
+    assert isinstance(roll, AutopilotProposal)
+    notch = {"gyro_notch1_hz": float(LINE[0]), "gyro_notch1_cutoff": float(LINE[0] - 20)}
+    again = design_gains(roll, notch)
+    assert again.filters is not None and again.filters.flown == {
+        "gyro_notch1_hz": 0.0,
+        "gyro_notch1_cutoff": 0.0,
+    }
+    assert again.new["gyro_notch1_hz"] == LINE[0]
 
 
 @pytest.mark.slow
