@@ -98,7 +98,6 @@ def test_sizes_share_a_program(cores, calls):
     assert {width for _, width in calls} == {PART}
 
 
-@pytest.mark.slow
 def test_metrics_are_those_of_one_core(cores):
     found = []
     for count in (1, 3):
