@@ -5,7 +5,8 @@ import lazy_loader
 from .records._firmwares import offer
 
 
-for _name in ("ardupilot", "px4", "betaflight", "crazyflie"):
-    offer(_name, f"jaxquad.autopilot.firmwares._{_name}_log")
+_LOGS = dict(ardupilot="_logs", px4="_logs", betaflight="_betaflight_log", crazyflie="_logs")
+for _name, _module in _LOGS.items():
+    offer(_name, f"jaxquad.autopilot.firmwares.{_module}")
 
 __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -35,12 +35,6 @@ from ._flight_channels import (
     read_flown as read_flown,
     settings_of as settings_of,
 )
-from ._flown_law import (
-    flown_law as flown_law,
-    FlownLaw as FlownLaw,
-    loop_of_law as loop_of_law,
-    StoredFilters as StoredFilters,
-)
 from ._gains import (
     Cascade as Cascade,
     cascade_of as cascade_of,
@@ -55,6 +49,13 @@ from ._gains import (
     RateGains as RateGains,
     torque_per_unit as torque_per_unit,
 )
+from ._identified_log import (
+    flown_law as flown_law,
+    FlownLaw as FlownLaw,
+    loop_of_law as loop_of_law,
+    StoredFilters as StoredFilters,
+    study_throttle as study_throttle,
+)
 from ._law import (
     AngleLoop as AngleLoop,
     filter_gyro as filter_gyro,
@@ -66,7 +67,6 @@ from ._law import (
     RateLoop as RateLoop,
 )
 from ._law_check import check_law as check_law, check_loop as check_loop
-from ._over_throttle import study_throttle as study_throttle
 from ._page import (
     B0Section as B0Section,
     PilotPage as PilotPage,
@@ -130,10 +130,6 @@ from .firmwares._betaflight_adrc_result import (
     ADRCAutopilot as ADRCAutopilot,
     doubted_throttle as doubted_throttle,
 )
-from .firmwares._betaflight_demo import (
-    CHIRP_TRUTH as CHIRP_TRUTH,
-    write_chirp_log as write_chirp_log,
-)
 from .firmwares._betaflight_law import (
     adrc_b0 as adrc_b0,
     BetaflightADRC as BetaflightADRC,
@@ -143,6 +139,10 @@ from .firmwares._betaflight_law import (
     dynamic_cutoff as dynamic_cutoff,
     ItermRelax as ItermRelax,
     tpa_factor as tpa_factor,
+)
+from .firmwares._betaflight_log import (
+    CHIRP_TRUTH as CHIRP_TRUTH,
+    write_chirp_log as write_chirp_log,
 )
 from .firmwares._crazyflie import (
     CrazyflieAttitude as CrazyflieAttitude,

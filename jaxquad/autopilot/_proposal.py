@@ -14,8 +14,8 @@ from jaxquad.report import Provenance, provenance, write_json
 from ._filter_bank import GyroNoise
 from ._firmware import firmware_named
 from ._flight_channels import FlightChannels, FlownAutopilot, IdentifiedPlant
+from ._identified_log import ThrottleVerdict
 from ._law_check import LoopCheck
-from ._over_throttle import ThrottleVerdict
 from ._page import pilot_page, PilotPage, write_pilot_page
 from ._parameters import change_table, ParameterChange, propose_changes, ProposedParameters
 from ._rate_loops import PlantSource

@@ -38,7 +38,7 @@ from .._law import (
     Signal,
     split_reference,
 )
-from ._ardupilot_log import LOG
+from ._logs import ARDUPILOT as LOG
 
 
 class ArduPilotRate(RateLoop):

@@ -37,7 +37,7 @@ from ._betaflight_law import (
     P_SCALE,
     tpa_factor,
 )
-from ._betaflight_log import LOG
+from ._betaflight_log import BETAFLIGHT as LOG
 
 
 Ends = tuple[float, float, float]  # of a dynamic cutoff: lowest and highest in Hz, expo

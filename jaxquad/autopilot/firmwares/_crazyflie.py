@@ -34,7 +34,7 @@ from .._law import (
     split_reference,
     sum_of,
 )
-from ._crazyflie_log import LOG
+from ._logs import CRAZYFLIE as LOG
 
 
 class CrazyflieRate(RateLoop):

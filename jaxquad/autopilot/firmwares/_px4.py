@@ -39,7 +39,7 @@ from .._law import (
     split_reference,
     sum_of,
 )
-from ._px4_log import LOG
+from ._logs import PX4 as LOG
 
 
 _FADED = np.deg2rad(400.0)  # rad/s of error at which the integral no longer grows
