@@ -200,8 +200,8 @@ def number(value: float | np.floating, name: str, precision: Precision) -> str:
         most = "FLT_MAX" if precision == "float" else "DBL_MAX"
         return most if rounded > 0 else f"-{most}"
     text = str(rounded)  # the shortest that reads back
-    whole = not any(mark in text for mark in ".e")
-    return text + ".0" * whole + "f" * (precision == "float")
+    is_digits = not any(mark in text for mark in ".e")
+    return text + ".0" * is_digits + "f" * (precision == "float")
 
 
 def braced(values: Iterable[str]) -> str:

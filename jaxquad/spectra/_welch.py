@@ -12,14 +12,7 @@ from jaxtyping import Array, ArrayLike, Complex, Float
 from jaxquad._core import Message, one_blas_thread, require_x64
 from jaxquad.records import Record
 
-from ._estimators import (
-    adjoint,
-    check_band,
-    check_compatible,
-    Grid,
-    in_hertz,
-    Welch,
-)
+from ._estimators import adjoint, check_band, check_compatible, Grid, in_hertz, Welch
 from ._fourier_sums import (
     coefficients,
     fourier_sums,
