@@ -138,7 +138,7 @@ def read_channels_if_any(
     setup, axis, span = proposal.setup, AXES.index(proposal.setup.axis), _span(settings)
     filtered = [f"{prefix}{name}" for name in firmware.log.rates]
     setpoint, rate = f"{prefix}{firmware.log.setpoints[axis]}", filtered[axis]
-    names = firmware.channels(prefix, axis)
+    names = firmware.channels(prefix, axis, values)
     injected = {setup.reference: 1.0} if setup.injected_at == "mixer" else {}
     try:
         logged = frozenset(channel.name for channel in channels(path))
@@ -148,7 +148,7 @@ def read_channels_if_any(
         wanted += [*names.output, *names.stick, *names.mixed, *names.slewed, *injected]
         records = _read(path, logged, [*wanted, *setup.throttle], span)
         tracked_hz: dict[int, tuple[float, ...]] = {}
-        for mode, pattern in firmware.tracked_channels().items():
+        for mode, pattern in names.tracked.items():
             turned = sorted(name for name in logged if re.fullmatch(pattern, name))
             speeds = _read(path, logged, turned, (None, None)).items()
             medians = [_median(record, name, span) / 60 for name, record in speeds]
@@ -169,7 +169,7 @@ def read_channels_if_any(
     raw = records.get(unfiltered[axis]) if unfiltered else None
     motors = [name for name in names.motors if name in records]
     output, mixed, stick = sum_at(names.output), sum_at(names.mixed), sum_at(names.stick)
-    limit = firmware.output_limit(values, axis)
+    limit, (low, high) = names.output_limit, names.stick_ends
     external = not injected and setup.reference != setpoint and setup.reference in records
     return FlightChannels(
         rates=tuple(at_rate(name, _in_radians) for name in filtered if name in records),
@@ -189,10 +189,10 @@ def read_channels_if_any(
         else mixed - np.clip(output, -limit, limit),
         reference=at_rate(setup.reference) if external else None,
         motors=np.stack([at_rate(x) for x in motors], axis=1) if motors else None,
-        motor_ends=firmware.motor_ends(values), throttle=sum_at(setup.throttle),
-        stick=None if stick is None else firmware.stick_throttle(stick, values),
+        motor_ends=names.motor_ends, throttle=sum_at(setup.throttle),
+        stick=None if stick is None else np.clip((stick - low) / (high - low), 0.0, 1.0),
         slewed=sum_at(names.slewed), late=setup.late_s.get(setpoint, 0.0),
-        resolution=firmware.resolution(values),
+        resolution=names.resolution,
         names=(rate, "" if raw is None else unfiltered[axis]), tracked_hz=tracked_hz,
     )  # fmt: skip
 
@@ -327,7 +327,8 @@ def read_flown(
     values = firmware.with_hold(logged.values, setup.hold)
     tracked = {} if flight is None else flight.tracked_hz
     loop = firmware.flown_loop(values, logged.version, throttle=throttle, tracked_hz=tracked)
-    loop = firmware.levelled(loop) if setup.levelled else loop
+    if setup.levelled:
+        loop = dataclasses.replace(loop, law=loop.law.levelled())
     if not np.any(gains_of(loop.law, axis) > 0):
         raise ValueError(
             f"{path}: P, I and D of {setup.axis} are all 0, so there is no rate loop to tune"

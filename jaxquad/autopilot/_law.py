@@ -154,6 +154,10 @@ class RateLoop(FirmwareLoop):
         """The law as it acts on the logged rate: a plant up to that contains the filters."""
         return dataclasses.replace(self, gyro=FilterChain())
 
+    def levelled(self) -> "RateLoop":
+        """The law as it is inside an angle loop that was closed."""
+        return self
+
     def holds_integral(self, axis: int) -> bool:
         """Whether the integral can be held while the set-point moves (iterm_relax)."""
         return False
@@ -366,7 +370,13 @@ def law_responses(
     law: RateLoop, axis: int, omega: Float[np.ndarray, " frequencies"]
 ) -> Complex[np.ndarray, "2 frequencies"]:
     """From the set-point and from the rate, both in rad/s, to the command."""
-    linear = law.linear(axis)
+    return linear_responses(law.linear(axis), omega)
+
+
+def linear_responses(
+    linear: LinearController, omega: Float[np.ndarray, " frequencies"]
+) -> Complex[np.ndarray, "2 frequencies"]:
+    """Likewise, of one axis' linear form."""
     A, c = np.asarray(linear.A), np.asarray(linear.C)
     into = np.stack([linear.reference_in, linear.measurement_in], axis=1)
     through = np.array([linear.reference_through, linear.measurement_through])

@@ -14,17 +14,7 @@ from jaxquad._core import write_file
 from jaxquad.identify import GainBand
 from jaxquad.plot import FlownAgain, Spectrum, StepBand, ThrottleCurve
 from jaxquad.records import AXES
-from jaxquad.report import (
-    attempt,
-    Cell,
-    FAILED,
-    Headline,
-    Provenance,
-    provenance_section,
-    reason_of,
-    render_page,
-    Table,
-)
+from jaxquad.report import Cell, Headline, Provenance, Table
 
 from ._filter_bank import gyro_noise, GyroNoise, hann_spectra, NoNoise, SLOWEST
 from ._filters import FilterChain
@@ -92,19 +82,19 @@ def write_pilot_page(path: str | Path, *pages: PilotPage) -> Path:
     for page in pages:
         sections = {
             "changes": {"changes": page.changes, "stages": page.stages},
-            **{name: attempt(section, page) for name, section in SECTIONS.items()},
+            **{name: report.attempt(section, page) for name, section in SECTIONS.items()},
             "text": {"text": page.text} if page.text else None,
         }
-        sections |= {name: {FAILED: reason} for name, reason in page.failures.items()}
+        sections |= {name: {report.FAILED: reason} for name, reason in page.failures.items()}
         axes.append({
             "title": page.title, "headlines": list(page.headlines), "remarks": list(page.remarks),
             "sections": {name: section for name, section in sections.items() if section},
         })  # fmt: skip
-    text = render_page(
+    text = report.render_page(
         "pilot.html",
         title=f"{first.headlines[0].word}: {first.title}" if len(pages) == 1 else first.overview,
         axes=axes,
-        origin=None if origin is None else attempt(provenance_section, origin),
+        origin=None if origin is None else report.attempt(report.provenance_section, origin),
     )
     return write_file(path, text)
 
@@ -262,7 +252,7 @@ def pilot_page(proposal: "AutopilotProposal", origin: Provenance, overview: str)
         try:
             return compute()
         except Exception as error:  # the page holds the rest
-            failures[section] = reason_of(error)
+            failures[section] = report.reason_of(error)
             return missing
 
     def spectra() -> tuple[GyroNoise | None, Spectra, Spectra]:

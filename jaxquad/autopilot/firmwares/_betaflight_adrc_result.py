@@ -37,6 +37,7 @@ from .._parameters import (
     parameter_file,
     ParameterChange,
     propose_changes,
+    stage_texts,
     store_parameters,
     WordChange,
 )
@@ -347,18 +348,13 @@ class ADRCAutopilot:
                 raised=[axis for axis in AXES if f"d_max_{axis}" in flown],
             )  # fmt: skip
             return {f"{_STEM}_revert.txt": text}
-        texts, table = {}, []
-        file = lambda changes, title, revert=False: parameter_file(
+        file = lambda changes, title, revert: parameter_file(
             "betaflight", changes, revert=revert, version=_BUILD, profile=None, words=self.words,
             title="\n".join([title, *self.remarks]),
         )  # fmt: skip
-        for percent in (33, 100) if self.flew_adrc else (100,):
-            changes = self.changes(1.0 if percent == 100 else 1 / 3)
-            title = f"{percent} % of the way from what flew to the proposal"
-            texts[f"{_STEM}_{percent:03d}.txt"] = file(changes, title)
-            table.append(f"## {title}\n\n{change_table(changes, self.words)}")
-        texts[f"{_STEM}_revert.txt"] = file(self.changes(), "what flew", True)
-        return texts | {f"{_STEM}.md": "\n".join(table)}
+        shares = {33: 1 / 3, 100: 1.0} if self.flew_adrc else {100: 1.0}
+        stages = {percent: self.changes(share) for percent, share in shares.items()}
+        return stage_texts(_STEM, "txt", stages, file, self.words)
 
     @property
     def shown_again(self) -> Mapping[float, Reproduction]:

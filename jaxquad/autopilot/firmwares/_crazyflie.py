@@ -1,5 +1,6 @@
 """The Crazyflie: its rate and attitude PID, parameters and files."""
 
+from collections.abc import Mapping
 from typing import ClassVar
 
 import equinox as eqx
@@ -173,7 +174,7 @@ class Crazyflie(Firmware):
     def flown_loop(self, values, version, *, throttle, tracked_hz):
         raise ValueError("logs of the Crazyflie hold no parameters, so they do not tell its loop")
 
-    def channels(self, prefix: str, axis: int) -> Channels:
+    def channels(self, prefix: str, axis: int, values: Mapping[str, str]) -> Channels:
         return Channels()
 
     def what_to_fly(self, axis: str) -> str:

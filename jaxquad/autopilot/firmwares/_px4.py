@@ -248,7 +248,7 @@ class PX4(Firmware):
     def flown_loop(self, values, version, *, throttle, tracked_hz):
         return px4_loop(values)
 
-    def channels(self, prefix: str, axis: int) -> Channels:
+    def channels(self, prefix: str, axis: int, values: Mapping[str, str]) -> Channels:
         return Channels(
             unfiltered=[f"sensor_combined.gyro_rad[{k}]" for k in range(3)],
             motors=[f"actuator_motors.control[{k}]" for k in range(4)],
