@@ -90,8 +90,18 @@ from ._parameters import (
     WordChange as WordChange,
     write_parameter_files as write_parameter_files,
 )
-from ._proposal import AutopilotProposal as AutopilotProposal, AxesProposal as AxesProposal
+from ._proposal import (
+    AutopilotProposal as AutopilotProposal,
+    AxesProposal as AxesProposal,
+    judge as judge,
+)
 from ._rate_design import design_gains as design_gains
+from ._rate_loops import (
+    certify_angle as certify_angle,
+    delay_margin as delay_margin,
+    hold_plants as hold_plants,
+    RateLoops as RateLoops,
+)
 from ._replay import (
     FlownController as FlownController,
     hold_response as hold_response,

@@ -20,10 +20,10 @@ from ._filter_bank import gyro_noise, GyroNoise, hann_spectra, NoNoise, SLOWEST
 from ._filters import FilterChain
 from ._firmware import firmware_named
 from ._flight_channels import FlightChannels
+from ._identified_log import StepGrid
 from ._law import RateLoop
 from ._parameters import gains_in, gains_of, ParameterChange, WordChange
-from ._rate_loops import gyro_chain_response, law_paths, StepGrid
-from ._stages import limits_text, Stage, WAYS
+from ._rate_loops import DesignSettings, gyro_chain_response, law_paths, Stage, WAYS
 
 
 if TYPE_CHECKING:
@@ -438,3 +438,12 @@ def change_rows(changes: Sequence[ParameterChange], words: Sequence[WordChange] 
     rows += [[Cell(word.name), word.old, word.new, "", "", word.reason] for word in words]
     heads = ("parameter", "old", "new", "unit", "range", "reason")
     return Table("From what flew to the proposal", heads, rows)
+
+
+def limits_text(limits: DesignSettings) -> str:
+    """Of what the limits are relative to, and when to stop."""
+    return (
+        f"limits: noise {limits.noise:g} times and gains {limits.change:g} times those of this "
+        "flight at most. They compound from log to log: stop where a log keeps what flew, or the "
+        "motors get warm"
+    )

@@ -33,9 +33,8 @@ from ._parameters import (
     parameters_of,
     propose_changes,
 )
-from ._proposal import AutopilotProposal
-from ._rate_loops import Gains, grouped, OneGains, RateLoops
-from ._stages import BELIEVED, certify_angle, certify_gains, FilterVerdict, judge, Stage, SWINGING
+from ._proposal import AutopilotProposal, BELIEVED, FilterVerdict, judge, SWINGING
+from ._rate_loops import certify_angle, certify_gains, Gains, grouped, OneGains, RateLoops, Stage
 
 
 _THIRD = 1 / 3

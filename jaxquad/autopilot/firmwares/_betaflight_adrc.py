@@ -30,12 +30,12 @@ from .._rate_loops import (
     cells_of,
     Frequencies,
     hold_plants,
+    Kind,
     LoopQualities,
     Paths,
     RateLoops,
     together,
 )
-from .._stages import Kind
 from ._betaflight import betaflight_loop, flies_adrc, FlownBetaflight
 from ._betaflight_law import BetaflightADRC
 

@@ -21,6 +21,7 @@ from jaxquad.report import Headline, Provenance, Table
 
 from .._filters import FilterChain, PT2
 from .._flight_channels import FlightChannels
+from .._identified_log import StepGrid
 from .._page import (
     B0Section,
     Chains,
@@ -41,11 +42,10 @@ from .._parameters import (
     store_parameters,
     WordChange,
 )
-from .._proposal import write_result
+from .._proposal import beyond_limits, write_result
 from .._rate_design import best_on_grid, stored_near
-from .._rate_loops import StepGrid
+from .._rate_loops import DesignSettings, Kind
 from .._replay import Reproduction
-from .._stages import beyond_limits, DesignSettings, Kind
 from ._betaflight_adrc import (
     adrc_loops,
     adrc_parameters,
