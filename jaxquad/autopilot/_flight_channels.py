@@ -10,7 +10,7 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Float
 
-from jaxquad._core import Message, Number
+from jaxquad._core import Number
 from jaxquad.identify import Fit, KnownFilter, measured_chain, MeasuredChain
 from jaxquad.records import (
     AXES,
@@ -25,7 +25,6 @@ from jaxquad.records import (
     Settings as LogSettings,
 )
 
-from ._filters import FilterChain
 from ._firmware import firmware_named, HOVER, OuterLoop, Span
 from ._law import FlownLoop, RateLoop
 from ._parameters import change_filters, flown_loop, gains_of, parameters_of
@@ -270,16 +269,6 @@ class FlownAutopilot:
     filters_text: str  # which of both
 
     @property
-    def parameters(self) -> dict[str, float]:
-        """Of all axes by the firmware's names."""
-        return self.loop.parameters()
-
-    @property
-    def unmodelled(self) -> tuple[Message, ...]:
-        """What of the firmware the law leaves out."""
-        return self.loop.unmodelled
-
-    @property
     def measured(self) -> tuple[KnownFilter, ...] | None:
         """The gyro's filters as measured; None where they are those of the law."""
         return self.filters if any(isinstance(x, MeasuredChain) for x in self.filters) else None
@@ -334,8 +323,7 @@ def read_flown(
             f"{path}: P, I and D of {setup.axis} are all 0, so there is no rate loop to tune"
         )
     angle = firmware.angle_loop(logged.values, axis, loop.law.dt, levelled=setup.levelled)
-    chains = tuple(chain for chain in loop.law.gyro_chains() if chain.filters)
-    filters, text = best_filters(chains, loop.unmodelled, flight, axis)
+    filters, text = best_filters(loop, flight, axis)
     return FlownAutopilot(
         proposal.vehicle, tuple(logged.version), axis, loop, loop.law, values, throttle, flight,
         angle, filters, text,
@@ -346,11 +334,11 @@ _SHOWN = 10.0  # Hz, of the delay in print
 
 
 def best_filters(
-    chains: tuple[FilterChain, ...], unmodelled: Sequence[Message], flight: FlightChannels | None,
-    axis: int,
-) -> tuple[tuple[KnownFilter, ...], str]:  # fmt: skip
+    loop: FlownLoop, flight: FlightChannels | None, axis: int
+) -> tuple[tuple[KnownFilter, ...], str]:
     """As measured where notches follow motors or spectrum, else those of the parameters."""
-    hidden = [text for text in unmodelled if text.kind == "notch"]
+    chains = tuple(chain for chain in loop.law.gyro_chains() if chain.filters)
+    hidden = [text for text in loop.unmodelled if text.kind == "notch"]
     missing = "" if not hidden else f" (not {'; '.join(text.partition(':')[0] for text in hidden)})"
     if hidden and flight is not None and len(flight.unfiltered) > axis and not flight.averaged:
         unfiltered, filtered = flight.unfiltered[axis], flight.rates[axis]

@@ -141,7 +141,7 @@ def flown_law(
             tracked_hz={} if flight is None else flight.tracked_hz,
         )  # fmt: skip
         chains = tuple(chain for chain in loop.law.gyro_chains() if chain.filters)
-        filters, text = best_filters(chains, loop.unmodelled, flight, axis)
+        filters, text = best_filters(loop, flight, axis)
         flew = not firmware.flies_adrc(logged.values) and dict(command) == dict(setup.command)
         law = loop.law if flew else None
         return FlownLaw(filters, text, law, axis, tuple(loop.unmodelled), chains)

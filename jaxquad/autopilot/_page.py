@@ -244,7 +244,7 @@ Part = TypeVar("Part")
 
 def pilot_page(proposal: "AutopilotProposal", origin: Provenance, overview: str) -> PilotPage:
     """All that the page shows; what cannot be computed says why. `overview` is of all axes."""
-    flown, flight, new = proposal.flown, proposal.flight, proposal.new
+    flown, flight, new = proposal.flown, proposal.flown.flight, proposal.new
     law, axis, filters = flown.law, flown.axis, proposal.filters
     failures: dict[str, str] = {}
 
@@ -294,7 +294,7 @@ def pilot_page(proposal: "AutopilotProposal", origin: Provenance, overview: str)
         title=f"{flown.firmware} {version}, rate loop of {AXES[axis]}".replace(" ,", ","),
         headlines=headlines,
         remarks=[
-            *(f"not modelled: {text}" for text in flown.unmodelled),
+            *(f"not modelled: {text}" for text in flown.loop.unmodelled),
             *([flown.filters_text] if flown.filters_text else []),
             *([limits_text(proposal.settings)] if new else []),
         ],

@@ -14,7 +14,7 @@ from jaxquad.report import Provenance, provenance, write_json
 
 from ._filter_bank import GyroNoise, SharedChange
 from ._firmware import firmware_named
-from ._flight_channels import FlightChannels, FlownAutopilot, IdentifiedPlant
+from ._flight_channels import FlownAutopilot, IdentifiedPlant
 from ._identified_log import ThrottleVerdict
 from ._law_check import LoopCheck
 from ._page import limits_text, pilot_page, PilotPage, write_pilot_page
@@ -65,11 +65,6 @@ class AutopilotProposal:
     filters: FilterVerdict | None = None  # what freeing them brings; None without a search
     noise: GyroNoise | None = None  # of the gyros, where the log shows it
     throttle: ThrottleVerdict | None = None  # where gains hold, and the thrust curve, apart
-
-    @property
-    def flight(self) -> FlightChannels | None:
-        """The channels that were read."""
-        return self.flown.flight
 
     @property
     def plants(self) -> PlantSource:
@@ -157,8 +152,8 @@ class AutopilotProposal:
             "firmware": self.flown.firmware,
             "version": self.flown.version,
             "axis": AXES[self.flown.axis],
-            "flown": dict(self.flown.parameters),
-            "unmodelled": self.flown.unmodelled,
+            "flown": self.flown.loop.parameters(),
+            "unmodelled": self.flown.loop.unmodelled,
             "gyro_filters": self.flown.filters_text,
             "old": self.old,
             "new": dict(self.new),
@@ -201,7 +196,7 @@ class AutopilotProposal:
         version = ".".join(map(str, flown.version))
         lines = [f"{flown.firmware} {version}, rate loop of {AXES[flown.axis]}".replace(" ,", ",")]
         lines += [f"  {name} = {value:.6g}" for name, value in self.old.items()]
-        lines += [f"  not modelled: {text}" for text in flown.unmodelled]
+        lines += [f"  not modelled: {text}" for text in flown.loop.unmodelled]
         lines += [f"  {flown.filters_text}"] if flown.filters_text else []
         plant = "plant up to the gyro's filters, in the firmware's units"
         lines += ["", f"{plant}:\n{self.identification.fit}"]

@@ -104,7 +104,7 @@ class _Design:
     """What one axis' search and certificates are made of."""
 
     def __init__(self, proposal: AutopilotProposal):
-        flight, throttle = proposal.flight, proposal.throttle
+        flight, throttle = proposal.flown.flight, proposal.throttle
         assert flight is not None and throttle is not None
         self.settings, self.flown, self.throttle = proposal.settings, proposal.flown, throttle
         self.source, self.edge = proposal.plants, proposal.identification.band[1]  # rad/s

@@ -46,11 +46,9 @@ class LoopQualities(NamedTuple):
 
     def or_worse(self, other: "LoopQualities") -> "LoopQualities":
         """The worse of each plant; effects of torque and of noise are those of the first."""
-        greater = {x: np.maximum(getattr(self, x), getattr(other, x)) for x in _GREATER}
+        names = ("peak", "resonance", "crossover")
+        greater = {x: np.maximum(getattr(self, x), getattr(other, x)) for x in names}
         return self._replace(stable=self.stable & other.stable, **greater)
-
-
-_GREATER = ("peak", "resonance", "crossover")
 
 
 class Filters(NamedTuple):
@@ -150,10 +148,6 @@ class RateLoops:
             )
             parts.append(base.or_worse(raised))
         return together(parts)
-
-    def open_loops(self, gains: OneGains) -> Responses:
-        """Of the rate, of all groups."""
-        return np.concatenate([gains @ group.feedback * group.plants for group in self.groups])
 
     def outer_loops(self, gains: OneGains, angle_gain: float) -> Responses:
         """Of the angle with a gain in 1/s, of all groups; the true rate is before the filters."""
@@ -450,6 +444,7 @@ def certify_gains(loops: Sequence[RateLoops], designs: Sequence[OneGains]) -> li
         relaxed = any(group.relaxed for group in loop.groups)
         still = loop.relaxed_qualities(gains[None]) if relaxed else None
         stable = qualities.stable if still is None else qualities.stable & still.stable
+        opened = np.concatenate([gains @ x.feedback * x.plants for x in loop.groups])
         stages.append(
             Stage(
                 tuple(map(float, gains)), float(np.mean(stable)), float(np.max(qualities.peak)),
@@ -458,7 +453,7 @@ def certify_gains(loops: Sequence[RateLoops], designs: Sequence[OneGains]) -> li
                 rms(qualities.noise) / rms(flown.noise),
                 tuple(float(np.max(part.peak)) for part in parts),
                 None if still is None else float(np.max(still.peak)),
-                float(np.min(delay_margin(loop.open_loops(gains), loop.omega))),
+                float(np.min(delay_margin(opened, loop.omega))),
             )
         )  # fmt: skip
     return stages

@@ -236,7 +236,7 @@ class ADRCAutopilot:
         """What switches from the PID to the ADRC; empty where the ADRC flew."""
         if self.flew_adrc or self.proposal is None or not self.new:
             return ()
-        law = self.proposal.schedule.law
+        law = self.proposal.law
         off = {} if self.proposal.scaled is None else self.proposal.scaled.deviations
         why = (
             f"nearest to the gain over the throttle: off by {100 * off[law]:.0f} % at most"
@@ -299,7 +299,7 @@ class ADRCAutopilot:
         proposal, plant = self.proposal, self.plant
         if proposal is None or plant is None:
             return tuple(remarks)
-        schedule, scaled, throttle = proposal.schedule, proposal.scaled, proposal.throttle
+        schedule, scaled, throttle = proposal.frame.schedule, proposal.scaled, proposal.throttle
         most = float(schedule.scale(throttle[-1]))
         if scaled is None:
             remarks.append(
@@ -437,7 +437,7 @@ def _steps_and_b0(
     result: ADRCAutopilot, proposal: ADRCProposal
 ) -> tuple[dict[str, StepBand], B0Section | None]:
     """Steps at the middle one of the throttles that were certified, and b0 over all of them."""
-    flown, schedule, plant = result.flown, proposal.schedule, result.plant
+    flown, schedule, plant = result.flown, proposal.frame.schedule, result.plant
     if plant is None:
         return {}, None
     middle = proposal.throttle[len(proposal.throttle) // 2]
