@@ -80,11 +80,6 @@ def check_ranges(firmware: str, values: Mapping[str, Number]) -> tuple[str, ...]
     return tuple(beyond)
 
 
-def firmware_of(law: FirmwareLoop) -> str:
-    """Which firmware a law is of."""
-    return _rate_loop(law).firmware
-
-
 def list_parameters(law: FirmwareLoop, *, axes: Sequence[str] = AXES) -> dict[str, float]:
     """The parameters that a law amounts to, not rounded: gains, filters, those of an angle loop.
 
@@ -145,7 +140,7 @@ def _rate_loop(law: FirmwareLoop) -> RateLoop:
 
 def _places(law: FirmwareLoop) -> Iterator[tuple[Parameter, Array]]:
     """The rows that have a place in a law, with what is there."""
-    for row in PARAMETERS[firmware_of(law)].values():
+    for row in PARAMETERS[_rate_loop(law).firmware].values():
         value = _value_at(law, row.field)
         if isinstance(value, Array):
             yield row, value

@@ -29,10 +29,7 @@ from .._law import (
     Advance,
     AngleLoop,
     bounded,
-    filter_gyro,
     FlownLoop,
-    gyro_rest,
-    low_pass_share,
     Memories,
     RateLoop,
     Signal,
@@ -88,19 +85,18 @@ class ArduPilotRate(RateLoop):
 
     def rest(self, zero: Signal) -> dict[str, PyTree]:
         signals = dict.fromkeys(("target", "error", "slope", "integral"), zero)
-        return {"gyro": gyro_rest(self.gyro, zero), **signals}
+        return {"gyro": self.gyro_rest(zero), **signals}
 
     def advance(
         self, memory: Memories, excess: Signal, reference: Reference, measurement: Signal
     ) -> Advance:
         at = lambda gain: broadcast_gain(gain, measurement)
-        share = lambda cutoff: low_pass_share(cutoff, self.dt, measurement)
         r, _ = split_reference(reference, measurement, self.dt)
-        gyro, (y, _) = filter_gyro(self.gyro, self.dt, memory["gyro"], measurement)
-        target = memory["target"] + share(self.target_hz) * (r - memory["target"])
-        error = memory["error"] + share(self.error_hz) * (target - y - memory["error"])
+        gyro, (y, _) = self.filter_gyro(memory["gyro"], measurement)
+        target = self.low_passed(self.target_hz, memory["target"], r)
+        error = self.low_passed(self.error_hz, memory["error"], target - y)
         raw = (error - memory["error"]) / self.dt
-        slope = memory["slope"] + share(self.derivative_hz) * (raw - memory["slope"])
+        slope = self.low_passed(self.derivative_hz, memory["slope"], raw)
         growth = at(self.i) * error * self.dt
         # A limited mixer lets the integral shrink only.
         growing = (jnp.abs(excess) > 1e-6) & (memory["integral"] * growth >= 0)
