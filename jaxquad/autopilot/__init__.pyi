@@ -115,20 +115,18 @@ from .firmwares._betaflight import (
 )
 from .firmwares._betaflight_adrc import (
     adrc_parameters as adrc_parameters,
+    ADRCProposal as ADRCProposal,
+    ADRCStage as ADRCStage,
+    ADRCTargets as ADRCTargets,
     b0_law as b0_law,
     betaflight_adrc_loop as betaflight_adrc_loop,
     Flown as Flown,
     FlownADRC as FlownADRC,
 )
-from .firmwares._betaflight_adrc_design import (
-    ADRCProposal as ADRCProposal,
-    ADRCStage as ADRCStage,
-    ADRCTargets as ADRCTargets,
-    propose_adrc as propose_adrc,
-)
 from .firmwares._betaflight_adrc_result import (
     ADRCAutopilot as ADRCAutopilot,
     doubted_throttle as doubted_throttle,
+    propose_adrc as propose_adrc,
 )
 from .firmwares._betaflight_law import (
     adrc_b0 as adrc_b0,
