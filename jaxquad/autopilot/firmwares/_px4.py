@@ -200,9 +200,6 @@ def px4_loop(values: Mapping[str, str], *, gyro_rate_hz: float = 8000.0) -> Flow
 
 
 _ESTIMATE = 0.004  # s, from one attitude estimate to the next
-
-
-_ESTIMATE = 0.004  # s, from one attitude estimate to the next
 _ABOVE: Range = (0, np.inf)
 _ROWS = [
     *rows_of_axes(_of("P"), "", (0.15, 0.15, 0.2), ((0.01, 0.5), (0.01, 0.6), (0, 0.6)), "p"),
