@@ -44,7 +44,7 @@ from .._parameters import (
 )
 from .._proposal import beyond_limits, write_result
 from .._rate_design import best_on_grid, stored_near
-from .._rate_loops import DesignSettings, Kind
+from .._rate_loops import DesignSettings, Kind, Limits
 from .._replay import Reproduction
 from ._betaflight_adrc import (
     adrc_loops,
@@ -73,7 +73,7 @@ def propose_adrc(
     axis: str,
     *,
     hover: float | None = None,
-    targets: ADRCTargets | None = None,
+    targets: Limits | None = None,
     bins: int = 5,
     members: int = 32,
     fresh: int = 256,
