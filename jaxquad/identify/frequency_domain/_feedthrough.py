@@ -22,9 +22,9 @@ from jaxquad.spectra import FrequencyResponse
 
 from ..uncertainty._error_budget import ErrorBudget, scaled_inverse
 from ..uncertainty._zero_bounds import linearise
-from ._parameters import Condition
+from ._parameters import Condition, Numbers
 from ._problem import Problem
-from ._sampled import direct_part, whole_samples
+from ._sampled import Aliases, direct_part, whole_samples
 from ._solve import Solution
 
 
@@ -59,7 +59,7 @@ class DirectDelay:
 
 
 @eqx.filter_jit
-def _delays(z: Float[Array, " free"], problem: Problem):
+def _delays(z: Float[Numbers, " free"], problem: Problem):
     """Gains and delays of the direct parts of all records, and the delays' slopes by `z`."""
 
     def late(z):
@@ -70,6 +70,12 @@ def _delays(z: Float[Array, " free"], problem: Problem):
 
     delays, gains = late(z)
     return gains, delays, jax.jacfwd(lambda z: late(z)[0])(z)
+
+
+def _aliases(problem: Problem, delay: DirectDelay) -> Aliases:
+    aliases = problem.aliases[delay.record]
+    assert aliases is not None
+    return aliases
 
 
 def free_delays(problem: Problem) -> list[list[DirectDelay]]:
@@ -120,9 +126,12 @@ def find_samples(
     none is better.
     """
     _, delays, _ = jax.tree.map(np.asarray, _delays(solution.z, problem))
-    pairs = zip(delays, problem.aliases, strict=True)
-    samples = [None if late is None else whole_samples(late, a.hold) for late, a in pairs]
-    counts = [[float(samples[x.record][x.output, x.input]) for x in group] for group in groups]
+
+    def sample(one: DirectDelay) -> float:
+        samples = whole_samples(delays[one.record], _aliases(problem, one).hold)
+        return float(np.asarray(samples)[one.output, one.input])
+
+    counts = [[sample(one) for one in group] for group in groups]
 
     def attempt(counts: Sequence[Sequence[float]], start: Solution) -> tuple[Problem, Solution]:
         tried = with_samples(problem, groups, counts)
@@ -165,7 +174,7 @@ def sample_limits(
     rows, places = [], []
     for one, *_ in groups:
         at = (one.output, one.input)
-        aliases = problem.aliases[one.record]
+        aliases = _aliases(problem, one)
         count = float(np.asarray(aliases.samples)[at])
         row = slopes[one.record][at]
         independent = np.linalg.matrix_rank(np.array([*rows, row])) > len(rows)

@@ -198,10 +198,12 @@ def evaluate_sampled(
     if aliases.samples is None:
         both = evaluate_response(model, everywhere)
         return jnp.asarray(aliases.total(both[: omega.size], both[omega.size :]))
-    both, (gain, late) = _split_direct(model, everywhere)
-    total = aliases.total(both[: omega.size], both[omega.size :])
+    both, direct = _split_direct(model, everywhere)
+    assert direct is not None
+    gain, late = direct
+    total = jnp.asarray(aliases.total(both[: omega.size], both[omega.size :]))
     samples = jnp.where(jnp.isnan(aliases.samples), late / aliases.hold + 0.5, aliases.samples)
-    return total + _late(gain, aliases.hold * samples, omega)
+    return total + _late(gain, jnp.asarray(aliases.hold * samples), omega)
 
 
 class SampledModel(eqx.Module):
