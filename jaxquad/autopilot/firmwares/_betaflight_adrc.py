@@ -30,12 +30,12 @@ from .._rate_loops import (
     cells_of,
     Frequencies,
     hold_plants,
+    Kind,
     LoopQualities,
     Paths,
     RateLoops,
     together,
 )
-from .._stages import Kind
 from ._betaflight import betaflight_loop, flies_adrc, FlownBetaflight
 from ._betaflight_law import BetaflightADRC
 
@@ -339,20 +339,15 @@ class ADRCProposal:
         return self.stages["proposed"]
 
     @property
-    def schedule(self) -> B0Schedule:
-        """adrc_b0_law, adrc_hover_throttle and the limits of b0's scale."""
-        return self.frame.schedule
-
-    @property
     def law(self) -> B0Law:
         """adrc_b0_law."""
-        return self.schedule.law
+        return self.frame.schedule.law
 
     def content(self) -> dict[str, object]:
         """All of it, for JSON."""
         return plain_content({
             "kind": self.kind, "verdict": self.verdict, "parameters": dict(self.parameters),
-            "schedule": self.schedule._asdict(),
+            "schedule": self.frame.schedule._asdict(),
             "throttle": self.throttle,
             "stages": {name: stage._asdict() for name, stage in self.stages.items()},
             "b0_of_the_log": None if (x := self.scaled) is None else {

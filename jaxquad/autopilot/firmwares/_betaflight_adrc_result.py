@@ -21,6 +21,7 @@ from jaxquad.report import Headline, Provenance, Table
 
 from .._filters import FilterChain, PT2
 from .._flight_channels import FlightChannels
+from .._identified_log import StepGrid
 from .._page import (
     B0Section,
     Chains,
@@ -37,14 +38,14 @@ from .._parameters import (
     parameter_file,
     ParameterChange,
     propose_changes,
+    stage_texts,
     store_parameters,
     WordChange,
 )
-from .._proposal import write_result
+from .._proposal import beyond_limits, write_result
 from .._rate_design import best_on_grid, stored_near
-from .._rate_loops import StepGrid
+from .._rate_loops import DesignSettings, Kind
 from .._replay import Reproduction
-from .._stages import beyond_limits, DesignSettings, Kind
 from ._betaflight_adrc import (
     adrc_loops,
     adrc_parameters,
@@ -235,7 +236,7 @@ class ADRCAutopilot:
         """What switches from the PID to the ADRC; empty where the ADRC flew."""
         if self.flew_adrc or self.proposal is None or not self.new:
             return ()
-        law = self.proposal.schedule.law
+        law = self.proposal.law
         off = {} if self.proposal.scaled is None else self.proposal.scaled.deviations
         why = (
             f"nearest to the gain over the throttle: off by {100 * off[law]:.0f} % at most"
@@ -298,7 +299,7 @@ class ADRCAutopilot:
         proposal, plant = self.proposal, self.plant
         if proposal is None or plant is None:
             return tuple(remarks)
-        schedule, scaled, throttle = proposal.schedule, proposal.scaled, proposal.throttle
+        schedule, scaled, throttle = proposal.frame.schedule, proposal.scaled, proposal.throttle
         most = float(schedule.scale(throttle[-1]))
         if scaled is None:
             remarks.append(
@@ -347,18 +348,13 @@ class ADRCAutopilot:
                 raised=[axis for axis in AXES if f"d_max_{axis}" in flown],
             )  # fmt: skip
             return {f"{_STEM}_revert.txt": text}
-        texts, table = {}, []
-        file = lambda changes, title, revert=False: parameter_file(
+        file = lambda changes, title, revert: parameter_file(
             "betaflight", changes, revert=revert, version=_BUILD, profile=None, words=self.words,
             title="\n".join([title, *self.remarks]),
         )  # fmt: skip
-        for percent in (33, 100) if self.flew_adrc else (100,):
-            changes = self.changes(1.0 if percent == 100 else 1 / 3)
-            title = f"{percent} % of the way from what flew to the proposal"
-            texts[f"{_STEM}_{percent:03d}.txt"] = file(changes, title)
-            table.append(f"## {title}\n\n{change_table(changes, self.words)}")
-        texts[f"{_STEM}_revert.txt"] = file(self.changes(), "what flew", True)
-        return texts | {f"{_STEM}.md": "\n".join(table)}
+        shares = {33: 1 / 3, 100: 1.0} if self.flew_adrc else {100: 1.0}
+        stages = {percent: self.changes(share) for percent, share in shares.items()}
+        return stage_texts(_STEM, "txt", stages, file, self.words)
 
     @property
     def shown_again(self) -> Mapping[float, Reproduction]:
@@ -441,7 +437,7 @@ def _steps_and_b0(
     result: ADRCAutopilot, proposal: ADRCProposal
 ) -> tuple[dict[str, StepBand], B0Section | None]:
     """Steps at the middle one of the throttles that were certified, and b0 over all of them."""
-    flown, schedule, plant = result.flown, proposal.schedule, result.plant
+    flown, schedule, plant = result.flown, proposal.frame.schedule, result.plant
     if plant is None:
         return {}, None
     middle = proposal.throttle[len(proposal.throttle) // 2]
