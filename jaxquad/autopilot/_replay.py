@@ -28,7 +28,7 @@ from jaxquad.identify import (
 from jaxquad.records import Record, select
 from jaxquad.spectra import frequency_response, FrequencyResponse, LocalPolynomial
 
-from ._law import FlownLoop
+from ._law import FlownLoop, linear_responses
 
 
 Samples = Float[Array | np.ndarray, "samples axes"]
@@ -212,12 +212,11 @@ def _flown_again(flown: FlownLoop, step: tuple[Array | np.ndarray, ...], wait: i
     return jax.lax.scan(sample, start, rows)[1]
 
 
-@eqx.filter_jit
 def predict_loop(
     law: LinearController,
     plant: Complex[Array | np.ndarray, "... frequencies"],
     omega: Float[Array | np.ndarray, " frequencies"],
-) -> Complex[Array, "... frequencies"]:
+) -> Complex[np.ndarray, "... frequencies"]:
     """The closed loop's response from set-point to measurement.
 
     **Arguments:**
@@ -227,20 +226,9 @@ def predict_loop(
         command included (`hold_response`); draws of it on leading axes.
     - `omega`: rad/s, below pi/dt.
     """
-    turn = omega * law.dt
-    z = jax.lax.complex(jnp.cos(turn), jnp.sin(turn))
-    inputs = jnp.stack([law.reference_in, law.measurement_in], axis=1)
-    through = jnp.stack([law.reference_through, law.measurement_through])
-    states = len(law.A)
-
-    def at(z: Array) -> Array:
-        resolvent = z * jnp.eye(states, dtype=z.dtype) - law.A.astype(z.dtype)
-        return law.C.astype(z.dtype) @ jnp.linalg.solve(resolvent, inputs.astype(z.dtype))
-
-    ahead, back = (jax.vmap(at)(z) + through.astype(z.dtype)[None]).T
-    plant = jnp.asarray(plant, z.dtype)
-    wide = (1,) * (plant.ndim - 1) + (-1,)
-    return plant * ahead.reshape(wide) / (1 - plant * back.reshape(wide))
+    ahead, back = linear_responses(law, np.asarray(omega))
+    plant = np.asarray(plant)
+    return plant * ahead / (1 - plant * back)
 
 
 def hold_response(
@@ -434,8 +422,8 @@ def reproduce_flight(
         reference_through=(1 + _CHANGE) * law.reference_through,
         measurement_through=(1 + _CHANGE) * law.measurement_through,
     )
-    loops = np.asarray(predict_loop(law, np.stack(plants), omega))
-    by_gain = (np.asarray(predict_loop(louder, plants[0], omega)) / loops[0] - 1) / _CHANGE
+    loops = predict_loop(law, np.stack(plants), omega)
+    by_gain = (predict_loop(louder, plants[0], omega) / loops[0] - 1) / _CHANGE
     slopes = (loops[1:] / loops[0] - 1) / _CHANGE
     spread = np.real(np.einsum("pf,pq,qf->f", slopes.conj(), fit.relative_covariance, slopes))
     predicted = loops[0] * filter_response(filters, omega)

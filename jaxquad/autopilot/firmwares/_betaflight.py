@@ -37,7 +37,7 @@ from ._betaflight_law import (
     P_SCALE,
     tpa_factor,
 )
-from ._betaflight_log import LOG
+from ._betaflight_log import BETAFLIGHT as LOG
 
 
 Ends = tuple[float, float, float]  # of a dynamic cutoff: lowest and highest in Hz, expo
@@ -334,13 +334,21 @@ class Betaflight(Firmware):
     def flown_loop(self, values, version, *, throttle, tracked_hz):
         return betaflight_loop(values, version, throttle=throttle)
 
-    def channels(self, prefix: str, axis: int) -> Channels:
+    def channels(self, prefix: str, axis: int, values: Mapping[str, str]) -> Channels:
+        number = lambda name, usual: float(values.get(name, usual))
+        limit, usual = ("pidsum_limit_yaw", 400.0) if axis == 2 else ("pidsum_limit", 500.0)
+        low, high = (float(x) for x in values.get("motorOutput", "48,2047").split(",")[:2])
+        finer = number("blackbox_high_resolution", 0.0) > 0
+        # The throttle before its boost; a limit of the throttle is another one.
+        limited = number("throttle_limit_type", 0.0)
         return Channels(
             unfiltered=[f"{prefix}gyroUnfilt[{k}]" for k in range(3)],
             terms=[f"{prefix}axis{x}[{axis}]" for x in "PIDF"],
-            motors=[f"{prefix}motor[{k}]" for k in range(8)],
-            output={f"{prefix}axisSum[{axis}]": 1.0}, stick={f"{prefix}rcCommand[3]": 1.0},
+            motors=[f"{prefix}motor[{k}]" for k in range(8)], motor_ends=(low, high),
+            output={f"{prefix}axisSum[{axis}]": 1.0}, output_limit=number(limit, usual),
+            stick={} if limited else {f"{prefix}rcCommand[3]": 1.0}, stick_ends=(1000.0, 2000.0),
             mixed={f"{prefix}axisMixed[{axis}]": 1.0},
+            resolution=(float(np.radians(0.1 if finer else 1.0)), 1.0),
         )  # fmt: skip
 
     def what_to_fly(self, axis: str) -> str:
@@ -351,24 +359,6 @@ class Betaflight(Firmware):
             f"and quick {axis} stick in acro for 20 s"
         )
 
-    def motor_ends(self, values: Mapping[str, str]) -> tuple[float, float]:
-        low, high = (float(x) for x in values.get("motorOutput", "48,2047").split(",")[:2])
-        return low, high
-
-    def stick_throttle(self, command: Samples, values: Mapping[str, str]) -> Samples | None:
-        """The throttle before its boost; a limit of the throttle is another one."""
-        if float(values.get("throttle_limit_type", 0)):
-            return None
-        return np.clip((command - 1000) / 1000, 0.0, 1.0)
-
-    def output_limit(self, values: Mapping[str, str], axis: int) -> float:
-        name, usual = ("pidsum_limit_yaw", 400.0) if axis == 2 else ("pidsum_limit", 500.0)
-        return float(values.get(name, usual))
-
-    def resolution(self, values: Mapping[str, str]) -> tuple[float, float]:
-        finer = float(values.get("blackbox_high_resolution", 0)) > 0
-        return np.radians(0.1 if finer else 1.0), 1.0
-
     def with_hold(self, values: Mapping[str, str], hold: float | None) -> Mapping[str, str]:
         if hold is None or "looptime" not in values:
             return values
@@ -376,10 +366,6 @@ class Betaflight(Firmware):
         if abs(looptime / float(values["looptime"]) - 1) < _SAME_LOOP:
             return values
         return {**values, "looptime": f"{looptime:.6g}"}
-
-    def levelled(self, loop: FlownLoop) -> FlownLoop:
-        law = loop.law.levelled() if isinstance(loop.law, BetaflightPID) else loop.law
-        return dataclasses.replace(loop, law=law)
 
     def angle_loop(self, values, axis, dt, *, levelled):
         level = values.get("levelPID", "").split(",")[0]

@@ -17,8 +17,13 @@ from ..frequency_domain._problem import on_device, Problem
 from ..frequency_domain._refits import Origin
 from ..frequency_domain._result import Fit
 from ..frequency_domain._sampled import remarks_on_hold
-from ..frequency_domain._solve import is_saddle, same_responses, Solution, solution_at
-from ..frequency_domain._starts import Minimum
+from ..frequency_domain._solve import (
+    is_saddle,
+    Minimum,
+    same_responses,
+    Solution,
+    solution_at,
+)
 from ..output_error._noise import NoiseModel
 from ..output_error._simulated import HasStateSpace, HasTransferFunction, linear_model
 from ._error_budget import (
