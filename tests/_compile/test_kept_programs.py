@@ -141,7 +141,7 @@ def test_a_damaged_file_is_compiled_anew(traced, tmp_path):
     kept(traced)(*ARGUMENTS)
     [path] = tmp_path.iterdir()
     path.write_bytes(path.read_bytes()[:100])
-    with pytest.warns(UserWarning, match="compiled anew"):
+    with pytest.warns(UserWarning, match="compiled again"):
         assert kept(traced)(*ARGUMENTS)["wc"] == 10.0
     assert kept(traced)(*ARGUMENTS)["wc"] == 10.0
     assert len(traced) == 2
