@@ -234,17 +234,15 @@ class FlownLoop(eqx.Module, Generic[RateLaw]):
         """The law as it acts on the logged rate."""
         return dataclasses.replace(self, law=self.law.without_gyro_filters())
 
-    def at_sample(self, throttle: Array, surge: Array, integral_share: Array) -> RateLaw:
+    def moments(
+        self, throttle: Series, before: Series, mixer_range: Series | None
+    ) -> tuple[Series, ...]:
+        """What `at_moment` takes, by the throttle now and a loop before, and the mixer's range."""
+        return ()
+
+    def at_moment(self, *moment: Array) -> RateLaw:
         """The law at one sample of a log."""
         return self.law
-
-    def surge(self, throttle: Series) -> Series:
-        """Anti-gravity's measure of a moving throttle times its gain, at the loop's samples."""
-        return np.zeros_like(throttle)
-
-    def integral_share(self, mixer_range: Series) -> Series:
-        """Of what the integral grows by, while the motors use this share of the mixer's range."""
-        return np.ones_like(mixer_range)
 
     def setpoint_speed(self, slope: Samples, fed: Samples) -> Samples:
         """In rad/s^2, by the slope of the set-point and the logged F."""

@@ -316,9 +316,7 @@ def pilot_page(proposal: "AutopilotProposal", origin: Provenance, overview: str)
         changes=change_rows(proposal.changes) if new else None,
         text=str(proposal),
         unit=firmware_named(flown.firmware).unit,
-        again=None if check is None else FlownAgain(
-            check.time, check.setpoint, check.rate, check.again
-        ),
+        again=None if check is None else check.shown,
         again_text="" if check is None else f"{check.verdict[0].upper()}{check.verdict[1:]}.",
         overview=overview,
         provenance=origin,

@@ -136,18 +136,9 @@ class RateLoops:
         return together(parts) if self.others else qualities
 
     def relaxed_qualities(self, gains: Gains) -> LoopQualities:
-        """With the integral held where it can be held in flight, D as set and at its ceiling."""
-        parts = []
-        for group in self.groups:
-            if not group.relaxed:
-                parts.append(group.qualities(gains))
-                continue
-            base, raised = (
-                group._qualities(*group.paths(gains * np.array([[1.0, 0.0, factor]])))
-                for factor in (1.0, group.ceiling)
-            )
-            parts.append(base.or_worse(raised))
-        return together(parts)
+        """Likewise, with the integral held where it can be held in flight."""
+        still = lambda group: gains * np.array([[1.0, 0.0 if group.relaxed else 1.0, 1.0]])
+        return together([group.qualities(still(group)) for group in self.groups])
 
     def outer_loops(self, gains: OneGains, angle_gain: float) -> Responses:
         """Of the angle with a gain in 1/s, of all groups; the true rate is before the filters."""

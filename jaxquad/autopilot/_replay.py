@@ -51,9 +51,7 @@ class _Row(NamedTuple):
     setpoint: Array
     speed: Array
     rate: Array
-    throttle: Array
-    surge: Array
-    integral_share: Array
+    moment: tuple[Array, ...]  # of `FlownLoop.at_moment`
     integral: Array
     anew: Array
 
@@ -154,19 +152,15 @@ class _Grid:
         speed = np.diff(r, axis=0, prepend=r[:1]) / self.interval
         if feed_forward is not None:
             speed = flown.setpoint_speed(speed, self.fine(feed_forward))
-        # Throttle, anti-gravity's surge and the integral's share are of the loop before.
-        before, surge = self.fine(throttle, self.interval), flown.surge(self.fine(throttle))
-        share = np.ones_like(before)
-        if mixer_range is not None:
-            share = flown.integral_share(self.fine(mixer_range, self.interval))
+        mixed = None if mixer_range is None else self.fine(mixer_range, self.interval)
+        moments = flown.moments(self.fine(throttle), self.fine(throttle, self.interval), mixed)
         start, anew = np.zeros_like(r), np.zeros(len(r), bool)
         if integral is not None:
             start = self.fine(integral, self.interval)  # what the law adds to at this sample
             anew = np.arange(len(r)) % max(1, round(restart / self.interval)) == 0
-        surge = np.concatenate([[0.0], surge[:-1]])
         more = -(-len(r) // _BLOCK) * _BLOCK - len(r)
         pad = lambda x: jnp.asarray(np.concatenate([x, np.repeat(x[-1:], more, axis=0)]))
-        return _Row(*map(pad, (r, speed, rate, before, surge, share, start, anew)))
+        return jax.tree.map(pad, _Row(r, speed, rate, moments, start, anew))
 
 
 def _straight(at: np.ndarray, time: np.ndarray, signal: np.ndarray) -> np.ndarray:
@@ -183,9 +177,7 @@ def _replayed(flown: FlownLoop, rows: _Row):
     def sample(memory, row: _Row):
         memory = {**memory, "integral": jnp.where(row.anew, row.integral, memory["integral"])}
         reference = Setpoint(row.setpoint, row.speed, zero)
-        memory, _, terms = flown.at_sample(row.throttle, row.surge, row.integral_share).advance(
-            memory, zero, reference, row.rate
-        )
+        memory, _, terms = flown.at_moment(*row.moment).advance(memory, zero, reference, row.rate)
         return memory, terms
 
     return jax.lax.scan(sample, flown.law.rest(zero), rows)[1]
@@ -201,9 +193,7 @@ def _flown_again(flown: FlownLoop, step: tuple[Array | np.ndarray, ...], wait: i
         memory, state, queue = carry
         rate = state[1]
         reference = Setpoint(row.setpoint, row.speed, zero)
-        memory, command, _ = flown.at_sample(row.throttle, row.surge, row.integral_share).advance(
-            memory, zero, reference, rate
-        )
+        memory, command, _ = flown.at_moment(*row.moment).advance(memory, zero, reference, rate)
         queue = jnp.concatenate([(command + row.rate)[None], queue])  # the newest one first
         moved = matrix @ state + jnp.outer(now, queue[-2]) + jnp.outer(before, queue[-1])
         return (memory, moved, queue[:-1]), rate

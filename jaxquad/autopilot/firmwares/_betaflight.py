@@ -55,7 +55,7 @@ class FlownBetaflight(FlownLoop[BetaflightPID]):
         low-pass of gyro and D; None where it is static.
     - `tpa`: tpa_rate in percent and the breakpoint's throttle.
     - `tpa_on_p`: whether TPA acts on P too.
-    - `anti_gravity`: gain, cutoff in Hz and gain of P, see `surge`; None is off.
+    - `anti_gravity`: gain, cutoff in Hz and gain of P; None is off.
     - `windup`: of the mixer's range, above which the integral grows less; 1 is off.
     """
 
@@ -94,27 +94,29 @@ class FlownBetaflight(FlownLoop[BetaflightPID]):
         law = self.law.without_gyro_filters()
         return dataclasses.replace(self, law=law, gyro_dynamic=None)
 
-    def at_sample(self, throttle: Array, surge: Array, integral_share: Array) -> BetaflightPID:
+    def at_moment(self, *moment: Array) -> BetaflightPID:
+        throttle, surge, integral_share = moment
         return self.at(throttle, surge=surge, integral_share=integral_share)
 
-    def surge(self, throttle: Samples) -> Samples:
+    def moments(
+        self, throttle: Samples, before: Samples, mixer_range: Samples | None
+    ) -> tuple[Samples, ...]:
+        """Throttle, anti-gravity's measure of it times its gain, and of what the integral grows."""
         from scipy.signal import lfilter
 
-        if self.anti_gravity is None:
-            return np.zeros_like(throttle)
-        gain, cutoff, _ = self.anti_gravity
-        change = np.diff(throttle, prepend=throttle[:1])
-        moved = np.abs(change) / self.law.dt * (1 - throttle) ** 2
-        moved = np.where(change > 0, 0.5 * (1 - throttle), 1.0) * moved
-        for section in PT2(cutoff).sections(1 / self.law.dt):
-            pole = [1.0, float(np.asarray(section.a1))]
-            moved = lfilter([float(np.asarray(section.b0))], pole, moved)
-        return gain * np.asarray(moved)
-
-    def integral_share(self, mixer_range: Samples) -> Samples:
-        if self.windup >= 1:
-            return np.ones_like(mixer_range)
-        return np.clip((1 - mixer_range) / (1 - self.windup), 0.0, 1.0)
+        surge, share = np.zeros_like(before), np.ones_like(before)
+        if self.anti_gravity is not None:
+            gain, cutoff, _ = self.anti_gravity
+            change = np.diff(throttle, prepend=throttle[:1])
+            moved = np.abs(change) / self.law.dt * (1 - throttle) ** 2
+            moved = np.where(change > 0, 0.5 * (1 - throttle), 1.0) * moved
+            for section in PT2(cutoff).sections(1 / self.law.dt):
+                pole = [1.0, float(np.asarray(section.a1))]
+                moved = lfilter([float(np.asarray(section.b0))], pole, moved)
+            surge = np.concatenate([[0.0], gain * np.asarray(moved)[:-1]])
+        if mixer_range is not None and self.windup < 1:
+            share = np.clip((1 - mixer_range) / (1 - self.windup), 0.0, 1.0)
+        return before, surge, share
 
     def setpoint_speed(self, slope: Speeds, fed: Speeds) -> Speeds:
         """By the logged F where that has a gain: it is of the sticks, between their samples."""

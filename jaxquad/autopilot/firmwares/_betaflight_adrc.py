@@ -31,6 +31,7 @@ from .._rate_loops import (
     Frequencies,
     hold_plants,
     Kind,
+    Limits,
     LoopQualities,
     Paths,
     RateLoops,
@@ -399,7 +400,7 @@ def stages_of(
 
 
 def score_of(
-    loops: Sequence[ADRCLoops], targets: ADRCTargets, edge: float, before: Design | None
+    loops: Sequence[ADRCLoops], targets: Limits, edge: float, before: Design | None
 ) -> Callable[[Designs], Float[np.ndarray, " designs"]]:
     """The effect of torque; designs beyond a target come after all that keep them."""
     limit, flown = _RESERVE * targets.sensitivity, [loop.flown() for loop in loops]
@@ -455,7 +456,7 @@ def frame_of(
 
 
 def judge_adrc(
-    stages: Mapping[str, ADRCStage], beyond: Sequence[str], targets: ADRCTargets, fresh: int,
+    stages: Mapping[str, ADRCStage], beyond: Sequence[str], targets: Limits, fresh: int,
     grid: np.ndarray,
 ) -> tuple[Kind, str]:  # fmt: skip
     """The verdict, in words too."""

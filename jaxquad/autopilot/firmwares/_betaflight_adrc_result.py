@@ -44,7 +44,7 @@ from .._parameters import (
 )
 from .._proposal import beyond_limits, write_result
 from .._rate_design import best_on_grid, stored_near
-from .._rate_loops import DesignSettings, Kind
+from .._rate_loops import DesignSettings, Kind, Limits
 from .._replay import Reproduction
 from ._betaflight_adrc import (
     adrc_loops,
@@ -73,7 +73,7 @@ def propose_adrc(
     axis: str,
     *,
     hover: float | None = None,
-    targets: ADRCTargets | None = None,
+    targets: Limits | None = None,
     bins: int = 5,
     members: int = 32,
     fresh: int = 256,
@@ -330,10 +330,9 @@ class ADRCAutopilot:
 
         **Returns:** their paths.
         """
-        path = Path(folder)
-        files = lambda: [write_file(path / name, text) for name, text in self._texts().items()]
+        files = lambda path: [write_file(path / name, x) for name, x in self._texts().items()]
         pages = lambda origin: [adrc_page(self, origin)]
-        return write_result(path, self.path, self.settings, self.content(), files, pages)
+        return write_result(Path(folder), self.path, self.settings, self.content(), files, pages)
 
     def _texts(self) -> dict[str, str]:
         """The parameter files, and the table of what changes; without a proposal what flew."""
