@@ -160,7 +160,7 @@ class _Grid:
             anew = np.arange(len(r)) % max(1, round(restart / self.interval)) == 0
         more = -(-len(r) // _BLOCK) * _BLOCK - len(r)
         pad = lambda x: jnp.asarray(np.concatenate([x, np.repeat(x[-1:], more, axis=0)]))
-        return jax.tree.map(pad, _Row(r, speed, rate, moments, start, anew))
+        return _Row(*jax.tree.map(pad, (r, speed, rate, moments, start, anew)))
 
 
 def _straight(at: np.ndarray, time: np.ndarray, signal: np.ndarray) -> np.ndarray:

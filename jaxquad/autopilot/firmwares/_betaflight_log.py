@@ -411,7 +411,7 @@ def _filtered(b: Sequence[Number], a: Sequence[Number], signal: np.ndarray) -> n
 
 
 def _low_passed(cutoff_hz: float, signal: np.ndarray) -> np.ndarray:
-    share = _share(cutoff_hz, _DT)
+    share = float(_share(cutoff_hz, _DT))
     return _filtered([share], [1.0, share - 1], signal)
 
 
