@@ -290,7 +290,6 @@ def number_text(value: Number, is_whole: bool) -> str:
 
 
 def joined_lines(rows: Sequence[str]) -> str:
-    """A text file of these lines."""
     return "\n".join([*rows, ""])
 
 

@@ -137,7 +137,6 @@ def filters_section(page: PilotPage) -> PageSection:
 
 
 def noise_section(page: PilotPage) -> PageSection:
-    """Spectra of gyro and D term."""
     if not page.gyro:
         return None
     image = report.embed_figure(
@@ -150,7 +149,6 @@ def noise_section(page: PilotPage) -> PageSection:
 
 
 def steps_section(page: PilotPage) -> PageSection:
-    """Steps of the set-point, and their overshoot."""
     if not page.steps:
         return None
     image = report.embed_figure(
@@ -183,7 +181,6 @@ def again_section(page: PilotPage) -> PageSection:
 
 
 def b0_section(page: PilotPage) -> PageSection:
-    """b0 over the throttle."""
     if page.b0 is None:
         return None
     levels, taken, curve, text = page.b0

@@ -34,7 +34,6 @@ class FilterVerdict:
     shared: SharedChange | None = None
 
     def content(self) -> dict[str, object]:
-        """All of it, for JSON."""
         return {
             "text": self.text,
             "flown": dict(self.flown),

@@ -164,7 +164,6 @@ class _Grid:
 
 
 def _straight(at: np.ndarray, time: np.ndarray, signal: np.ndarray) -> np.ndarray:
-    """A series, or each column of one, at other times."""
     if signal.ndim == 1:
         return np.interp(at, time, signal)
     return np.stack([np.interp(at, time, column) for column in signal.T], axis=1)

@@ -399,7 +399,6 @@ def _fly(random: np.random.Generator) -> tuple[dict[str, np.ndarray], np.ndarray
 
 
 def _share(cutoff_hz: float | np.ndarray, dt: float) -> float | np.ndarray:
-    """Of the new sample in a pt1."""
     omega = 2 * np.pi * cutoff_hz * dt
     return omega / (1 + omega)
 
