@@ -13,7 +13,6 @@ import jaxquad.report as report
 from jaxquad._core import write_file
 from jaxquad.identify import GainBand
 from jaxquad.plot import FlownAgain, Spectrum, StepBand, ThrottleCurve
-from jaxquad.records import AXES
 from jaxquad.report import Cell, Headline, Provenance, Table
 
 from ._filter_bank import gyro_noise, GyroNoise, hann_spectra, NoNoise, SLOWEST
@@ -286,9 +285,8 @@ def pilot_page(proposal: "AutopilotProposal", origin: Provenance, overview: str)
         if throttle.curve is not None:
             level = "warn" if throttle.curve.change else "good"
             headlines.append(Headline(level, "THRUST CURVE", throttle.curve.text))
-    version = ".".join(map(str, flown.version))
     return PilotPage(
-        title=f"{flown.firmware} {version}, rate loop of {AXES[axis]}".replace(" ,", ","),
+        title=proposal.title,
         headlines=headlines,
         remarks=[
             *(f"not modelled: {text}" for text in flown.loop.unmodelled),

@@ -66,6 +66,12 @@ class AutopilotProposal:
     throttle: ThrottleVerdict | None = None  # where gains hold, and the thrust curve, apart
 
     @property
+    def title(self) -> str:
+        """Firmware, version and axis."""
+        name, version = self.flown.firmware, ".".join(map(str, self.flown.version))
+        return f"{name} {version}, rate loop of {AXES[self.flown.axis]}".replace(" ,", ",")
+
+    @property
     def plants(self) -> PlantSource:
         """What the log leaves possible."""
         fit, unit = self.identification.fit, self.identification.records[0].output_units[0]
@@ -191,9 +197,7 @@ class AutopilotProposal:
         ]
 
     def __str__(self) -> str:
-        flown = self.flown
-        version = ".".join(map(str, flown.version))
-        lines = [f"{flown.firmware} {version}, rate loop of {AXES[flown.axis]}".replace(" ,", ",")]
+        flown, lines = self.flown, [self.title]
         lines += [f"  {name} = {value:.6g}" for name, value in self.old.items()]
         lines += [f"  not modelled: {text}" for text in flown.loop.unmodelled]
         lines += [f"  {flown.filters_text}"] if flown.filters_text else []
