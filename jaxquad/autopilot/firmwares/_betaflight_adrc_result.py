@@ -10,11 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from jaxquad._core import announce, plain_content, write_file
-from jaxquad.identify import (
-    GainBand,
-    GainOverThrottle,
-    UndeterminedError,
-)
+from jaxquad.identify import GainBand, GainOverThrottle, UndeterminedError
 from jaxquad.plot import StepBand, ThrottleCurve
 from jaxquad.records import AXES
 from jaxquad.report import Headline, Provenance, Table
