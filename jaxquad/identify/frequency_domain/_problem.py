@@ -256,10 +256,8 @@ def weigh_parts(problem: Problem, k: int, magnitude: Part, phase: Part) -> tuple
 
 
 def misfits(z: Float[Array, " n"], problem: Problem) -> Float[Array, " residuals"]:
-    """The magnitudes and then the phases of one record after the other, then the priors.
-
-    Each is (outputs, inputs, frequencies), flattened.
-    """
+    """The magnitudes and then the phases of one record after the other, then the priors. Each is
+    (outputs, inputs, frequencies), flattened."""
     parts = [part.reshape(-1) for log in _log_ratios(z, problem) for part in log]
     return jnp.concatenate([*parts, prior_misfits(z, problem)])
 

@@ -298,9 +298,7 @@ class _Orders(NamedTuple):
 
     def free(self, start: TransferFunction, omega: Float[np.ndarray, " frequencies"]) -> list[Real]:
         """All coefficients but the leading 1 and the integrators' zeros; a delay unless it is 0.
-
-        Each with its size, or what would double the response somewhere if it is near 0.
-        """
+        Each with its size, or what would double the response somewhere if it is near 0."""
         sizes = []
         for coefficients in map(np.asarray, (start.numerator, start.denominator)):
             terms = omega[:, None] ** np.arange(coefficients.size - 1, -1, -1.0)

@@ -301,10 +301,8 @@ def _residuals(plain: Evaluation, models: Models) -> Residuals:
 
 
 def with_fixed_slopes(descent: Descent) -> Evaluation:
-    """The misfits' slopes by the free parameters, then the fixed, then the initial states.
-
-    Central differences: they serve for names alone, and compile nothing anew.
-    """
+    """The misfits' slopes by the free parameters, then the fixed, then the initial states. Central
+    differences: they serve for names alone, and compile nothing anew."""
     problem, step = descent.problem, _STEP_FIXED_SLOPES
     parameters, values = problem.base.parameters, np.asarray(descent.solution.values)
     count, fixed = parameters.count, []

@@ -56,10 +56,8 @@ class Sampled(NamedTuple):
 
 
 class Columns(NamedTuple):
-    """What start and trim do to a record: a unit shift, then the free motions.
-
-    These are biases and initial values, up to the sample at which nothing is left of them.
-    """
+    """What start and trim do to a record: a unit shift, then the free motions. These are biases and
+    initial values, up to the sample at which nothing is left of them."""
 
     shift: Samples  # within the band
     free: Moving

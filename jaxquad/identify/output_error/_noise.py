@@ -88,10 +88,8 @@ def shock_slopes(v: Series, model: NoiseModel) -> Float[np.ndarray, "samples coe
 
 
 def estimate_noise(v: Series, noise: Noise) -> NoiseModel:
-    """The model of the wanted kind that leaves the least mean square of shocks.
-
-    "auto" is that of lowest Akaike criterion of autoregressive ones and of a few with zeros.
-    """
+    """The model of the wanted kind that leaves the least mean square of shocks. "auto" is that of
+    lowest Akaike criterion of autoregressive ones and of a few with zeros."""
     if isinstance(noise, ARMA):
         return _with_zeros(v, noise.poles, noise.zeros)
     if isinstance(noise, AutoRegressive):
@@ -139,10 +137,8 @@ def _with_deviation(v: Series, numerator: np.ndarray, denominator: np.ndarray) -
 
 
 def _with_zeros(v: Series, poles: int, zeros: int) -> NoiseModel:
-    """Gauss-Newton from Hannan and Rissanen's start.
-
-    Source: Brockwell & Davis, Time Series: Theory and Methods, sec. 8.4 and 8.11.
-    """
+    """Gauss-Newton from Hannan and Rissanen's start. Source: Brockwell & Davis, Time Series: Theory
+    and Methods, sec. 8.4 and 8.11."""
     if not zeros:
         return _autoregressive(v, poles)
     # Least squares on past samples and on the shocks of a long autoregression.
@@ -286,10 +282,8 @@ def orthonormal(
 
 
 def row_products(rows: Float[np.ndarray, "rows samples"]) -> Float[np.ndarray, "rows rows"]:
-    """Products of each two of a few long rows.
-
-    By a copy: BLAS's own way for a matrix and its transpose takes two to four times as long here.
-    """
+    """Products of each two of a few long rows. By a copy: BLAS's own way for a matrix and its
+    transpose takes two to four times as long here."""
     return rows @ rows.copy(order="K").T
 
 

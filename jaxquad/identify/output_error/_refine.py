@@ -402,14 +402,10 @@ def _verdict(
 
 def _same_outputs(descent: Descent, values: Float[np.ndarray, " parameters"]) -> bool:
     """Whether other values of the free parameters leave all simulated outputs as they are."""
-    problem, parameters = descent.problem, descent.problem.base.parameters
-    count = parameters.count
-    ratio = values / np.asarray(parameters.scale)[:count]
-    logarithmic = np.array(parameters.logarithmic[:count])
-    if np.any(logarithmic & (ratio <= 0)):
+    problem = descent.problem
+    if (z := problem.base.parameters.coordinates(values)) is None:
         return False
-    z = np.where(logarithmic, np.log(np.where(logarithmic, ratio, 1.0)), ratio)
-    other = evaluate_misfits(np.concatenate([np.asarray(z), descent.z[count:]]), problem).misfits
+    other = evaluate_misfits(np.concatenate([z, descent.z[z.size :]]), problem).misfits
     for new, old, term in zip(other, descent.evaluation.misfits, problem.terms, strict=True):
         size = np.std(np.asarray(term.y), axis=0) * np.asarray(term.weights)
         if not np.all(np.abs(np.asarray(new) - np.asarray(old)) < 1e-6 * size):

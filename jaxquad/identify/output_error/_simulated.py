@@ -30,9 +30,7 @@ def band_gain(
     band: tuple[float, float] | None, record: Record
 ) -> Float[np.ndarray, " bins"] | None:
     """|H|^2 of a third-order Butterworth band-pass, forwards and backwards; None without a band.
-
-    Raises ValueError for a band (rad/s) that does not rise or leaves the record's range.
-    """
+    Raises ValueError for a band (rad/s) that does not rise or leaves the record's range."""
     if band is None:
         return None
     nyquist = np.pi / record.dt

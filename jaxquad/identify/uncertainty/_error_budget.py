@@ -98,10 +98,8 @@ def _scaled_inverse(elements: bytes, count: int) -> Matrix:
 
 
 def calibrated_covariance(bread: Matrix, noise: Noise) -> Matrix:
-    """Sandwich covariance: (J'WJ)^-1 J'W S W J (J'WJ)^-1, S the covariance of the errors.
-
-    It holds for any weights, and counts neighbouring frequencies that share their noise once only.
-    """
+    """Sandwich covariance: (J'WJ)^-1 J'W S W J (J'WJ)^-1, S the covariance of the errors. It holds
+    for any weights, and counts neighbouring frequencies that share their noise once only."""
     inverse = scaled_inverse(bread)
     return inverse @ (noise.data + noise.priors) @ inverse
 
@@ -383,10 +381,8 @@ def find_discrepancy(
     prior: PriorRows,
     moving: Sequence[int],
 ) -> tuple[Mixture, Mixture]:
-    """The discrepancy of a fit, under the prior and under one of a larger mean.
-
-    `moving` are the parameters that can take up a misfit: not those that a bound holds against it.
-    """
+    """The discrepancy of a fit, under the prior and under one of a larger mean. `moving` are the
+    parameters that can take up a misfit: not those that a bound holds against it."""
     columns = np.asarray(moving, int)
     rows = np.concatenate([prior.slopes[:, columns], prior.misfit[:, None]], axis=1)
     # Products of slopes and misfit under noise alone; along the components of the kernels, gains of

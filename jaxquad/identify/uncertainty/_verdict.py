@@ -253,10 +253,8 @@ class Information(NamedTuple):
 def identifiability_of(
     information: Information, prior: PriorRows, bounds: tuple[Bound, ...] = ()
 ) -> tuple[Verdict, Verdict]:
-    """What data and priors determine together, and what the data determine alone.
-
-    Parameters with a bound are determined by it, and take part in no direction.
-    """
+    """What data and priors determine together, and what the data determine alone. Parameters with a
+    bound are determined by it, and take part in no direction."""
     by_data = _determine(information, bounds)
     if not len(prior.misfit):
         return by_data, by_data

@@ -64,9 +64,7 @@ def solve_within_bounds(
     problem: Problem, start: Vector | Solution, solver: eqx.Module | None, max_steps: int
 ) -> Solution:
     """Solve from `z`, or go on from a solution, until all that belongs at zero is marked as there.
-
-    It is so wherever the path to it ended; what does not belong there is released.
-    """
+    It is so wherever the path to it ended; what does not belong there is released."""
     is_solved = isinstance(start, Solution)
     solution = start if is_solved else solve(problem, start, solver, max_steps)
     logarithmic = np.array(problem.parameters.logarithmic[: solution.z.size])
