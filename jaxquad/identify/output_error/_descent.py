@@ -104,14 +104,11 @@ def descend(
             "frequency domain with jq.fit"
         )
     options = {"max_steps": max_steps, "tolerance": tolerance}
-    if isinstance(start, FilteredPoint):
-        end, status, steps = minimise_on_host(start, FilteredPoint.moved, **options)
-        precise = end.is_precise
-        stop = Point(problem, end.z, end.evaluation) if precise else Point.at(problem, end.z)
-    else:
-        precise, stop, status, steps = False, start, RUNNING, 0
-    if not precise:
-        stop, status, steps = minimise_on_host(stop, Point.moved, **options)
+    stop, status, steps = minimise_on_host(start, type(start).moved, **options)
+    if isinstance(stop, FilteredPoint) and stop.is_precise:
+        stop = Point(problem, stop.z, stop.evaluation)
+    elif isinstance(stop, FilteredPoint):
+        stop, status, steps = minimise_on_host(Point.at(problem, stop.z), Point.moved, **options)
     message = ""
     if status == RUNNING:
         message = f"the maximum of {steps} steps was reached"

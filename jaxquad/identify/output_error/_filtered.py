@@ -26,7 +26,6 @@ from jaxquad.models import sample_rational, TransferFunction
 
 from ..frequency_domain._parameters import Numbers
 from ..frequency_domain._solve import evaluate, Frame, take_apart
-from ._noise import row_products
 from ._problem import Evaluation, insert_parameters, OutputError, RecordTerm
 from ._simulated import band_filter, linear_model
 
@@ -35,7 +34,6 @@ _MOST = 4  # poles, beyond which the coefficients of A may say too little of the
 _DIGITS = 1e6  # rounding of the output, in units of the last bit of its largest value
 _RIDGE = 1e-10  # of the squared length of a column, and taken out again by refinement
 _REFINEMENTS = 3
-_CLOSE = 1e-8  # a step, relative to 1 + |z|, whose square is rounding
 _GONE = 1e-20  # of the states, relative to their start
 
 Samples = Float[np.ndarray, " samples"]
@@ -112,7 +110,6 @@ class FilteredPoint:
     records: list[Simulated]
     prior_misfits: Float[np.ndarray, " priors"]
     prior_slopes: Float[np.ndarray, "priors parameters"]
-    next_to: "FilteredPoint | None" = None  # a point so near that it has the same slopes
 
     @property
     def cost(self) -> float:
@@ -124,15 +121,11 @@ class FilteredPoint:
     @ft.cached_property
     def behind(self) -> list[Samples]:
         """y / A of each record."""
-        if self.next_to is not None:
-            return self.next_to.behind
         return [_over(one.sampled.below, one.output) for one in self.records]
 
     @ft.cached_property
     def rows(self) -> list[Rows]:
         """The slopes of each record's misfit, up to what start and trim can do."""
-        if self.next_to is not None:
-            return self.next_to.rows
         rows = []
         for term, one, behind in zip(self.problem.terms, self.records, self.behind, strict=True):
             model, driven = one.sampled, -one.driven
@@ -154,7 +147,7 @@ class FilteredPoint:
             # Products of the rows' parts orthogonal to the columns.
             columns = one.columns
             shared = columns.scale[:, None] * columns.products(rows)
-            products = row_products(rows) - shared.T @ np.linalg.solve(columns.normal, shared)
+            products = _row_products(rows) - shared.T @ np.linalg.solve(columns.normal, shared)
             hessian = hessian + products
         return gradient, hessian
 
@@ -162,20 +155,6 @@ class FilteredPoint:
         return self.normal
 
     def moved(self, change: Values) -> "FilteredPoint":
-        if np.max(np.abs(change) / (1 + np.abs(self.z))) <= _CLOSE and self.next_to is None:
-            gradient, hessian = self.normal
-            # After a step of Gauss and Newton the misfit is known by its slopes. A step that
-            # damping has shortened is none of these, and its cost has to be seen.
-            if np.allclose(hessian @ change, -gradient, rtol=0.1, atol=0.0):
-                pairs = [*zip(self.records, self.rows, strict=True)]
-                left = [_project_out(x.misfit + change @ rows, x.columns)[0] for x, rows in pairs]
-                return dataclasses.replace(
-                    self,
-                    z=self.z + change,
-                    records=[x._replace(misfit=y) for x, y in zip(self.records, left, strict=True)],
-                    prior_misfits=self.prior_misfits + self.prior_slopes @ change,
-                    next_to=self,
-                )
         return FilteredPoint.at(self.problem, self.programs, self.z + change)
 
     @staticmethod
@@ -307,7 +286,7 @@ def _columns(term: RecordTerm, free: Moving) -> Columns:
     if term.gain is not None:
         filtered = _in_band(term, np.pad(free, ((0, 0), (0, samples - free.shape[1]))))
     normal = np.empty((len(filtered) + 1,) * 2)
-    normal[0, 0], normal[1:, 1:] = shift @ shift, row_products(filtered)
+    normal[0, 0], normal[1:, 1:] = shift @ shift, _row_products(filtered)
     normal[0, 1:] = normal[1:, 0] = filtered @ shift[: filtered.shape[1]]
     square = np.diagonal(normal)
     scale = 1 / np.sqrt(np.where(square > 1e-20 * np.max(square), square, 1.0))
@@ -327,3 +306,9 @@ def _project_out(misfit: Samples, columns: Columns) -> tuple[Samples, Float[np.n
     left = misfit - unknowns[0] * columns.shift
     left[: columns.filtered.shape[1]] -= unknowns[1:] @ columns.filtered
     return left, unknowns
+
+
+def _row_products(rows: Float[np.ndarray, "rows samples"]) -> Float[np.ndarray, "rows rows"]:
+    """Products of each two of a few long rows. By a copy: BLAS's own way for a matrix and its
+    transpose takes two to four times as long here."""
+    return rows @ rows.copy(order="K").T

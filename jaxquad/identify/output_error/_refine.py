@@ -41,7 +41,7 @@ from ..uncertainty._error_budget import (
 )
 from ..uncertainty._verdict import identifiability_of, Information, NO_MINIMUM, Verdict
 from ._descent import descend_by_turns, descend_with_noise, Descent, with_fixed_slopes
-from ._noise import ARMA, AutoRegressive, Noise, orthogonal_factors, orthonormal, projected_noise
+from ._noise import ARMA, AutoRegressive, Noise, orthonormal, projected_noise
 from ._problem import (
     evaluate_misfits,
     Evaluation,
@@ -352,7 +352,7 @@ def _reduce(descent: Descent, evaluation: Evaluation, scale: Vector) -> Reduced:
         at += states
     stacked = [one.slopes.reshape(-1, every).T for one in projected]
     stacked = np.concatenate([*stacked, np.zeros((every, every))], axis=1)
-    basis, root = orthogonal_factors(stacked.T)
+    basis, root = np.linalg.qr(stacked.T)
     aim, output, noise, at = np.zeros(every), np.zeros(every), np.zeros((every, every)), 0
     for one, term in zip(projected, terms, strict=True):
         flat = basis[at : at + one.misfit.size]
