@@ -33,7 +33,7 @@ from .frequency_domain._cost import (
     least_coherence,
     MaximumLikelihood,
     Mixing,
-    mixings_of,
+    mixing_of,
     Points,
     points_of,
     Range,
@@ -362,8 +362,8 @@ class BatchFit(eqx.Module):
         """
         points, steps = self.points[k], int(self.steps[k])
         problem = make_problem(self.model, self.parameters, [points.frf])
-        mixings = mixings_of([points], [self.weights[k]]) if self.mixed else None
-        problem = problem.weighted([self.weights[k]], mixings)
+        mixing = mixing_of(points, self.weights[k]) if self.mixed else None
+        problem = problem.weighted([self.weights[k]], [mixing])
         message = "" if self.converged[k] else stopped_early(STALLED, steps)
         solution = solution_at(problem, self.z[k], message, steps)
         return assess(problem, weighting_at(problem, [points], solution), solution)
@@ -438,11 +438,11 @@ def fit_batch(
         raise ValueError(
             f"the inputs of the responses are held for {holds} s: fit those of one hold together"
         )
-    points = points_of(frfs, used)
+    points = [points_of(*pair) for pair in zip(frfs, used, strict=True)]
     weigh = lambda ratios: np.stack([cost.weights(*x) for x in zip(points, ratios, strict=True)])
     weights, mixed = weigh(np.ones(measured.shape)), isinstance(cost, MaximumLikelihood)
     # Without a floor on the errors, they do not depend on the weights.
-    mixings = mixings_of(points, list(weights)) if mixed else ()
+    mixings = [mixing_of(*x) for x in zip(points, weights, strict=True)] if mixed else ()
     where = Batch(model, parameters, holds[0], _pad(omega))
     together, single = (np.asarray(part) for part in _both_ways(model, where.omega))
     if together.shape != (*where.omega.shape, *measured.shape[2:]):

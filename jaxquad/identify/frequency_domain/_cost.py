@@ -243,13 +243,9 @@ def precise_points(frf: FrequencyResponse) -> Mask:
     return np.isfinite(np.asarray(frf.response)) & (error <= _PRECISE) & (not dominated)
 
 
-def points_of(frfs: Sequence[FrequencyResponse], used: Sequence[Mask]) -> list[Points]:
-    """The points of several responses, with a floor of 0. Correlations are those of the errors
-    relative to the response."""
-    return [_points(frf, mask) for frf, mask in zip(frfs, used, strict=True)]
-
-
-def _points(frf: FrequencyResponse, used: Mask) -> Points:
+def points_of(frf: FrequencyResponse, used: Mask) -> Points:
+    """The points of a response, with a floor of 0. Correlations are those of the errors relative to
+    the response."""
     shared, correlations, errors = np.ones(used.shape), {}, frf.errors
     for o, i in np.ndindex(used.shape[1:]):
         mine = np.flatnonzero(used[:, o, i])
@@ -301,12 +297,8 @@ class Mixing(NamedTuple):
     idle: Bool[np.ndarray, ""] | None = None  # whether nothing is mixed, if programs are to ask
 
 
-def mixings_of(points: Sequence[Points], weights: Sequence[Weights]) -> tuple[Mixing | None, ...]:
-    """One for each response, `None` where the points share no noise."""
-    return tuple(_mixing(*pair) for pair in zip(points, weights, strict=True))
-
-
-def _mixing(points: Points, weights: Weights) -> Mixing | None:
+def mixing_of(points: Points, weights: Weights) -> Mixing | None:
+    """Of the points of a response; `None` where they share no noise."""
     if not points.correlations and points.between is None:
         return None
     none = unmixed(points.used.shape)

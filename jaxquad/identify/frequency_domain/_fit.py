@@ -34,7 +34,7 @@ from ._cost import (
     describe_usable,
     least_coherence,
     MaximumLikelihood,
-    mixings_of,
+    mixing_of,
     Points,
     points_of,
     precise_points,
@@ -220,7 +220,8 @@ def _fit(model: PyTree, frfs: Sequence[FrequencyResponse], options: Options, rou
         return unfitted(model, parameters, verdict, tuple(remarks))
     problem = make_problem(model, parameters, frfs, options.conditions, options.priors)
     pairs = zip(usable_points, problem.silences, strict=True)
-    points = points_of(frfs, [mask & ~silent for mask, silent in pairs])
+    masks = (mask & ~silent for mask, silent in pairs)
+    points = [points_of(*pair) for pair in zip(frfs, masks, strict=True)]
 
     def weigh(points: Sequence[Points], solution: Solution | None) -> list[Weights]:
         """By the ratio of model to measurement at a solution; 1 before there is one."""
@@ -232,7 +233,8 @@ def _fit(model: PyTree, frfs: Sequence[FrequencyResponse], options: Options, rou
 
     def weighted(points: Sequence[Points], weights: Sequence[Weights]) -> Problem:
         """Only a likelihood knows what it would mean that points share noise."""
-        return problem.weighted(weights, mixings_of(points, weights) if is_likelihood else None)
+        pairs = zip(points, weights, strict=True)
+        return problem.weighted(weights, [mixing_of(*x) for x in pairs] if is_likelihood else None)
 
     def are_close(old: Sequence[Numbers], new: Sequence[Weights], share: float) -> bool:
         both = zip(map(np.asarray, old), new, strict=True)

@@ -365,7 +365,7 @@ def _usable_pair(
             f"{describe_usable([pair], count, least)}, and {orders.unknowns} coefficients "
             f"need at least {needed}"
         )
-    return points_of([pair], [used])[0], reason
+    return points_of(pair, used), reason
 
 
 def _no_numbers(orders: _Orders, reason: str, remarks: tuple[str, ...]) -> Fit:

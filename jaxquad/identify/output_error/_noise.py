@@ -234,18 +234,15 @@ def projected_noise(
 
     samples, outputs = residual.shape
     length = int(next_fast_len(2 * samples, real=True) or 2 * samples)
-    # Two series at once share the vectors of the processor; more of them only take memory.
     turn = lambda series: np.asarray(rfft(series, length))
     rest, driven, smooth, left = [], [], [], []
     windows = _windows(length // 2 + 1, length / samples)
     for o in range(outputs):
         driven.append(turn(columns[:, o].T))
-        others = np.vstack([residual[:, o], nuisance[:, o].T])
-        pairs = (turn(others[k : k + 2]) for k in range(0, len(others), 2))
-        first = next(pairs)
-        rest.append(first[0])
-        taken = _power(driven[o][:count]) + _power(first[1:]) + sum(map(_power, pairs))
-        smooth.append(_averaged(_power(first[:1]) / samples, windows))
+        others = turn(np.vstack([residual[:, o], nuisance[:, o].T]))
+        rest.append(others[0])
+        taken = _power(driven[o][:count]) + _power(others[1:])
+        smooth.append(_averaged(_power(others[:1]) / samples, windows))
         left.append(np.sqrt(np.maximum(1 - _averaged(taken / samples, windows), _FLOOR)))
     twice = np.full(length // 2 + 1, 2.0 / length)
     twice[0] = 1.0 / length
