@@ -104,11 +104,12 @@ def descend(
             "frequency domain with jq.fit"
         )
     options = {"max_steps": max_steps, "tolerance": tolerance}
-    stop, status, steps = minimise_on_host(start, type(start).moved, **options)
+    move = lambda point, change: point.moved(change)
+    stop, status, steps = minimise_on_host(start, move, **options)
     if isinstance(stop, FilteredPoint) and stop.is_precise:
         stop = Point(problem, stop.z, stop.evaluation)
     elif isinstance(stop, FilteredPoint):
-        stop, status, steps = minimise_on_host(Point.at(problem, stop.z), Point.moved, **options)
+        stop, status, steps = minimise_on_host(Point.at(problem, stop.z), move, **options)
     message = ""
     if status == RUNNING:
         message = f"the maximum of {steps} steps was reached"
