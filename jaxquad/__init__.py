@@ -5,6 +5,7 @@ import lazy_loader
 from .records._firmwares import offer
 
 
+# The module of each firmware's `FirmwareLog`, a constant with the name of the firmware: `PX4`.
 _LOGS = dict(ardupilot="_logs", px4="_logs", betaflight="_betaflight_log", crazyflie="_logs")
 for _name, _module in _LOGS.items():
     offer(_name, f"jaxquad.autopilot.firmwares.{_module}")

@@ -64,6 +64,8 @@ from ._system import (
     map_in_threads as map_in_threads,
     one_blas_thread as one_blas_thread,
     plain_content as plain_content,
+    readable as readable,
+    staged_files as staged_files,
     STAGES as STAGES,
     thread_settings as thread_settings,
     write_file as write_file,

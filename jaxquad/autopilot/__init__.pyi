@@ -58,10 +58,8 @@ from ._identified_log import (
 )
 from ._law import (
     AngleLoop as AngleLoop,
-    filter_gyro as filter_gyro,
     FirmwareLoop as FirmwareLoop,
     FlownLoop as FlownLoop,
-    gyro_rest as gyro_rest,
     LoopState as LoopState,
     pick_axis as pick_axis,
     RateLoop as RateLoop,
@@ -77,7 +75,6 @@ from ._parameters import (
     change_table as change_table,
     check_ranges as check_ranges,
     find_parameter as find_parameter,
-    firmware_of as firmware_of,
     flown_loop as flown_loop,
     list_parameters as list_parameters,
     parameter_file as parameter_file,
@@ -90,8 +87,18 @@ from ._parameters import (
     WordChange as WordChange,
     write_parameter_files as write_parameter_files,
 )
-from ._proposal import AutopilotProposal as AutopilotProposal, AxesProposal as AxesProposal
+from ._proposal import (
+    AutopilotProposal as AutopilotProposal,
+    AxesProposal as AxesProposal,
+    judge as judge,
+)
 from ._rate_design import design_gains as design_gains
+from ._rate_loops import (
+    certify_angle as certify_angle,
+    delay_margin as delay_margin,
+    hold_plants as hold_plants,
+    RateLoops as RateLoops,
+)
 from ._replay import (
     FlownController as FlownController,
     hold_response as hold_response,
@@ -115,20 +122,18 @@ from .firmwares._betaflight import (
 )
 from .firmwares._betaflight_adrc import (
     adrc_parameters as adrc_parameters,
+    ADRCProposal as ADRCProposal,
+    ADRCStage as ADRCStage,
+    ADRCTargets as ADRCTargets,
     b0_law as b0_law,
     betaflight_adrc_loop as betaflight_adrc_loop,
     Flown as Flown,
     FlownADRC as FlownADRC,
 )
-from .firmwares._betaflight_adrc_design import (
-    ADRCProposal as ADRCProposal,
-    ADRCStage as ADRCStage,
-    ADRCTargets as ADRCTargets,
-    propose_adrc as propose_adrc,
-)
 from .firmwares._betaflight_adrc_result import (
     ADRCAutopilot as ADRCAutopilot,
     doubted_throttle as doubted_throttle,
+    propose_adrc as propose_adrc,
 )
 from .firmwares._betaflight_law import (
     adrc_b0 as adrc_b0,

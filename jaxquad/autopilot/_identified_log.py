@@ -4,7 +4,7 @@ import dataclasses
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Complex, Float
@@ -28,6 +28,7 @@ from jaxquad.identify import (
     usable,
     with_values,
 )
+from jaxquad.plot import StepBand
 from jaxquad.records import AXES, Proposal, propose, Record, RecordWarning
 from jaxquad.records.firmware import firmware_names
 from jaxquad.report import LawLoop, reason_of
@@ -45,7 +46,6 @@ from ._flight_channels import (
 )
 from ._law import law_responses, RateLoop
 from ._parameters import find_parameter, ParameterChange, propose_changes
-from ._rate_loops import StepGrid
 
 
 Frequencies = Float[np.ndarray, " frequencies"]
@@ -141,7 +141,7 @@ def flown_law(
             tracked_hz={} if flight is None else flight.tracked_hz,
         )  # fmt: skip
         chains = tuple(chain for chain in loop.law.gyro_chains() if chain.filters)
-        filters, text = best_filters(chains, loop.unmodelled, flight, axis)
+        filters, text = best_filters(loop, flight, axis)
         flew = not firmware.flies_adrc(logged.values) and dict(command) == dict(setup.command)
         law = loop.law if flew else None
         return FlownLaw(filters, text, law, axis, tuple(loop.unmodelled), chains)
@@ -157,6 +157,36 @@ def flown_law(
     if first is None or all(law is not None and alike(law) for law in others):
         return first
     return FlownLaw((), f"{in_model}: those of the logs differ")
+
+
+_PERIOD, _SHOWN, _FINEST = 8.0, 1.2, 1 / 400  # s, of a computed step, of a shown one, of a sample
+
+
+class StepGrid(NamedTuple):
+    """Frequencies from whose closed responses steps are computed."""
+
+    dt: float  # of the computed step in s
+    omega: Float[np.ndarray, " frequencies"]  # rad/s
+    fade: Float[np.ndarray, " frequencies"]  # where the law runs faster than the step is computed
+
+    @classmethod
+    def of(cls, dt: float) -> "StepGrid":
+        """For a law of this interval."""
+        coarse = max(dt, _FINEST)
+        count = 2 * int(_PERIOD / coarse / 2)
+        omega = 2 * np.pi * np.arange(1, count // 2) / (count * coarse)
+        fade = np.cos(np.linspace(0, np.pi / 2, omega.size)) ** 2
+        return cls(coarse, omega, fade if coarse > dt else np.ones(omega.size))
+
+    def band(self, closed: Complex[np.ndarray, "plants frequencies"]) -> StepBand:
+        """Of the responses from set-point to rate: median and 95 % of the plants."""
+        response = np.pad(self.fade * closed, ((0, 0), (1, 1)))
+        response[:, 0] = 1.0
+        impulse = np.fft.irfft(response, 2 * (self.omega.size + 1), axis=1)
+        shown = int(_SHOWN / self.dt)
+        steps = np.cumsum(impulse, axis=1)[:, :shown]
+        low, middle, high = np.percentile(steps, [2.5, 50.0, 97.5], axis=0)
+        return StepBand(np.arange(shown) * self.dt, middle, low, high)
 
 
 Response = Complex[np.ndarray, " frequencies"]

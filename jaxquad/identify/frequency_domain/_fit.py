@@ -42,6 +42,14 @@ from ._cost import (
     Weights,
     widen_band,
 )
+from ._feedthrough import (
+    find_samples,
+    free_delays,
+    limited,
+    remarks_on_samples,
+    sample_limits,
+    unsampled,
+)
 from ._parameters import Condition, Free, Numbers, Parameters, select_parameters, Tie
 from ._problem import (
     make_problem,
@@ -222,6 +230,9 @@ def _fit(model: PyTree, frfs: Sequence[FrequencyResponse], options: Options, rou
     pairs = zip(usable_points, problem.silences, strict=True)
     masks = (mask & ~silent for mask, silent in pairs)
     points = [points_of(*pair) for pair in zip(frfs, masks, strict=True)]
+    delays = free_delays(problem)
+    if delays:
+        problem = unsampled(problem, delays)
 
     def weigh(points: Sequence[Points], solution: Solution | None) -> list[Weights]:
         """By the ratio of model to measurement at a solution; 1 before there is one."""
@@ -251,6 +262,9 @@ def _fit(model: PyTree, frfs: Sequence[FrequencyResponse], options: Options, rou
         starts = spread_starts(parameters, options.starts, fastest=fastest)
         solution, minima = solve_from_many(problem, starts, solver, max_steps)
         solution = solve_within_bounds(problem, solution, solver, max_steps)
+    if delays:
+        solve_from = lambda problem, at: solve_within_bounds(problem, at.z, solver, max_steps)
+        problem, solution = find_samples(problem, solution, delays, solve_from)
     again = weigh(points, solution)
     if not are_close(weights, again, 1e-4):
         problem = weighted(points, again)
@@ -270,10 +284,15 @@ def _fit(model: PyTree, frfs: Sequence[FrequencyResponse], options: Options, rou
         solution = solve_within_bounds(problem, solution.z, solver, max_steps)
         _check_finite(solution)
         weighting = weighting_at(problem, points, solution)
+    limits = sample_limits(problem, weighting.budget, solution, delays) if delays else []
+    if limits:
+        problem = limited(problem, limits)
+        solution = solve_within_bounds(problem, solution.z, solver, max_steps)
+        weighting = weighting_at(problem, points, solution)
     if lifted:
         weighting = weighting._replace(by_noise=weighted(points, weigh(points, solution)))
+    remarks = remarks_on_samples(problem, limits, frfs)
     # Responses that were measured, and that the model has none of.
-    remarks = []
     for frf, mask, pairs in zip(frfs, usable_points, problem.silent, strict=True):
         for o, i in pairs:
             error = np.asarray(frf.random_error)[mask[:, o, i], o, i]

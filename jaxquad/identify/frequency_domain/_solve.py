@@ -126,7 +126,8 @@ class _Unweighted:
 
     def __init__(self, problem: Problem):
         self.problem = problem
-        self.ids = tuple(map(id, (problem.model, problem.measured, problem.parameters)))
+        names = ("model", "measured", "parameters", "aliases", "prior")
+        self.ids = tuple(id(getattr(problem, name)) for name in names)
 
     def __hash__(self) -> int:
         return hash(self.ids)

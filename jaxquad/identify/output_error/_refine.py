@@ -83,12 +83,13 @@ def refine(
 
     Outputs are weighted by the variance of their residuals, which is estimated in turn with the
     parameters; `Fit.cost` is in units of it. Standard errors hold for coloured residuals. Each
-    record has its own initial state, trim and noise level. With a `noise` model, the errors of
-    predicting each sample from those before it take the place of the residuals: an efficient
-    estimate in coloured noise, and a consistent one where feedback returns noise to the input, as
-    far as the noise model is right. With the controller of the `loop` the residuals are those of
-    the closed loop, S (y - G u): what its references do not explain. That is consistent whatever
-    the noise, and a noise model makes it efficient.
+    record has its own initial state, trim and noise level, which is that of its residuals: misfit /
+    random error is 1 for any model, `jq.verify` on another record checks it. With a `noise` model,
+    the errors of predicting each sample from those before it take the place of the residuals: an
+    efficient estimate in coloured noise, and a consistent one where feedback returns noise to the
+    input, as far as the noise model is right. With the controller of the `loop` the residuals are
+    those of the closed loop, S (y - G u): what its references do not explain. That is consistent
+    whatever the noise, and a noise model makes it efficient.
 
     **Arguments:**
 
@@ -449,11 +450,7 @@ def _remarks_on_output_error(
             "«joint estimate|, jq.frequency_response(..., estimator=jq.spectra.JointInputOutput())»"
         )
         remarks.append(Message(text, "feedback"))
-    text = (
-        "the noise level is estimated from the residuals, so misfit / random error is 1 for any "
-        "model: check the model by «jq.verify» on another record"
-    )
-    return [*remarks, Message(text, "noise level")]
+    return remarks
 
 
 def _remarks_on_colour(descent: Descent, bread: Matrix, covariance: Matrix) -> list[Message]:

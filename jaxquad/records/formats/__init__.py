@@ -175,10 +175,11 @@ def load_log(path: str | Path) -> Log:
         readers = [*(log.reader for log in registered_logs() if log.reader), *READERS.values()]
         by_content = (reader for reader in readers if reader.sniff(head, path))
         by_name = (reader for reader in readers if suffix in reader.suffixes)
-        reader = next(by_content, None) or next(by_name, None)
+        reader = next(by_content, None)
+        if reader is None and path.is_dir():
+            raise ReadError(f"{path} is a folder, and no bag of ROS 2: name the file in it.")
+        reader = reader or next(by_name, None)
         if reader is None:
-            if path.is_dir():
-                raise ReadError(f"{path} is a folder, and no bag of ROS 2: name the file in it.")
             suffixes = ", ".join(ending for x in READERS.values() for ending in x.suffixes)
             ending = f"ending {suffix!r}" if suffix else "name, which has no ending,"
             raise ReadError(
