@@ -24,6 +24,7 @@ from ._verdict import Bound, LIMIT
 _NEAR = 1e-2  # of the change that shows: a parameter below it is at zero
 _AT_ZERO = 1e-6  # likewise, where its slopes are evaluated
 _ROUNDS = 4  # of releasing parameters that do not belong at zero
+_POLISHES = 3  # steps
 _SMALLEST = 60.0  # in ln, below the start: 1e-26 of it
 _RISE = 2.71  # of the cost, at the end of a one-sided 95 % interval
 _EVALUATIONS = 12  # of the profile
@@ -113,13 +114,13 @@ def solve_within_bounds(
 
 
 def polish(
-    problem: Problem, z: Vector, fixed: Sequence[int], start: Solution, rounds: int = 3
+    problem: Problem, z: Vector, fixed: Sequence[int], start: Solution
 ) -> tuple[Solution, Linearised]:
     """The optimum over the other parameters, from near it, by undamped Gauss-Newton steps."""
     free = np.setdiff1d(np.arange(z.size), fixed)
     solution = solution_at(problem, z, steps=start.steps)
     local = linearise(problem, solution)
-    for _ in range(rounds):
+    for _ in range(_POLISHES):
         if not (np.isfinite(local.cost) and np.all(np.isfinite(local.jacobian))):
             break  # so far out that the model has no numbers
         step = np.linalg.lstsq(local.jacobian[:, free], -local.residual, rcond=1e-10)[0]
