@@ -13,7 +13,7 @@ import warnings
 import zlib
 from collections.abc import Callable
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 from typing import Any, Literal, NamedTuple
 
 import jax
@@ -21,18 +21,40 @@ import platformdirs
 from jax.experimental.compilation_cache import compilation_cache
 from jaxtyping import PyTree
 
-from . import _plain
+
+# The compilers' functions without compilers: all names that the package takes from `jaxquad._xla`.
+PLAIN = SimpleNamespace(
+    reason="",  # why there are no compilers
+    as_one_kernel=lambda function, *args: function(*args),
+    scan_on_device=lambda step, carry, signals, members, scan: None,
+    why_no_device_kernels=lambda: PLAIN.reason,
+    why_plain=lambda: PLAIN.reason,
+    or_plain=lambda name, kind, run: run(),
+    set_kernel=lambda kernel: _require_switch(kernel),
+    switches=tuple,
+    left_plain=tuple,
+    compiler_options=dict,
+    brief_options=dict,
+    hasty_options=dict,
+    no_fuse=lambda function, *args: function(*args),
+    evaluate_once=lambda function, *, least: function,
+)
+
+
+def _require_switch(kernel: str) -> None:
+    if kernel not in ("auto", "off"):
+        raise ValueError(f'kernel is "{kernel}", but it must be "auto" or "off"')
 
 
 @ft.cache
-def compilers() -> ModuleType:
+def compilers() -> ModuleType | SimpleNamespace:
     """`jaxquad._xla`; without it, or with a JAX that lacks what it needs, plain scans."""
     try:
         import jaxquad._xla as xla
     except (ImportError, AttributeError) as error:  # JAX's interfaces to its compiler may move.
-        _plain.reason = f"this JAX ({jax.__version__}) lacks what kernels are made with ({error})"
-        warnings.warn(f"loops take longer than they could: {_plain.reason}", stacklevel=2)
-        return _plain
+        PLAIN.reason = f"this JAX ({jax.__version__}) lacks what kernels are made with ({error})"
+        warnings.warn(f"loops take longer than they could: {PLAIN.reason}", stacklevel=2)
+        return PLAIN
     return xla
 
 

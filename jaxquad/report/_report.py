@@ -19,12 +19,7 @@ from jaxquad.spectra import find_line, FrequencyResponse
 
 from ._answers import answer_section
 from ._loop import LawLoop, loop_section, step_section
-from ._numbers import (
-    identifiability_section,
-    parameter_section,
-    tuned_section,
-    verdict_headlines,
-)
+from ._numbers import identifiability_section, parameter_section, tuned_section, verdict_headlines
 from ._page import Cell, embed_figure, Headline, Image, render_page, Section, Table
 from ._results import attempt, Provenance, provenance_section
 
