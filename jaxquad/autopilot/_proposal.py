@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxquad._core import announce, Message, plain_content
+from jaxquad._core import announce, Message, plain_content, staged_files
 from jaxquad.records import AXES
 from jaxquad.report import Provenance, provenance, write_json
 
@@ -326,7 +326,7 @@ def _write_axes(
     flown = axes[0].flown
     overview = f"{flown.firmware} {'.'.join(map(str, flown.version))}, rate loops".strip()
 
-    def files() -> list[Path]:
+    def files(folder: Path) -> list[Path]:
         curves = (one.write_curve(folder) for one in axes)
         return [*next((paths for paths in curves if paths), []), *result.parameters.write(folder)]
 
@@ -337,17 +337,19 @@ def _write_axes(
 
 def write_result(
     folder: Path, log: Path, settings: DesignSettings, content: Mapping[str, object],
-    files: Callable[[], Sequence[Path]], pages: Callable[[Provenance], Sequence[PilotPage]],
+    files: Callable[[Path], Sequence[Path]], pages: Callable[[Provenance], Sequence[PilotPage]],
 ) -> list[Path]:  # fmt: skip
-    """The page, the JSON with where it is from, and what `files` writes."""
+    """The page, the JSON with where it is from, and what `files` writes: all, or nothing."""
     announce("parameter files")
     stated = {k: v for k, v in settings.content().items() if v is not None}
     words = ["jaxquad", "autopilot", str(log), *settings.words()]
     origin = provenance(log, command=shlex.join(words), settings=stated)
     with_origin = {**content, "provenance": origin.content()}
-    stored, written = write_json(folder / "autopilot.json", with_origin), files()
-    announce("the page")
-    return [write_pilot_page(folder / "autopilot.html", *pages(origin)), stored, *written]
+    with staged_files(folder) as draft:
+        stored, written = write_json(draft / "autopilot.json", with_origin), files(draft)
+        announce("the page")
+        paths = [write_pilot_page(draft / "autopilot.html", *pages(origin)), stored, *written]
+    return [folder / path.name for path in paths]
 
 
 def beyond_limits(

@@ -326,10 +326,9 @@ class ADRCAutopilot:
 
         **Returns:** their paths.
         """
-        path = Path(folder)
-        files = lambda: [write_file(path / name, text) for name, text in self._texts().items()]
+        files = lambda path: [write_file(path / name, x) for name, x in self._texts().items()]
         pages = lambda origin: [adrc_page(self, origin)]
-        return write_result(path, self.path, self.settings, self.content(), files, pages)
+        return write_result(Path(folder), self.path, self.settings, self.content(), files, pages)
 
     def _texts(self) -> dict[str, str]:
         """The parameter files, and the table of what changes; without a proposal what flew."""
