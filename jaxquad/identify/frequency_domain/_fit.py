@@ -34,7 +34,7 @@ from ._cost import (
     describe_usable,
     least_coherence,
     MaximumLikelihood,
-    mixings_of,
+    mixing_of,
     Points,
     points_of,
     precise_points,
@@ -187,11 +187,8 @@ def fit(
 def fit_with(
     model: PyTree, frfs: Sequence[FrequencyResponse], options: Options, *, rounds: int = 3
 ) -> Fit:
-    """Fit as `jq.fit` does.
-
-    `rounds` is how often to solve again with what the model leaves unexplained as a floor on the
-    random error; 0 for estimates under the noise alone, whose costs compare structures.
-    """
+    """Fit as `jq.fit` does, and up to `rounds` times more with what the model leaves unexplained as
+    a floor on the random error; without, costs compare structures."""
     small = all(np.size(frf.omega) <= _SMALL for frf in frfs)
     with one_blas_thread() if small else contextlib.nullcontext():
         return _fit(with_arrays(model), frfs, options, rounds)
@@ -228,7 +225,8 @@ def _fit(model: PyTree, frfs: Sequence[FrequencyResponse], options: Options, rou
         return unfitted(model, parameters, verdict, tuple(remarks))
     problem = make_problem(model, parameters, frfs, options.conditions, options.priors)
     pairs = zip(usable_points, problem.silences, strict=True)
-    points = points_of(frfs, [mask & ~silent for mask, silent in pairs])
+    masks = (mask & ~silent for mask, silent in pairs)
+    points = [points_of(*pair) for pair in zip(frfs, masks, strict=True)]
     delays = free_delays(problem)
     if delays:
         problem = unsampled(problem, delays)
@@ -243,7 +241,8 @@ def _fit(model: PyTree, frfs: Sequence[FrequencyResponse], options: Options, rou
 
     def weighted(points: Sequence[Points], weights: Sequence[Weights]) -> Problem:
         """Only a likelihood knows what it would mean that points share noise."""
-        return problem.weighted(weights, mixings_of(points, weights) if is_likelihood else None)
+        pairs = zip(points, weights, strict=True)
+        return problem.weighted(weights, [mixing_of(*x) for x in pairs] if is_likelihood else None)
 
     def are_close(old: Sequence[Numbers], new: Sequence[Weights], share: float) -> bool:
         both = zip(map(np.asarray, old), new, strict=True)

@@ -255,10 +255,8 @@ def verify(
 def _significant_unknowns(
     rest: Outputs, columns: Float[np.ndarray, "samples outputs unknowns"], motions: Motions
 ) -> Float[np.ndarray, " significant"]:
-    """Least squares without the fast transients that do not stand out, the fastest first.
-
-    They stand out where they are beyond their errors, in noise like what is left.
-    """
+    """Least squares without the fast transients that do not stand out, the fastest first. They
+    stand out where they are beyond their errors, in noise like what is left."""
     groups = list(motions.groups)
     while True:
         flat = columns.reshape(rest.size, -1)
