@@ -8,7 +8,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import PyTree
 
-from jaxquad._core import Message, one_blas_thread, require_x64
+from jaxquad._core import concrete_values, is_traced, Message, one_blas_thread, require_x64
 from jaxquad.models import LaggedIntegrator, with_arrays
 from jaxquad.spectra import FrequencyResponse
 
@@ -30,6 +30,7 @@ from ._cost import (
     Weights,
     widen_band,
 )
+from ._derivatives import Descent, Inputs, with_derivatives
 from ._parameters import Condition, Free, Numbers, select_parameters, Tie
 from ._problem import (
     make_problem,
@@ -140,6 +141,9 @@ def fit(
     Source: docs/identification.md; Eq. (14) of the paper, as corrected in docs/equations.md.
     """
     require_x64("a fit")
+    inputs = Inputs(model, frf, conditions, priors)
+    if traced := is_traced(inputs):
+        model, frf, conditions, priors = concrete_values(inputs, "jq.fit")
     require_model("fit", model)
     frfs = require_responses(frf)
     if conditions is None:
@@ -148,23 +152,37 @@ def fit(
     options = Options(
         free, tied, cost, conditions, priors, band, min_coherence, starts, solver, max_steps
     )
-    return fit_with(model, frfs, options)
+    descents: list[Descent] = []
+    fit = fit_with(model, frfs, options, descents=descents)
+    return with_derivatives(fit, descents, inputs, cost) if traced else fit
 
 
 def fit_with(
-    model: PyTree, frfs: Sequence[FrequencyResponse], options: Options, *, rounds: int = 3
+    model: PyTree,
+    frfs: Sequence[FrequencyResponse],
+    options: Options,
+    *,
+    rounds: int = 3,
+    descents: list[Descent] | None = None,
 ) -> Fit:
     """Fit as `jq.fit` does.
 
     `rounds` is how often to solve again with what the model leaves unexplained as a floor on the
-    random error; 0 for estimates under the noise alone, whose costs compare structures.
+    random error; 0 for estimates under the noise alone, whose costs compare structures. `descents`
+    gets those that were made.
     """
     small = all(np.size(frf.omega) <= _SMALL for frf in frfs)
     with one_blas_thread() if small else contextlib.nullcontext():
-        return _fit(with_arrays(model), frfs, options, rounds)
+        return _fit(with_arrays(model), frfs, options, rounds, [] if descents is None else descents)
 
 
-def _fit(model: PyTree, frfs: Sequence[FrequencyResponse], options: Options, rounds: int) -> Fit:
+def _fit(
+    model: PyTree,
+    frfs: Sequence[FrequencyResponse],
+    options: Options,
+    rounds: int,
+    descents: list[Descent],
+) -> Fit:
     # The problem: points, parameters, priors.
     cost, band, solver, max_steps = options.cost, options.band, options.solver, options.max_steps
     parameters = select_parameters(model, options.free, options.tied)
@@ -224,10 +242,12 @@ def _fit(model: PyTree, frfs: Sequence[FrequencyResponse], options: Options, rou
         starts = spread_starts(parameters, options.starts, fastest=fastest)
         solution, minima = solve_from_many(problem, starts, solver, max_steps)
         solution = solve_within_bounds(problem, solution, solver, max_steps)
+    descents.append(Descent(problem, points, solution))
     again = weigh(points, solution)
     if not are_close(weights, again, 1e-4):
         problem = weighted(points, again)
         solution = solve_within_bounds(problem, solution.z, solver, max_steps)
+        descents.append(Descent(problem, points, solution))
     _check_finite(solution)
     check_priors(problem, solution)
     # Again with what the model leaves unexplained as a floor on the random error, where it does
@@ -241,6 +261,7 @@ def _fit(model: PyTree, frfs: Sequence[FrequencyResponse], options: Options, rou
             break
         problem, lifted = weighted(raised, weights), True
         solution = solve_within_bounds(problem, solution.z, solver, max_steps)
+        descents.append(Descent(problem, raised, solution))
         _check_finite(solution)
         weighting = weighting_at(problem, points, solution)
     if lifted:
