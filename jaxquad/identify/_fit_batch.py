@@ -18,6 +18,7 @@ from jaxquad._core import (
     begin,
     CONVERGED,
     decrement,
+    Message,
     Normal,
     require_x64,
     RUNNING,
@@ -39,6 +40,7 @@ from .frequency_domain._cost import (
     Range,
     usable,
 )
+from .frequency_domain._feedthrough import free_delays
 from .frequency_domain._fit import check_options
 from .frequency_domain._parameters import (
     Free,
@@ -51,7 +53,7 @@ from .frequency_domain._parameters import (
 )
 from .frequency_domain._problem import make_problem, Problem, problem_normal
 from .frequency_domain._result import Fit
-from .frequency_domain._sampled import behind_hold, hold_of
+from .frequency_domain._sampled import behind_hold, direct_part, hold_of
 from .frequency_domain._solve import solution_at, stopped_early
 from .uncertainty._assess import assess
 from .uncertainty._error_budget import weighting_at
@@ -465,6 +467,15 @@ def fit_batch(
     if len(holds) > 1:
         raise ValueError(
             f"the inputs of the responses are held for {holds} s: fit those of one hold together"
+        )
+    passes = holds[0] and eqx.filter_eval_shape(direct_part, model) is not None
+    if passes and free_delays(make_problem(model, parameters, frfs[:1])):
+        raise ValueError(
+            Message(
+                f"the input is held for {holds[0]:g} s and passes directly to an output, late by a "
+                "free delay that shows only in whole samples: fit the responses one by one with "
+                "jq.fit, which tries these, or leave the delay out of «free=»"
+            )
         )
     points = points_of(frfs, used)
 

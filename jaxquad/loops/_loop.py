@@ -42,7 +42,10 @@ class Controller(Protocol):
     - `applied(state, achieved)`: gets what the drive really gave, before the next sample;
     - `signals(state)`: a dict of arrays `[axes, *ensemble]` to record;
     - `prepared()`: the controller to run, with what is the same for all samples computed;
-    - `linear(axis, member)`: a `jq.control.LinearController` to analyse.
+    - `linear(axis, member)`: a `jq.control.LinearController` to analyse and to certify;
+    - `tunable()`: what `jq.tune` varies, see `jq.control.Tunable`;
+    - `scheduled_at(inertia)`: the gains of an inertia, see `jq.control.ScheduledController`;
+    - `c_source(axes, precision)`: a `jq.export.Source` for `jq.export.write_c_header`.
     """
 
     def init(self, like: Vector) -> PyTree: ...

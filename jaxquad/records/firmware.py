@@ -280,7 +280,9 @@ class FirmwareLog:
     remarks_on: Callable[[Log, Setup, Spans], tuple[str, ...]] = lambda log, setup, spans: ()
     numbers_chirps: bool = False  # whether a proposal lists all chirps with their numbers
     gyro_cutoffs: tuple[str, ...] = ()  # one of these is in each log that tells the gyro's filters
-    reader: Reader | None = None  # of its files, where no format of `jq.read` is theirs
+    # Of its files, where no format of `jq.read` is theirs. For firmwares that are registered: those
+    # of the package are not imported before a file is recognised, so theirs are in `formats`.
+    reader: Reader | None = None
 
 
 def hold_by_rate(log: Log, name: str) -> tuple[float | None, tuple[str, ...]]:

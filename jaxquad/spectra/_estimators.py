@@ -447,6 +447,11 @@ class Periodic(eqx.Module):
         return samples
 
 
+# To add one: settings here, and a function of (records, omega, settings, method) that returns an
+# `Estimate`, as `estimate_periodic`, which `frequency_response` calls.
+DirectEstimator = Welch | Composite | LocalPolynomial | Periodic
+
+
 class JointInputOutput(eqx.Module):
     """Response estimated with external references r: G = S_ry S_ru^-1, unbiased in closed loop.
 
@@ -461,7 +466,7 @@ class JointInputOutput(eqx.Module):
     - `spectra`: any of the other estimators.
     """
 
-    spectra: Welch | Composite | LocalPolynomial | Periodic = LocalPolynomial()
+    spectra: DirectEstimator = LocalPolynomial()
 
 
-Estimator = Welch | Composite | LocalPolynomial | Periodic | JointInputOutput
+Estimator = DirectEstimator | JointInputOutput

@@ -130,7 +130,6 @@ class FrequencyResponse:
     input_names: tuple[str, ...] = eqx.field(static=True)
     output_names: tuple[str, ...] = eqx.field(static=True)
     remarks: Sequence[Remark] = eqx.field(static=True, default=())
-    integrators: int = eqx.field(static=True, default=0)  # removed before windowing
     resolution: float = eqx.field(static=True, default=0.0)  # one cycle in a window, rad/s
     distortion: Distortion | None = None  # of a periodic excitation
     log_noise_covariance: Square | None = None
@@ -333,7 +332,11 @@ class FrequencyResponse:
 
 
 class Estimate(NamedTuple):
-    """What an estimator makes of records; nan and infinite errors where it is undetermined."""
+    """What an estimator makes of records; nan and infinite errors where it is undetermined.
+
+    `independent_errors` makes the `errors` of estimates that share no noise between frequencies;
+    `log_noise_covariance` of n independent averages is then the identity over n.
+    """
 
     omega: Grid
     response: Responses
@@ -434,7 +437,6 @@ def frequency_response(
         input_names=first.input_names,
         output_names=first.output_names,
         remarks=Remarks(find_remarks),
-        integrators=0 if isinstance(estimator, Periodic) else estimator.integrators,
         resolution=estimate.resolution,
         distortion=estimate.distortion,
         log_noise_covariance=estimate.log_noise_covariance,

@@ -84,8 +84,12 @@ def with_derivatives(fit: Fit, descents: Sequence[Descent], inputs: Inputs, cost
 
     **Raises:** ValueError where there is no minimum to follow, or a function uses NumPy.
     """
-    if not descents or fit.verdict.kind == NO_MINIMUM:
+    if not fit.verdict.fitted or fit.verdict.kind == NO_MINIMUM:
         raise ValueError(f"a fit without a minimum has no derivative: {fit.verdict.summary}")
+    if not descents:
+        raise ValueError(
+            "this fit knows a delay only to its sample, which has no derivative: fix it (free=)"
+        )
     frfs = list(inputs.frf) if isinstance(inputs.frf, Sequence) else [inputs.frf]
     priors = [jnp.stack([one.value, one.standard_error]) for one in inputs.priors]
     model, steps = with_arrays(inputs.model), []

@@ -75,6 +75,31 @@ class Solution(NamedTuple):
         return not self.message
 
 
+MINIMUM = "minimum"
+FLAT = "flat: some change of parameters does not change the cost"
+SADDLE = "stationary, but no minimum: the cost falls to one side"
+WALL = "no minimum: no shorter step lowers the cost, yet its slope is not zero"
+UNFINISHED = "the maximum number of steps was reached"
+NOT_FINITE = "the model is not finite at the start"
+
+
+class Minimum(NamedTuple):
+    """A point at which the fits from some of the starts ended."""
+
+    cost: float  # sum of squares
+    z: Float[np.ndarray, " parameters"]
+    values: Float[np.ndarray, " parameters"]  # physical
+    starts: tuple[int, ...]  # which of them led here
+    decrement: float  # Newton decrement: half of what one more step would save of the cost
+    curvature: float  # smallest eigenvalue of the cost's Hessian, scaled to unit diagonal
+    kind: str  # "minimum", or what it is instead
+
+    @property
+    def is_minimum(self) -> bool:
+        """Whether slope and curvature are those of a minimum, isolated or flat."""
+        return self.kind in (MINIMUM, FLAT)
+
+
 class Frame(NamedTuple):
     """A problem without its arrays: what a program is compiled for."""
 
@@ -101,7 +126,8 @@ class _Unweighted:
 
     def __init__(self, problem: Problem):
         self.problem = problem
-        self.ids = tuple(map(id, (problem.model, problem.measured, problem.parameters)))
+        names = ("model", "measured", "parameters", "aliases", "prior")
+        self.ids = tuple(id(getattr(problem, name)) for name in names)
 
     def __hash__(self) -> int:
         return hash(self.ids)

@@ -11,13 +11,19 @@ from jaxquad._core import as_messages, Message
 from jaxquad.models import LaggedIntegrator, StateSpace, TransferFunction
 
 from ..frequency_domain._cost import widen_band
+from ..frequency_domain._feedthrough import DirectDelay
 from ..frequency_domain._parameters import Parameters
 from ..frequency_domain._problem import on_device, Problem
 from ..frequency_domain._refits import Origin
 from ..frequency_domain._result import Fit
 from ..frequency_domain._sampled import remarks_on_hold
-from ..frequency_domain._solve import is_saddle, same_responses, Solution, solution_at
-from ..frequency_domain._starts import Minimum
+from ..frequency_domain._solve import (
+    is_saddle,
+    Minimum,
+    same_responses,
+    Solution,
+    solution_at,
+)
 from ..output_error._noise import NoiseModel
 from ..output_error._simulated import HasStateSpace, HasTransferFunction, linear_model
 from ._error_budget import (
@@ -216,7 +222,10 @@ def assess(
                 f"costs {rivals[0].cost:.4g} at {', '.join(names)} = {values}: record more, or "
                 "over a wider band, to know which is right",
             )
-        remarks += remarks_on_priors(budget.prior.misfit, verdict, by_data, chi_squared=doubted)
+        by_user = sum(not isinstance(q, DirectDelay) for q in problem.quantities)
+        if by_user:
+            pulls = budget.prior.misfit[:by_user]
+            remarks += remarks_on_priors(pulls, verdict, by_data, chi_squared=doubted)
         if _LARGE < amplitude <= _NO_MODEL:
             remark(
                 "discrepancy",
