@@ -265,8 +265,8 @@ def as_float64(label: str, values: ArrayLike, *, copy: bool = True) -> np.ndarra
         if type(error).__name__ != "TracerArrayConversionError":
             raise
         raise RecordError(
-            f"{label} is traced by JAX: records and their frequency responses are made by NumPy and "
-            "have no derivatives; take them by the response's numbers, «which jq.fit has»."
+            f"{label} is traced by JAX, but records and frequency responses are made by NumPy and "
+            "have no derivatives: take them by the numbers of the response, which jq.fit has."
         ) from error
     if array.dtype.names:
         raise RecordError(

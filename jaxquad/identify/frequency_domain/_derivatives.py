@@ -54,7 +54,7 @@ class Descent(NamedTuple):
     solution: Solution
 
 
-class _Known(NamedTuple):
+class _Data(NamedTuple):
     """`Inputs` as a problem has them; of each response the values, their errors, the coherence."""
 
     model: PyTree
@@ -95,7 +95,7 @@ def with_derivatives(fit: Fit, descents: Sequence[Descent], inputs: Inputs, cost
     model, steps = with_arrays(inputs.model), []
     conditions = tuple(require_conditions(model, inputs.conditions, len(frfs)))
     responses = tuple((frf.response, frf.random_error, frf.coherence) for frf in frfs)
-    known = _Known(model, conditions, jnp.stack(priors) if priors else np.zeros((0, 2)), responses)
+    data = _Data(model, conditions, jnp.stack(priors) if priors else np.zeros((0, 2)), responses)
     for problem, points, solution in descents:
         plain = tuple(
             replace(one, frf=replace(one.frf, remarks=(), log_noise_covariance=None))
@@ -111,7 +111,7 @@ def with_derivatives(fit: Fit, descents: Sequence[Descent], inputs: Inputs, cost
     # Strictness about types and shapes is for a user's own arrays.
     with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
         try:
-            z = _estimate(known, (steps, cost), grids)
+            z = _estimate(data, (steps, cost), grids)
         except jax.errors.TracerArrayConversionError as error:
             raise ValueError(
                 f"{type(cost).__name__}, or another function of this fit, computes with NumPy, "
@@ -128,49 +128,49 @@ def with_derivatives(fit: Fit, descents: Sequence[Descent], inputs: Inputs, cost
         return replace(fit, model=on_device(parameters.replace(model, values)), values=values)
 
 
-def _estimate(known: _Known, rest: PyTree, grids: tuple) -> Vector:
-    """Where the last descent stopped, with its derivatives by what is known."""
-    (frame, arrays), count = take_apart((known, rest)), len(take_apart(known)[1])
+def _estimate(data: _Data, rest: PyTree, grids: tuple) -> Vector:
+    """Where the last descent stopped, with its derivatives by the data."""
+    (frame, arrays), count = take_apart((data, rest)), len(take_apart(data)[1])
     rest, z = arrays[count:], rest[0][-1].z
 
     @jax.custom_jvp
-    def estimate(known: list[Numbers]) -> Vector:
+    def estimate(data: list[Numbers]) -> Vector:
         return jnp.asarray(z)
 
     @estimate.defjvp
     def along(primals, tangents):
-        (known,), (changes,) = primals, tangents
-        if is_traced(known):  # by a second derivative
-            follow = lambda known: _follow_jitted(frame, grids, known, rest)[0]
-            return jax.jvp(follow, (known,), (changes,))
-        slopes, curvature = _slopes()(frame, grids, known, rest)
+        (data,), (changes,) = primals, tangents
+        if is_traced(data):  # by a second derivative
+            follow = lambda data: _follow_jitted(frame, grids, data, rest)[0]
+            return jax.jvp(follow, (data,), (changes,))
+        slopes, curvature = _slopes()(frame, grids, data, rest)
         if not np.linalg.eigvalsh(np.asarray(curvature))[0] > _FLAT:
             raise np.linalg.LinAlgError
         smooth = (change for change in changes if change.dtype != jax.dtypes.float0)
         pairs = zip(slopes, smooth, strict=True)
         change = sum(jnp.real(jnp.tensordot(slope, x, x.ndim)) for slope, x in pairs)
-        return estimate(known), change
+        return estimate(data), change
 
     return estimate(arrays[:count])
 
 
 @ft.cache
 def _slopes() -> Callable[..., tuple[list[Array], Matrix]]:
-    """The program of the estimates' slopes by all that is known, and of the last curvature.
+    """The program of the estimates' slopes by the data, and of the last curvature.
 
     There are few parameters, so that both modes share it; and it takes brief compiling, as a
     program within a derivative cannot.
     """
 
-    def slopes(frame, grids, known, rest):
-        smooth = [jnp.issubdtype(x.dtype, jnp.inexact) for x in known]
+    def slopes(frame, grids, data, rest):
+        smooth = [jnp.issubdtype(x.dtype, jnp.inexact) for x in data]
 
         def follow(chosen):
             left = iter(chosen)
-            filled = [next(left) if one else x for x, one in zip(known, smooth, strict=True)]
+            filled = [next(left) if one else x for x, one in zip(data, smooth, strict=True)]
             return _follow(frame, grids, filled, rest)
 
-        chosen = [x for x, one in zip(known, smooth, strict=True) if one]
+        chosen = [x for x, one in zip(data, smooth, strict=True) if one]
         z, pull, curvature = jax.vjp(follow, chosen, has_aux=True)
         return jax.vmap(pull)(jnp.eye(z.size))[0], curvature
 
@@ -178,13 +178,13 @@ def _slopes() -> Callable[..., tuple[list[Array], Matrix]]:
 
 
 def _follow(
-    frame: Frame, grids: tuple, known: list[Numbers], rest: list[Numbers]
+    frame: Frame, grids: tuple, data: list[Numbers], rest: list[Numbers]
 ) -> tuple[Vector, Matrix]:
     """Where the last descent stopped, from stop to stop, and the curvature there.
 
     `grids` has the places of the points in use, and their frequencies.
     """
-    inputs, (steps, cost) = frame.filled([*known, *rest])
+    inputs, (steps, cost) = frame.filled([*data, *rest])
     problem, z = steps[0].problem, jnp.asarray(steps[0].z)
     for k, step in enumerate(steps):
         rows = zip(step.points, inputs.frfs, grids, strict=True)
@@ -206,10 +206,10 @@ def _follow(
             prior=inputs.prior,
             measured=tuple(one.frf.response for one in points),
         ).weighted(weights, [mixing and mixing._replace(idle=None) for mixing in mixings])
-        whole, arrays = take_apart(problem)
-        z = _minimum(whole, step.z, step.moving, arrays)
+        frame, arrays = take_apart(problem)
+        z = _minimum(frame, step.z, step.moving, arrays)
     fixed = jax.lax.stop_gradient((z, arrays))
-    return z, _unit(_curvature(whole, *fixed), step.moving)[0]
+    return z, _unit(_curvature(frame, *fixed), step.moving)[0]
 
 
 _follow_jitted = jax.jit(_follow, static_argnums=(0, 1))
