@@ -109,7 +109,7 @@ class Parameters:
         return model
 
 
-def namespace_of(x: Numbers):
+def namespace_of(x: Numbers) -> Any:
     """The module whose functions take `x`: NumPy, or `jax.numpy`."""
     return np if isinstance(x, np.ndarray) else jnp
 
