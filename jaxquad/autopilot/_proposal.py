@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxquad._core import announce, Message, plain_content
+from jaxquad._core import announce, Message, plain_content, staged_files
 from jaxquad.records import AXES
 from jaxquad.report import Provenance, provenance, write_json
 
@@ -34,7 +34,6 @@ class FilterVerdict:
     shared: SharedChange | None = None
 
     def content(self) -> dict[str, object]:
-        """All of it, for JSON."""
         return {
             "text": self.text,
             "flown": dict(self.flown),
@@ -65,6 +64,12 @@ class AutopilotProposal:
     filters: FilterVerdict | None = None  # what freeing them brings; None without a search
     noise: GyroNoise | None = None  # of the gyros, where the log shows it
     throttle: ThrottleVerdict | None = None  # where gains hold, and the thrust curve, apart
+
+    @property
+    def title(self) -> str:
+        """Firmware, version and axis."""
+        name, version = self.flown.firmware, ".".join(map(str, self.flown.version))
+        return f"{name} {version}, rate loop of {AXES[self.flown.axis]}".replace(" ,", ",")
 
     @property
     def plants(self) -> PlantSource:
@@ -192,9 +197,7 @@ class AutopilotProposal:
         ]
 
     def __str__(self) -> str:
-        flown = self.flown
-        version = ".".join(map(str, flown.version))
-        lines = [f"{flown.firmware} {version}, rate loop of {AXES[flown.axis]}".replace(" ,", ",")]
+        flown, lines = self.flown, [self.title]
         lines += [f"  {name} = {value:.6g}" for name, value in self.old.items()]
         lines += [f"  not modelled: {text}" for text in flown.loop.unmodelled]
         lines += [f"  {flown.filters_text}"] if flown.filters_text else []
@@ -323,7 +326,7 @@ def _write_axes(
     flown = axes[0].flown
     overview = f"{flown.firmware} {'.'.join(map(str, flown.version))}, rate loops".strip()
 
-    def files() -> list[Path]:
+    def files(folder: Path) -> list[Path]:
         curves = (one.write_curve(folder) for one in axes)
         return [*next((paths for paths in curves if paths), []), *result.parameters.write(folder)]
 
@@ -334,17 +337,19 @@ def _write_axes(
 
 def write_result(
     folder: Path, log: Path, settings: DesignSettings, content: Mapping[str, object],
-    files: Callable[[], Sequence[Path]], pages: Callable[[Provenance], Sequence[PilotPage]],
+    files: Callable[[Path], Sequence[Path]], pages: Callable[[Provenance], Sequence[PilotPage]],
 ) -> list[Path]:  # fmt: skip
-    """The page, the JSON with where it is from, and what `files` writes."""
+    """The page, the JSON with where it is from, and what `files` writes: all, or nothing."""
     announce("parameter files")
     stated = {k: v for k, v in settings.content().items() if v is not None}
     words = ["jaxquad", "autopilot", str(log), *settings.words()]
     origin = provenance(log, command=shlex.join(words), settings=stated)
     with_origin = {**content, "provenance": origin.content()}
-    stored, written = write_json(folder / "autopilot.json", with_origin), files()
-    announce("the page")
-    return [write_pilot_page(folder / "autopilot.html", *pages(origin)), stored, *written]
+    with staged_files(folder) as draft:
+        stored, written = write_json(draft / "autopilot.json", with_origin), files(draft)
+        announce("the page")
+        paths = [write_pilot_page(draft / "autopilot.html", *pages(origin)), stored, *written]
+    return [folder / path.name for path in paths]
 
 
 def beyond_limits(

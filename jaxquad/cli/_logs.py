@@ -1,6 +1,7 @@
 """Commands on logs: channels, identify, report, verify, and batch for all logs of a folder."""
 
 import argparse
+import io
 import math
 import sys
 from collections import Counter
@@ -8,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import jaxquad.workflows as workflows
+from jaxquad._core import write_file
 from jaxquad.records import parse_mix, require_file
 from jaxquad.workflows import BatchSettings, default_folder, IdentifySettings, in_options, open_logs
 
@@ -79,7 +81,8 @@ def finish_identification(
     same = {"settings": result.settings.content()}
     with shell.stdout_for_json(options):
         print(in_options(result.message()), flush=True)
-        path = result.write(shell.folder_to_write(options, folder, "result.json", same, sources))
+        with shell.folder_to_write(options, folder, "result.json", same, sources) as free:
+            path = result.write(free)
         drawn = [name for name in result.figure_names if path.with_name(name).exists()]
         names = ", ".join(["report.html", *drawn])
         print(f"\n{path}, {names}{note.format(report=path.with_name('report.html'))}")
@@ -193,8 +196,8 @@ _OF_A_RECORD = {
   jaxquad verify results/flight second_flight.npz --start 20 --stop 45 --out verification.png
 
 Channels, rate and band are those of the result, unless other ones are given.
-exit codes: 0 done, 2 unusable input, 3 the record that was identified does not determine the
-parameters of the model, or the result holds none
+exit codes: 0 done, 2 unusable input, 3 the log contradicts the model, or the record that was
+identified does not determine its parameters, or the result holds none
 """,
 )
 def verify(declared: argparse.ArgumentParser) -> Run:
@@ -207,6 +210,7 @@ def verify(declared: argparse.ArgumentParser) -> Run:
         stored = workflows.load_result(options.result)
         require_file(options.file)
         shell.start_computing()
+        from jaxquad.identify import CONTRADICTS
         from jaxquad.plot import compare, headless
         from jaxquad.report import verification_content
 
@@ -219,17 +223,21 @@ def verify(declared: argparse.ArgumentParser) -> Run:
                 print("  a good agreement below does not make up for that")
             for doubt in stored.doubts[1:]:
                 print(f"! {doubt}")
-            print(check)
+            print(f"{check}\n{check.verdict}")
             if options.out:
                 picture = options.out if options.out.suffix else options.out.with_suffix(".png")
-                picture.parent.mkdir(parents=True, exist_ok=True)
+                image = io.BytesIO()
                 with headless():
-                    compare(check, title=options.file.name).figure.savefig(picture, dpi=130)
+                    compare(check, title=options.file.name).figure.savefig(
+                        image, dpi=130, format=picture.suffix[1:]
+                    )
+                write_file(picture, image.getvalue())
                 print(picture)
         if options.json:
             model = {"identifiable": stored.identifiable, "verdict": stored.summary}
             shell.print_json(model | verification_content(check))
-        return 0 if stored.identifiable else NOT_IDENTIFIABLE
+        sound = stored.identifiable and check.verdict.kind != CONTRADICTS
+        return 0 if sound else NOT_IDENTIFIABLE
 
     return run
 

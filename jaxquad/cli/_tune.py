@@ -52,8 +52,9 @@ def tune(declared: argparse.ArgumentParser) -> Run:
             print(_WORDS)
             same = {key: content[key] for key in ("settings", "identified_with")}
             wanted = options.out or stored.folder / "tuned"
-            folder = shell.folder_to_write(options, wanted, "tuned.json", same, logs)
-            print(f"\n{folder}: {', '.join(path.name for path in tuning.write(folder))}")
+            with shell.folder_to_write(options, wanted, "tuned.json", same, logs) as folder:
+                names = ", ".join(path.name for path in tuning.write(folder))
+            print(f"\n{folder}: {names}")
         if options.json:
             shell.print_json(content)
         return 0 if tuning.tuned.holds else _NOT_TO_BE_FLOWN
@@ -108,8 +109,8 @@ def run_autopilot(
     with shell.stdout_for_json(options):
         print(in_options(str(proposal)))
         same = {"settings": settings.content()}
-        folder = shell.folder_to_write(options, wanted, "autopilot.json", same, [log])
-        names = ", ".join(path.name for path in proposal.write(folder))
+        with shell.folder_to_write(options, wanted, "autopilot.json", same, [log]) as folder:
+            names = ", ".join(path.name for path in proposal.write(folder))
         print(f"\n{folder}: {names}{note.format(page=folder / 'autopilot.html')}")
     if options.json:
         shell.print_json(proposal.content())

@@ -95,6 +95,8 @@ from .output_error._verify import (
     Agreement as Agreement,
     compare as compare,
     Comparison as Comparison,
+    CONTRADICTS as CONTRADICTS,
+    GOOD_TIC as GOOD_TIC,
     Verification as Verification,
     verify as verify,
 )

@@ -71,7 +71,11 @@ class Sensor(Protocol):
 
 @runtime_checkable
 class LinearisablePlant(Protocol):
-    """A plant that `jq.analyse`, `jq.tune` and `jq.certify` can analyse as a linear loop."""
+    """A plant that `jq.analyse` can analyse as a linear loop.
+
+    Members of an ensemble, and so `jq.tune` and `jq.certify`, need more than that: a
+    `jq.DecoupledAxes` or a `jq.models.Multirotor`.
+    """
 
     def linearise(self, axis: int) -> LinearAxis:
         """One axis about rest."""

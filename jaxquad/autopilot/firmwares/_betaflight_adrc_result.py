@@ -10,11 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from jaxquad._core import announce, plain_content, write_file
-from jaxquad.identify import (
-    GainBand,
-    GainOverThrottle,
-    UndeterminedError,
-)
+from jaxquad.identify import GainBand, GainOverThrottle, UndeterminedError
 from jaxquad.plot import StepBand, ThrottleCurve
 from jaxquad.records import AXES
 from jaxquad.report import Headline, Provenance, Table
@@ -330,10 +326,9 @@ class ADRCAutopilot:
 
         **Returns:** their paths.
         """
-        path = Path(folder)
-        files = lambda: [write_file(path / name, text) for name, text in self._texts().items()]
+        files = lambda path: [write_file(path / name, x) for name, x in self._texts().items()]
         pages = lambda origin: [adrc_page(self, origin)]
-        return write_result(path, self.path, self.settings, self.content(), files, pages)
+        return write_result(Path(folder), self.path, self.settings, self.content(), files, pages)
 
     def _texts(self) -> dict[str, str]:
         """The parameter files, and the table of what changes; without a proposal what flew."""
@@ -401,7 +396,6 @@ _CURVE = 60  # points over the throttle
 
 
 def adrc_page(result: ADRCAutopilot, origin: Provenance) -> PilotPage:
-    """All that the page shows."""
     version, proposal = ".".join(map(str, result.version)), result.proposal
     flown, flight, axis = result.flown, result.flight, AXES.index(result.axis)
     headlines = [Headline(*VERDICTS[result.kind], result.verdict)]

@@ -36,7 +36,7 @@ from ._cost import (
     describe_usable,
     least_coherence,
     MaximumLikelihood,
-    mixings_of,
+    mixing_of,
     Points,
     points_of,
     precise_points,
@@ -200,12 +200,8 @@ def fit_with(
     rounds: int = 3,
     descents: list[Descent] | None = None,
 ) -> Fit:
-    """Fit as `jq.fit` does.
-
-    `rounds` is how often to solve again with what the model leaves unexplained as a floor on the
-    random error; 0 for estimates under the noise alone, whose costs compare structures. `descents`
-    gets those that were made.
-    """
+    """Fit as `jq.fit` does, and up to `rounds` times more with what the model leaves unexplained as
+    a floor on the random error; without, costs compare structures. `descents` gets all of them."""
     small = all(np.size(frf.omega) <= _SMALL for frf in frfs)
     with one_blas_thread() if small else contextlib.nullcontext():
         return _fit(with_arrays(model), frfs, options, rounds, [] if descents is None else descents)
@@ -248,7 +244,8 @@ def _fit(
         return unfitted(model, parameters, verdict, tuple(remarks))
     problem = make_problem(model, parameters, frfs, options.conditions, options.priors)
     pairs = zip(usable_points, problem.silences, strict=True)
-    points = points_of(frfs, [mask & ~silent for mask, silent in pairs])
+    masks = (mask & ~silent for mask, silent in pairs)
+    points = [points_of(*pair) for pair in zip(frfs, masks, strict=True)]
     delays = free_delays(problem)
     if delays:
         problem = unsampled(problem, delays)
@@ -263,7 +260,8 @@ def _fit(
 
     def weighted(points: Sequence[Points], weights: Sequence[Weights]) -> Problem:
         """Only a likelihood knows what it would mean that points share noise."""
-        return problem.weighted(weights, mixings_of(points, weights) if is_likelihood else None)
+        pairs = zip(points, weights, strict=True)
+        return problem.weighted(weights, [mixing_of(*x) for x in pairs] if is_likelihood else None)
 
     def are_close(old: Sequence[Numbers], new: Sequence[Weights], share: float) -> bool:
         both = zip(map(np.asarray, old), new, strict=True)

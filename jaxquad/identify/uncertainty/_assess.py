@@ -74,10 +74,8 @@ def assess(
     further: Sequence[str] = (),
     origin: Origin | None = None,
 ) -> Fit:
-    """Costs, bounds, calibrated covariance and identifiability at the solution.
-
-    The fit gets the `further` remarks and its `origin`.
-    """
+    """Costs, bounds, calibrated covariance and identifiability at the solution. The fit gets the
+    `further` remarks and its `origin`."""
     parameters, budget, bounds = problem.parameters, weighting.budget, ()
     names, count, start = parameters.names, parameters.count, units_of(solution)
     bread, gradient, units = budget.bread, budget.gradient, start  # by slopes at the solution
@@ -256,10 +254,8 @@ def assess(
 
 
 def is_unfinished(solution: Solution, step: Vector, covariance: Matrix) -> bool:
-    """Whether the solver stopped early, where the next `step` still moves an estimate.
-
-    Step and covariance, that of the noise, are those of relative changes.
-    """
+    """Whether the solver stopped early, where the next `step` still moves an estimate. Step and
+    covariance, that of the noise, are those of relative changes."""
     limit = _STILL * np.sqrt(np.maximum(np.diagonal(covariance), 0.0)) + _ROUNDING
     return not solution.converged and bool(np.any(np.abs(step) > limit))
 
@@ -267,10 +263,8 @@ def is_unfinished(solution: Solution, step: Vector, covariance: Matrix) -> bool:
 def no_minimum(
     names: tuple[str, ...], decrement: float, cost: float, *remedies: str, message: str = ""
 ) -> Verdict:
-    """The verdict on a stop from which a step would still lower the cost.
-
-    The `message` says why the solver stopped early, and is empty where it did not.
-    """
+    """The verdict on a stop from which a step would still lower the cost. The `message` says why
+    the solver stopped early, and is empty where it did not."""
     reason = f"one more Gauss-Newton step would lower the cost, {cost:.4g}, by {2 * decrement:.3g}"
     if message:
         reason = f"the fit has not converged: {message[:1].lower()}{message[1:]}; {reason}"
@@ -392,9 +386,7 @@ def make_fit(
     origin: Origin | None = None,
 ) -> Fit:
     """A result in physical units; both covariances are those of changes relative to `units`.
-
-    `freedom` is that of the noise estimate, infinite without.
-    """
+    `freedom` is that of the noise estimate, infinite without."""
     names, values = problem.parameters.names, np.asarray(solution.values)[: units.size]
     freedom = np.full(units.size, np.inf) if freedom is None else freedom
     pooled = pooled_freedom(freedom, np.ones(units.size))

@@ -151,7 +151,11 @@ def load_signals(path: str | Path) -> Signals:
             f"{type(path).__name__} is no path of a file: a table in memory is read by "
             "jq.records.from_dataframe, arrays by jq.Record(time, inputs, outputs)"
         )
-    signals = flattened(load_log(path))
+    log = load_log(path)
+    try:
+        signals = flattened(log)
+    except ReadError as error:
+        raise located(error, path) from error
     if not signals.arrays:
         raise ReadError(
             f"{path}: the file holds no numeric array of one or two dimensions. Objects of MATLAB "
@@ -175,10 +179,11 @@ def load_log(path: str | Path) -> Log:
         readers = [*(log.reader for log in registered_logs() if log.reader), *READERS.values()]
         by_content = (reader for reader in readers if reader.sniff(head, path))
         by_name = (reader for reader in readers if suffix in reader.suffixes)
-        reader = next(by_content, None) or next(by_name, None)
+        reader = next(by_content, None)
+        if reader is None and path.is_dir():
+            raise ReadError(f"{path} is a folder, and no bag of ROS 2: name the file in it.")
+        reader = reader or next(by_name, None)
         if reader is None:
-            if path.is_dir():
-                raise ReadError(f"{path} is a folder, and no bag of ROS 2: name the file in it.")
             suffixes = ", ".join(ending for x in READERS.values() for ending in x.suffixes)
             ending = f"ending {suffix!r}" if suffix else "name, which has no ending,"
             raise ReadError(
