@@ -24,7 +24,7 @@ from jaxquad.spectra import FrequencyResponse
 
 from ..uncertainty._error_budget import find_discrepancy, PriorRows, ResponseTerm
 from ..uncertainty._verdict import NO_MINIMUM
-from ._cost import Cost, mixings_of, Points
+from ._cost import Cost, mixing_of, Points
 from ._parameters import Condition, Numbers, require_conditions
 from ._problem import misfits, on_device, Prior, Problem, residuals
 from ._result import Fit
@@ -198,7 +198,8 @@ def _follow(
                 floor = _unexplained(steps[k - 1], points, reached)
                 points = [replace(one, floor=jnp.full(one.used.shape, floor)) for one in points]
         weights = [type(cost).weights(cost, *pair) for pair in zip(points, ratios, strict=True)]
-        mixings = mixings_of(points, weights) if step.is_mixed else [None] * len(points)
+        pairs = zip(points, weights, strict=True)
+        mixings = [mixing_of(*pair) if step.is_mixed else None for pair in pairs]
         problem = replace(
             step.problem,
             model=inputs.model,
