@@ -165,14 +165,9 @@ def _flights_of(log: Log) -> tuple[Flight, ...]:
 
 
 def propose(
-    path: str | Path,
-    *,
-    axis: str | None = None,
-    chirp: int | None = None,
-    flight: int | None = None,
-    start: float | int | None = None,
-    stop: float | int | None = None,
-) -> Proposal:
+    path: str | Path, *, axis: str | None = None, chirp: int | None = None,
+    flight: int | None = None, start: float | int | None = None, stop: float | int | None = None,
+) -> Proposal:  # fmt: skip
     """Propose which channels of an autopilot's log are command, rate and external reference.
 
     Injected excitation is found, with its time and band: ArduPilot's SystemID mode, PX4's

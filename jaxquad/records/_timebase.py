@@ -61,12 +61,9 @@ class ChannelSummary(NamedTuple):
 
 
 def channels(
-    path: str | Path,
-    *,
-    time: str | None = None,
-    time_unit: TimeUnit | None = None,
+    path: str | Path, *, time: str | None = None, time_unit: TimeUnit | None = None,
     dt: Number | None = None,
-) -> list[ChannelSummary]:
+) -> list[ChannelSummary]:  # fmt: skip
     """List the channels that `read` can take from a file.
 
     **Arguments:**
@@ -110,13 +107,9 @@ class Timebases:
     """
 
     def __init__(
-        self,
-        signals: Signals,
-        time: str | None,
-        time_unit: TimeUnit | None,
-        dt: Number | None = None,
-        time_factor: Number | None = None,
-    ):
+        self, signals: Signals, time: str | None, time_unit: TimeUnit | None,
+        dt: Number | None = None, time_factor: Number | None = None,
+    ):  # fmt: skip
         check_unit(time_unit)
         if time_factor is not None and not 0.5 <= time_factor <= 2:
             raise RecordError(

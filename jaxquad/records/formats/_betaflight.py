@@ -132,11 +132,9 @@ def _log(data: bytes, header: Header) -> tuple[dict[str, Table], list[str]]:
 
 
 def _table(
-    values: Int[np.ndarray, "samples fields"],
-    letter: str,
-    time: Float[np.ndarray, " samples"],
+    values: Int[np.ndarray, "samples fields"], letter: str, time: Float[np.ndarray, " samples"],
     header: Header,
-) -> Table:
+) -> Table:  # fmt: skip
     """Views of the decoded columns with the units that the header gives them."""
     frame = header.frames[letter]
     columns = {

@@ -73,14 +73,9 @@ _FIRMWARE = re.compile(r"\b[A-Z][\w:]*\w V\d+\.\d+[^\0,]*")
 
 
 def _log(
-    logged: Iterable[tuple[_Format, Mapping[str, np.ndarray]]],
-    scaling: _Scaling,
-    remarks: list[str],
-    stamped: Stamped,
-    texts: Iterable[str],
-    *,
-    applied: bool,
-) -> Log:
+    logged: Iterable[tuple[_Format, Mapping[str, np.ndarray]]], scaling: _Scaling,
+    remarks: list[str], stamped: Stamped, texts: Iterable[str], *, applied: bool,
+) -> Log:  # fmt: skip
     """The messages of each type with a time stamp as a table, or one per instance: `IMU[0]`.
 
     Their columns have their own scale `applied` or not; `texts` of VER and MSG name the firmware.
