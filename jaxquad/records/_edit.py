@@ -12,7 +12,6 @@ from ._channel import (
     Channel,
     chosen_span,
     clock_start,
-    FEWEST,
     longest_gap,
     longest_step,
     nonuniformity,
@@ -23,7 +22,7 @@ from ._channel import (
     window,
     within,
 )
-from ._errors import choose_range, GapError, mend_holes, RecordError, warn
+from ._log import choose_range, FEWEST, GapError, mend_holes, RecordError, warn
 from ._record import as_tuple, assemble, Record
 
 

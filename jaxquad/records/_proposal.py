@@ -11,9 +11,8 @@ from jaxtyping import Float
 
 from jaxquad._core import marked_text
 
-from ._errors import printable, RecordError
 from ._firmwares import firmware_log, firmware_names
-from ._log import flattened, Log, SettingChange, Signals
+from ._log import flattened, Log, printable, RecordError, SettingChange, Signals
 from .firmware import (
     AXES,
     channel_rate,

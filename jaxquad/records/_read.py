@@ -26,8 +26,7 @@ from ._channel import (
     without_turns,
 )
 from ._edit import combine, resample
-from ._errors import GapError, located, ReadError, RecordError, unknown_name, warn
-from ._log import known_unit
+from ._log import GapError, known_unit, located, ReadError, RecordError, unknown_name, warn
 from ._record import as_tuple, assemble, check_distinct, Hold, Record
 from ._timebase import Timebases
 from .formats import load_signals

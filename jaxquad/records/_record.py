@@ -20,7 +20,7 @@ from ._channel import (
     uniform_stamps,
     Valid,
 )
-from ._errors import mend_holes, RecordError, unknown_name, warn
+from ._log import mend_holes, RecordError, unknown_name, warn
 
 
 if TYPE_CHECKING:

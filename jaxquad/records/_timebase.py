@@ -13,7 +13,6 @@ from ._channel import (
     check_unit,
     clock_start,
     doubt_of_seconds,
-    FEWEST,
     Number,
     PER_SECOND,
     repair_time,
@@ -22,8 +21,17 @@ from ._channel import (
     TimeUnit,
     unwrap,
 )
-from ._errors import listed, located, ReadError, RecordError, unknown_name, warn
-from ._log import Signal, Signals
+from ._log import (
+    FEWEST,
+    listed,
+    located,
+    ReadError,
+    RecordError,
+    Signal,
+    Signals,
+    unknown_name,
+    warn,
+)
 from .formats import load_signals
 
 

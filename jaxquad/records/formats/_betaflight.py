@@ -11,8 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int, Integer
 
-from .._errors import ReadError
-from .._log import Log, Table
+from .._log import Log, ReadError, Table
 from ._betaflight_columns import scaled, with_derived, with_mixed_axes
 from ._betaflight_frames import (
     ADJUSTMENT,

@@ -14,8 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .._errors import ReadError
-from .._log import changes_of, describe_skips, Log, number_in, Table
+from .._log import changes_of, describe_skips, Log, number_in, ReadError, Table
 
 
 _FORMAT_TYPE = 128
