@@ -79,11 +79,8 @@ class Batch(NamedTuple):
 
     @property
     def evaluates_singly(self) -> bool:
-        """Whether members are evaluated one after the other: a `jq.StateSpace` without ties.
-
-        Its states are a loop of their own. Any other model of plain arithmetic becomes one kernel,
-        at a quarter of the cost of what evaluates the rest: at all frequencies at once.
-        """
+        """Whether members are evaluated one by one: a `jq.StateSpace`, whose states are a loop of
+        their own. Other models become one kernel, at a quarter of the cost."""
         return type(self.model) is StateSpace and not self.parameters.ties and not self.hold
 
 
@@ -490,9 +487,7 @@ def _sizes(where, z) -> Float[Array, "batch frequencies outputs inputs"]:
     return jax.vmap(one)(z)
 
 
-def _ratios(
-    where: Batch, measured: np.ndarray, solution: BatchSolution
-) -> Float[np.ndarray, "batch frequencies outputs inputs"]:
+def _ratios(where: Batch, measured: np.ndarray, solution: BatchSolution) -> np.ndarray:
     """|model / measurement| of every member; 1 where a fit ran away."""
     parts = [_sizes(where, solution.z[chunk]) for chunk in _places(len(solution.z), 2 * _CHUNK)]
     sizes = np.concatenate([np.asarray(part) for part in parts])

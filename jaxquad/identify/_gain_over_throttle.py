@@ -228,11 +228,8 @@ def _find_levels(
     records: Sequence[Record], throttle: str, span: tuple[float, float], rate: float, width: float,
     shortest: float,
 ) -> tuple[list[_Level], tuple[str, ...]]:  # fmt: skip
-    """Segments of nearly the same mean together, in the order of throttle; and what is left out.
-
-    A segment lasts at least `shortest` s, and the throttle moves by at most `width` within it. Its
-    record has command, rate and reference without the throttle, at no more than `rate`.
-    """
+    """Segments of nearly the same mean together, in the order of throttle, without its channel and
+    at no more than `rate`; and what is left out."""
     if span[0] == span[1]:
         raise ValueError(f"throttle_range is {span}: give the values at no and at full throttle")
     if not (0 < width <= 0.5 and shortest > 0):

@@ -116,6 +116,11 @@ def flattened(log: Log) -> Signals:
                 values, unit = (values, unit) if seconds is None else (seconds, "s")
             if values.dtype.kind not in "fiub" or values.ndim not in (1, 2):
                 continue
+            if max(values.shape) > MOST_SAMPLES:
+                raise ReadError(
+                    f"{full!r} has {max(values.shape)} samples, which is more than a record can "
+                    f"use ({MOST_SAMPLES}): cut the file into parts"
+                )
             if table.time is None and values.ndim == 2:
                 rows, columns = values.shape
                 alike = columns in lengths and rows not in lengths
@@ -143,14 +148,16 @@ def number_in(cell: str) -> float:
         return float("nan")
 
 
-_LARGEST = 4 * 2**30  # bytes of decoded arrays
-_DENSEST = 250  # decoded bytes per byte of the file: real logs stay far below
-_HARMLESS = 64 * 2**20  # bytes that any file may hold
+_HARMLESS = 64 * 2**20  # bytes of decoded arrays that any file may hold
+_DENSEST, _LARGEST = 250, 3 * 2**28  # decoded bytes per byte of the file, and in all ...
+_LOOSEST, _MOST = 3, 4 * 2**30  # ... which a file that is hardly compressed may go beyond
+MOST_SAMPLES = 20_000_000  # of a channel: more than five hours at 1 kHz
 
 
 def allowance(stored: int) -> int:
-    """How many bytes `stored` ones may decode to."""
-    return min(_LARGEST, max(_HARMLESS, _DENSEST * stored))
+    """How many bytes `stored` ones may decode to: lists and records of them stay near 2 GB."""
+    dense = max(_HARMLESS, min(_LARGEST, _DENSEST * stored))
+    return max(dense, min(_MOST, _LOOSEST * stored))
 
 
 def check_size(what: str, declared: int, stored: int, *, offset: int | None = None) -> None:

@@ -88,7 +88,8 @@ def channels(
     summaries = []
     for name in timebases.names:
         values = timebases.values(name)
-        finite = values[np.isfinite(values)]
+        is_finite = np.isfinite(values)
+        finite = values if is_finite.all() else values[is_finite]  # a long one is not copied
         low, high = (float(finite.min()), float(finite.max())) if finite.size else (np.nan, np.nan)
         try:
             clock = timebases.extent(name)

@@ -187,11 +187,8 @@ def fit(
 def fit_with(
     model: PyTree, frfs: Sequence[FrequencyResponse], options: Options, *, rounds: int = 3
 ) -> Fit:
-    """Fit as `jq.fit` does.
-
-    `rounds` is how often to solve again with what the model leaves unexplained as a floor on the
-    random error; 0 for estimates under the noise alone, whose costs compare structures.
-    """
+    """Fit as `jq.fit` does, and up to `rounds` times more with what the model leaves unexplained as
+    a floor on the random error; without, costs compare structures."""
     small = all(np.size(frf.omega) <= _SMALL for frf in frfs)
     with one_blas_thread() if small else contextlib.nullcontext():
         return _fit(with_arrays(model), frfs, options, rounds)

@@ -150,11 +150,8 @@ def has_few_slopes(problem: Problem) -> bool:
 
 
 def evaluate(problem: Problem, *places: Vector) -> list[Sensitivity]:
-    """Misfits and slopes at values of the free parameters, at all places in parallel.
-
-    Records of equal shape share a program, whatever they are weighted by: compiling it takes longer
-    than a fit.
-    """
+    """Misfits and slopes at all places in parallel. Records of equal shape share a program,
+    whatever they are weighted by: compiling it takes longer than a fit."""
     programs, running = _parts(_Unweighted(problem)), []
     for z in places:
         z_all = np.array(problem.parameters.start)

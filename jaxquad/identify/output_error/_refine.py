@@ -332,11 +332,8 @@ def assess_output_error(descent: Descent, records: Sequence[Record]) -> Fit:
 
 
 def _reduce(descent: Descent, evaluation: Evaluation, scale: Vector) -> Reduced:
-    """Slopes by relative changes, orthogonal to what else is fitted to each record.
-
-    That is its initial state, its trim and its noise model: the errors are those of a joint
-    estimate, in a closed loop too, where the input depends on the noise.
-    """
+    """Slopes by relative changes, orthogonal to initial state, trim and noise model of each record:
+    errors are those of a joint estimate, in a closed loop too."""
     projected, at, every = [], scale.size, scale.size
     noises = [noise.slopes for noise in descent.noise] or [None] * len(evaluation.misfits)
     terms, count = descent.problem.terms, descent.problem.base.parameters.count

@@ -70,11 +70,8 @@ def band_filter(
 def inputs_between_samples(
     record: Record, hold: str | None
 ) -> tuple[Float[np.ndarray, "samples inputs"], str]:
-    """The inputs, and how they run between their samples: "zero" (held) or "first" (straight).
-
-    Where `hold` does not say, the record does: held where they keep each value for a sample,
-    straight where nobody knows. What is held for less is straight, and half its hold late.
-    """
+    """The inputs, and how they run between samples: "zero" (held) or "first" (straight, unless the
+    record says otherwise). What is held for less is straight, half its hold late."""
     u = np.asarray(record.inputs)
     if hold not in ("first", "zero", None):
         raise ValueError(

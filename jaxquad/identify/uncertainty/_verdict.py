@@ -362,11 +362,8 @@ def _echelon(rows: Directions) -> Directions:
 def _analyse_groups(
     null: Directions, exact: Directions, information: Information
 ) -> tuple[list[Combination], list[Vector], list[str]]:
-    """Of each group of parameters that share null directions: what of them is determined.
-
-    Combinations of the kind, product or sum, that holds over a finite change; the values to which
-    that change leads; and names of parameters of which neither kind holds.
-    """
+    """Of each group of parameters in null directions: combinations of the kind, product or sum,
+    that holds over a finite change, values there, and names of which neither holds."""
     combinations, alternatives, curved = [], [], []
     if not len(null):
         return combinations, alternatives, curved

@@ -151,7 +151,11 @@ def load_signals(path: str | Path) -> Signals:
             f"{type(path).__name__} is no path of a file: a table in memory is read by "
             "jq.records.from_dataframe, arrays by jq.Record(time, inputs, outputs)"
         )
-    signals = flattened(load_log(path))
+    log = load_log(path)
+    try:
+        signals = flattened(log)
+    except ReadError as error:
+        raise located(error, path) from error
     if not signals.arrays:
         raise ReadError(
             f"{path}: the file holds no numeric array of one or two dimensions. Objects of MATLAB "

@@ -49,6 +49,9 @@ def load(path: Path) -> Log:
         while place < len(content):
             end = content.find(b"\n", min(place + _BLOCK, len(content)))
             end = len(content) if end < 0 else end + 1
+            if end - place > _BLOCK + _LONGEST_LINE:
+                begin = content.rfind(b"\n", place, place + _BLOCK) + 1 or place
+                raise _too_long(number + content.count(b"\n", place, begin), begin, end)
             block = content[place:end]
             table = _parse(block, header)
             table = _parse_rows(block, number, header) if table is None else table
@@ -119,6 +122,12 @@ def _topics(
     return columns, {name: filled[name] for name in columns if name in partly}, tuple(remarks)
 
 
+def _too_long(number: int, begin: int, end: int) -> ReadError:
+    return ReadError(
+        f"line {number} has {end - begin} bytes: the file is not a table", offset=begin
+    )
+
+
 def _header(content: bytes) -> _Header:
     comment, number, end = "", 0, -1
     while (begin := end + 1) < len(content):
@@ -126,9 +135,7 @@ def _header(content: bytes) -> _Header:
         end = len(content) if end < 0 else end
         number += 1
         if end - begin > _LONGEST_LINE:
-            raise ReadError(
-                f"line {number} has {end - begin} bytes: the file is not a table", offset=begin
-            )
+            raise _too_long(number, begin, end)
         text = content[begin:end].decode().strip(" ")
         if not text.strip():
             continue
