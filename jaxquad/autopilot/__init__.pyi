@@ -71,7 +71,6 @@ from ._page import (
     write_pilot_page as write_pilot_page,
 )
 from ._parameters import (
-    change_filters as change_filters,
     change_table as change_table,
     check_ranges as check_ranges,
     find_parameter as find_parameter,

@@ -165,6 +165,7 @@ class Firmware(abc.ABC):
     notches: tuple[tuple[str, str], ...] = ()  # static ones: the parameters of centre and width
     words: bool = False  # whether some of its parameters are words
     has_adrc: bool = False  # whether it can fly Betaflight's proposed ADRC
+    no_ladrc: str = "it has no disturbance observer"  # why it cannot run a LADRC of the angle
 
     @abc.abstractmethod
     def flown_loop(
@@ -269,10 +270,6 @@ class Firmware(abc.ABC):
                 return {row.name: p}
         raise ValueError(f"{self.log.title} has no angle loop here.")
 
-    def no_ladrc(self) -> str:
-        """Why it cannot run a LADRC of the angle."""
-        return "it has no disturbance observer"
-
     def parameter_file(
         self, values: Values, title: str, *, version: tuple[int, ...], profile: int | None,
         raised: Sequence[str], words: Words,
@@ -293,7 +290,6 @@ def number_text(value: Number, is_whole: bool) -> str:
 
 
 def joined_lines(rows: Sequence[str]) -> str:
-    """A text file of these lines."""
     return "\n".join([*rows, ""])
 
 

@@ -27,7 +27,7 @@ from jaxquad.records import (
 
 from ._firmware import firmware_named, HOVER, OuterLoop, Span
 from ._law import FlownLoop, RateLoop
-from ._parameters import change_filters, flown_loop, gains_of, parameters_of
+from ._parameters import flown_loop, gains_of, parameters_of
 
 
 Samples = Float[np.ndarray, " samples"]
@@ -275,7 +275,7 @@ class FlownAutopilot:
 
     def with_filters(self, parameters: Mapping[str, Number]) -> RateLoop:
         """The law as it is read from a log with these cutoffs and notches."""
-        values = change_filters(self.firmware, self.values, parameters)
+        values = firmware_named(self.firmware).change_filters(self.values, parameters)
         tracked = None if self.flight is None else self.flight.tracked_hz
         return flown_loop(
             self.firmware, values, self.version, throttle=self.throttle, tracked_hz=tracked

@@ -255,7 +255,6 @@ class CurveVerdict:
     change: ParameterChange | None = None  # None where what flew is as good, or is not known
 
     def content(self) -> dict[str, object]:
-        """All of it, for JSON."""
         estimate = self.estimate
         return {
             "parameter": self.name,
@@ -293,7 +292,6 @@ class ThrottleVerdict:
         return "\n".join(x for x in str(self.gains).splitlines() if not x.startswith(names))
 
     def content(self) -> dict[str, object]:
-        """All of it, for JSON."""
         return {
             "text": self.text,
             "certified_at": list(self.logged),

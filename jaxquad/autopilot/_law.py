@@ -351,7 +351,6 @@ def split_reference(reference: Reference, before: Signal, dt: float) -> tuple[Si
 
 
 def sum_of(terms: Terms) -> Signal:
-    """P + I + D + F."""
     return terms["P"] + terms["I"] + terms["D"] + terms["F"]
 
 

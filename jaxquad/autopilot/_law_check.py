@@ -92,7 +92,6 @@ class LawCheck:
 
     @property
     def text(self) -> str:
-        """In words."""
         if not self.terms:
             return "the log holds neither the terms of the law nor its output"
         shares = ", ".join(
@@ -114,7 +113,6 @@ class LawCheck:
         )
 
     def content(self) -> dict[str, object]:
-        """All numbers, for JSON."""
         terms = {name: x._asdict() | {"share": x.share} for name, x in self.terms.items()}
         return {
             "flew": self.flew,
@@ -304,7 +302,6 @@ class LoopCheck:
         return f"{numbers}, {at}. {cause[0].upper()}{cause[1:]}"
 
     def content(self) -> dict[str, object]:
-        """All numbers, for JSON."""
         parts = lambda x: {"magnitude": np.abs(x), "phase_rad": np.angle(x)}
         return plain_content(
             {

@@ -13,7 +13,6 @@ import jaxquad.report as report
 from jaxquad._core import write_file
 from jaxquad.identify import GainBand
 from jaxquad.plot import FlownAgain, Spectrum, StepBand, ThrottleCurve
-from jaxquad.records import AXES
 from jaxquad.report import Cell, Headline, Provenance, Table
 
 from ._filter_bank import gyro_noise, GyroNoise, hann_spectra, NoNoise, SLOWEST
@@ -137,7 +136,6 @@ def filters_section(page: PilotPage) -> PageSection:
 
 
 def noise_section(page: PilotPage) -> PageSection:
-    """Spectra of gyro and D term."""
     if not page.gyro:
         return None
     image = report.embed_figure(
@@ -150,7 +148,6 @@ def noise_section(page: PilotPage) -> PageSection:
 
 
 def steps_section(page: PilotPage) -> PageSection:
-    """Steps of the set-point, and their overshoot."""
     if not page.steps:
         return None
     image = report.embed_figure(
@@ -183,7 +180,6 @@ def again_section(page: PilotPage) -> PageSection:
 
 
 def b0_section(page: PilotPage) -> PageSection:
-    """b0 over the throttle."""
     if page.b0 is None:
         return None
     levels, taken, curve, text = page.b0
@@ -289,9 +285,8 @@ def pilot_page(proposal: "AutopilotProposal", origin: Provenance, overview: str)
         if throttle.curve is not None:
             level = "warn" if throttle.curve.change else "good"
             headlines.append(Headline(level, "THRUST CURVE", throttle.curve.text))
-    version = ".".join(map(str, flown.version))
     return PilotPage(
-        title=f"{flown.firmware} {version}, rate loop of {AXES[axis]}".replace(" ,", ","),
+        title=proposal.title,
         headlines=headlines,
         remarks=[
             *(f"not modelled: {text}" for text in flown.loop.unmodelled),

@@ -195,18 +195,6 @@ def flown_loop(
     )
 
 
-def change_filters(
-    firmware: str, values: Mapping[str, str], parameters: Mapping[str, Number]
-) -> dict[str, str]:
-    """The values of a log as they would be with other cutoffs and notches, by their names.
-
-    **Raises:**
-
-    - `ValueError`: Betaflight's header has no line for one of them.
-    """
-    return firmware_named(firmware).change_filters(values, parameters)
-
-
 FIELDS = ("p", "i", "d")
 Gains = Float[np.ndarray, " gains"]
 

@@ -34,7 +34,6 @@ class FilterVerdict:
     shared: SharedChange | None = None
 
     def content(self) -> dict[str, object]:
-        """All of it, for JSON."""
         return {
             "text": self.text,
             "flown": dict(self.flown),
@@ -65,6 +64,12 @@ class AutopilotProposal:
     filters: FilterVerdict | None = None  # what freeing them brings; None without a search
     noise: GyroNoise | None = None  # of the gyros, where the log shows it
     throttle: ThrottleVerdict | None = None  # where gains hold, and the thrust curve, apart
+
+    @property
+    def title(self) -> str:
+        """Firmware, version and axis."""
+        name, version = self.flown.firmware, ".".join(map(str, self.flown.version))
+        return f"{name} {version}, rate loop of {AXES[self.flown.axis]}".replace(" ,", ",")
 
     @property
     def plants(self) -> PlantSource:
@@ -192,9 +197,7 @@ class AutopilotProposal:
         ]
 
     def __str__(self) -> str:
-        flown = self.flown
-        version = ".".join(map(str, flown.version))
-        lines = [f"{flown.firmware} {version}, rate loop of {AXES[flown.axis]}".replace(" ,", ",")]
+        flown, lines = self.flown, [self.title]
         lines += [f"  {name} = {value:.6g}" for name, value in self.old.items()]
         lines += [f"  not modelled: {text}" for text in flown.loop.unmodelled]
         lines += [f"  {flown.filters_text}"] if flown.filters_text else []

@@ -232,7 +232,6 @@ class _Design:
         return float(values[-1])
 
     def _third(self, new: Mapping[str, float], filters: Mapping[str, float]) -> dict[str, float]:
-        """A third of the way, as the firmware stores it."""
         flown, changed = self.flown, self.flown_filters(filters)
         old = flown.old | changed
         if flown.angle is not None and flown.angle.name in new:

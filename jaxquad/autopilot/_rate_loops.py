@@ -187,7 +187,6 @@ class RateLoops:
 
 
 def grouped(groups: Iterable[RateLoops]) -> RateLoops:
-    """The loops of several throttles as one."""
     first, *others = groups
     return dataclasses.replace(first, others=tuple(others))
 
@@ -249,7 +248,6 @@ def law_paths(law: RateLoop, axis: int, omega: Frequencies) -> tuple[Parts, Part
 
 
 def gyro_chain_response(law: RateLoop, omega: Frequencies) -> Response:
-    """Of all filters of the gyro."""
     return filter_response(law.gyro_chains(), omega)
 
 
@@ -326,7 +324,6 @@ class PlantSource:
     def _drawn(
         self, count: int, seed: int, throttle: float | None
     ) -> tuple[Column, Column, Column, Column]:
-        """Gain, lag, delay and damping."""
         if self.over is None:
             names = len(self.fit.names)
             scores = np.zeros((names, -(-count // _AT_ONCE) * _AT_ONCE))
@@ -409,7 +406,6 @@ class Stage(NamedTuple):
         return f"{1e3 * self.delay_margin:.1f}" if self.stable == 1 else "none"
 
     def content(self) -> dict[str, object]:
-        """All of it, for JSON."""
         return {**self._asdict(), "angle": None if self.angle is None else self.angle._asdict()}
 
 

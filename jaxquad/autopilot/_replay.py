@@ -160,11 +160,10 @@ class _Grid:
             anew = np.arange(len(r)) % max(1, round(restart / self.interval)) == 0
         more = -(-len(r) // _BLOCK) * _BLOCK - len(r)
         pad = lambda x: jnp.asarray(np.concatenate([x, np.repeat(x[-1:], more, axis=0)]))
-        return jax.tree.map(pad, _Row(r, speed, rate, moments, start, anew))
+        return _Row(*jax.tree.map(pad, (r, speed, rate, moments, start, anew)))
 
 
 def _straight(at: np.ndarray, time: np.ndarray, signal: np.ndarray) -> np.ndarray:
-    """A series, or each column of one, at other times."""
     if signal.ndim == 1:
         return np.interp(at, time, signal)
     return np.stack([np.interp(at, time, column) for column in signal.T], axis=1)

@@ -332,6 +332,7 @@ class Betaflight(Firmware):
     notches = tuple((f"gyro_notch{k}_hz", f"gyro_notch{k}_cutoff") for k in (1, 2))
     words = True
     has_adrc = True
+    no_ladrc = "its proposed ADRC (pull request 15400) is of the rate, not of the angle"
 
     def flown_loop(self, values, version, *, throttle, tracked_hz):
         return betaflight_loop(values, version, throttle=throttle)
@@ -432,9 +433,6 @@ class Betaflight(Firmware):
 
     def angle_parameters(self, axis: str, p: float) -> dict[str, float]:
         return {"angle_p_gain": 10 * p}
-
-    def no_ladrc(self) -> str:
-        return "its proposed ADRC (pull request 15400) is of the rate, not of the angle"
 
     def parameter_file(self, values, title, *, version, profile, raised, words):
         adrc = [row.name for row, *_ in values if row.name.startswith("adrc_")]

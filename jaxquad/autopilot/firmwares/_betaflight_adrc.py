@@ -56,7 +56,6 @@ class ADRCFrame(NamedTuple):
     forgetting: float = 0.3  # 1/s
 
     def parameters(self) -> dict[str, float]:
-        """By the firmware's names."""
         return {
             "adrc_gyro_lpf_hz": self.lowpass_hz, "adrc_td_hz": self.setpoint_hz,
             "adrc_hover_throttle": 100 * self.schedule.hover,
@@ -195,7 +194,6 @@ class ADRCLoops(RateLoops):
     frame: ADRCFrame
 
     def flown(self) -> LoopQualities:
-        """What flew gives."""
         return self._qualities(self.feedback, self.ahead)
 
     def closed(self, design: Design | None) -> Paths:
@@ -459,7 +457,6 @@ def judge_adrc(
     stages: Mapping[str, ADRCStage], beyond: Sequence[str], targets: Limits, fresh: int,
     grid: np.ndarray,
 ) -> tuple[Kind, str]:  # fmt: skip
-    """The verdict, in words too."""
     if beyond:
         return "not to be flown", (
             f"no parameters are proposed: {'; '.join(beyond)}. Allow more (`sensitivity`, "

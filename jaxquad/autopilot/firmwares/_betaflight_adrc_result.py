@@ -10,11 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from jaxquad._core import announce, plain_content, write_file
-from jaxquad.identify import (
-    GainBand,
-    GainOverThrottle,
-    UndeterminedError,
-)
+from jaxquad.identify import GainBand, GainOverThrottle, UndeterminedError
 from jaxquad.plot import StepBand, ThrottleCurve
 from jaxquad.records import AXES
 from jaxquad.report import Headline, Provenance, Table
@@ -400,7 +396,6 @@ _CURVE = 60  # points over the throttle
 
 
 def adrc_page(result: ADRCAutopilot, origin: Provenance) -> PilotPage:
-    """All that the page shows."""
     version, proposal = ".".join(map(str, result.version)), result.proposal
     flown, flight, axis = result.flown, result.flight, AXES.index(result.axis)
     headlines = [Headline(*VERDICTS[result.kind], result.verdict)]

@@ -296,7 +296,6 @@ class BetaflightADRC(BetaflightRate):
         self._chain()  # refuses what lies beyond half of the loop's rate
 
     def _chain(self) -> FilterChain:
-        """All filters of the rate at the loop's rate."""
         lowpass = (PT2(150.0),) if self.lowpass is None else self.lowpass
         return FilterChain((*self.filters, *lowpass), 1 / self.dt)
 

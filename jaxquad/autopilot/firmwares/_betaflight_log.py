@@ -399,7 +399,6 @@ def _fly(random: np.random.Generator) -> tuple[dict[str, np.ndarray], np.ndarray
 
 
 def _share(cutoff_hz: float | np.ndarray, dt: float) -> float | np.ndarray:
-    """Of the new sample in a pt1."""
     omega = 2 * np.pi * cutoff_hz * dt
     return omega / (1 + omega)
 
@@ -411,7 +410,7 @@ def _filtered(b: Sequence[Number], a: Sequence[Number], signal: np.ndarray) -> n
 
 
 def _low_passed(cutoff_hz: float, signal: np.ndarray) -> np.ndarray:
-    share = _share(cutoff_hz, _DT)
+    share = float(_share(cutoff_hz, _DT))
     return _filtered([share], [1.0, share - 1], signal)
 
 

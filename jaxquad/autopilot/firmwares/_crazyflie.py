@@ -81,7 +81,6 @@ class CrazyflieRate(RateLoop):
         self._slope()  # refuses what lies beyond half of the loop's rate
 
     def _slope(self) -> FilterChain:
-        """The low-pass of the derivative."""
         cutoff = self.derivative_hz
         return FilterChain(() if cutoff is None else (Butterworth(cutoff),), 1 / self.dt)
 

@@ -214,7 +214,6 @@ def _chirps(log: Log) -> list[NumberedChirp]:
 
 
 def _number(value: object) -> float:
-    """0 for what is no finite number."""
     try:
         return number if np.isfinite(number := float(str(value))) else 0.0
     except ValueError:

@@ -137,14 +137,9 @@ class ResponseTerm:
         return np.exp(-self.misfit[..., 0] - 1j * self.misfit[..., 1])
 
     @ft.cached_property
-    def error_exponent(self) -> Float[np.ndarray, "frequencies outputs inputs"]:
-        """As in `FrequencyResponse`."""
-        return self.frf.error_exponent
-
-    @ft.cached_property
     def measured_error(self) -> Float[np.ndarray, "frequencies outputs inputs"]:
         """Random error relative to the model."""
-        return np.asarray(self.frf.random_error) * np.abs(self.ratio) ** self.error_exponent
+        return np.asarray(self.frf.random_error) * np.abs(self.ratio) ** self.frf.error_exponent
 
     @ft.cached_property
     def error(self) -> Float[np.ndarray, "frequencies outputs inputs"]:
@@ -231,7 +226,7 @@ class ErrorBudget:
         for record in self.records:
             pulls, used = record.pulls, record.used
             model = np.where(used, np.asarray(record.frf.response) / record.ratio, 1.0)
-            off = np.where(used, np.abs(record.ratio), 1.0) ** (1 - record.error_exponent)
+            off = np.where(used, np.abs(record.ratio), 1.0) ** (1 - record.frf.error_exponent)
             # Magnitude and phase of the misfit are the parts of dT over T.
             columns = (pulls[..., 0, :] + 1j * pulls[..., 1, :]) / (model.conj() * off)[..., None]
             errors = record.frf.errors
