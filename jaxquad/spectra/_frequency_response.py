@@ -22,11 +22,11 @@ from jaxquad.records import Record
 from ._error_covariance import ErrorCovariance, independent_errors
 from ._estimators import (
     check_band,
-    check_compatible,
     check_distinct,
     check_excitation,
     check_references,
     COHERENT,
+    compatible,
     Composite,
     DOMINATED,
     Estimator,
@@ -393,8 +393,7 @@ def frequency_response(
     from ._periodic import estimate_periodic
 
     require_x64("a frequency response")
-    records = [record] if isinstance(record, Record) else list(record)
-    check_compatible(records)
+    records = compatible(record)
     check_distinct(records)
     first, method = records[0], "direct"
     grid = None if omega is None else np.atleast_1d(np.asarray(omega, float))

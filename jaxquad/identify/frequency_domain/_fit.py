@@ -278,8 +278,8 @@ def _fit(
         starts = spread_starts(parameters, options.starts, fastest=fastest)
         solution, minima = solve_from_many(problem, starts, solver, max_steps)
         solution = solve_within_bounds(problem, solution, solver, max_steps)
+    solve_from = lambda problem, z: solve_within_bounds(problem, z, solver, max_steps)
     if delays:
-        solve_from = lambda problem, at: solve_within_bounds(problem, at.z, solver, max_steps)
         problem, solution = find_samples(problem, solution, delays, solve_from)
     descents.append(Descent(problem, points, solution))
     again = weigh(points, solution)
@@ -303,11 +303,11 @@ def _fit(
         descents.append(Descent(problem, raised, solution))
         _check_finite(solution)
         weighting = weighting_at(problem, points, solution)
-    limits = sample_limits(problem, weighting.budget, solution, delays) if delays else []
+    limits, within = sample_limits(problem, solution, delays, solve_from)
     if limits:
         problem = limited(problem, limits)
         descents.clear()  # what limits a delay to its sample has no derivative
-        solution = solve_within_bounds(problem, solution.z, solver, max_steps)
+        solution = solve_from(problem, within.z)
         weighting = weighting_at(problem, points, solution)
     if lifted:
         weighting = weighting._replace(by_noise=weighted(points, weigh(points, solution)))

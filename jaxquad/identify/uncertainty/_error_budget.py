@@ -140,15 +140,10 @@ class ResponseTerm:
         return exp(-self.misfit[..., 0] - 1j * self.misfit[..., 1])
 
     @ft.cached_property
-    def error_exponent(self) -> Float[Numbers, "frequencies outputs inputs"]:
-        """As in `FrequencyResponse`."""
-        return self.frf.error_exponent
-
-    @ft.cached_property
     def measured_error(self) -> Float[Numbers, "frequencies outputs inputs"]:
         """Random error relative to the model."""
-        xp = namespace_of(self.misfit)
-        return xp.asarray(self.frf.random_error) * xp.abs(self.ratio) ** self.error_exponent
+        xp, power = namespace_of(self.misfit), self.frf.error_exponent
+        return xp.asarray(self.frf.random_error) * xp.abs(self.ratio) ** power
 
     @ft.cached_property
     def error(self) -> Float[Numbers, "frequencies outputs inputs"]:
@@ -235,7 +230,7 @@ class ErrorBudget:
         for record in self.records:
             pulls, used = record.pulls, record.used
             model = np.where(used, np.asarray(record.frf.response) / record.ratio, 1.0)
-            off = np.where(used, np.abs(record.ratio), 1.0) ** (1 - record.error_exponent)
+            off = np.where(used, np.abs(record.ratio), 1.0) ** (1 - record.frf.error_exponent)
             # Magnitude and phase of the misfit are the parts of dT over T.
             columns = (pulls[..., 0, :] + 1j * pulls[..., 1, :]) / (model.conj() * off)[..., None]
             errors = record.frf.errors
