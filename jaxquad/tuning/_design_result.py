@@ -59,6 +59,8 @@ class DesignResult(eqx.Module):
     diverged: Bool[np.ndarray, " members"]
     lost: Bool[np.ndarray, " members"]  # diverged, or carried off beyond the model's range
     observer_instability: str = ""  # why an observer of the controller is unstable by itself
+    # ITAE from event to event, rad s^2
+    by_part: Float[np.ndarray, "parts axes members"] | None = None
 
     @property
     def members(self) -> int:
@@ -234,7 +236,7 @@ def evaluate_design(
     reference = np.asarray(flight.reference)
     moved = max(float(np.max(reference)), 0.0) - min(float(np.min(reference)), 0.0)
     lost = flown.diverged | ~(flown.greatest <= _TILTED + moved)
-    return DesignResult(numbers, unstable, flown.diverged, lost, why)
+    return DesignResult(numbers, unstable, flown.diverged, lost, why, flown.by_part)
 
 
 def flying_loop(controller: PyTree, members: Members) -> Loop:
@@ -359,6 +361,8 @@ class Flown(NamedTuple):
     numbers: dict[str, Float[np.ndarray, "axes members"]]
     diverged: Bool[np.ndarray, " members"]
     greatest: Float[np.ndarray, " members"]  # rad, the error at any time and of any axis
+    by_part: Float[np.ndarray, "parts axes members"]  # ITAE from event to event, rad s^2
+    peaks: Float[np.ndarray, "parts axes members"]  # rad, the greatest error from event to event
 
 
 def fly(loop: Loop, flight: Scenario, span: TimeSpan, devices: DeviceChoice = None) -> Flown:
@@ -378,7 +382,9 @@ def fly(loop: Loop, flight: Scenario, span: TimeSpan, devices: DeviceChoice = No
     numbers |= {name: stack(name).sum(axis=0) for name in _INTEGRALS}
     numbers["overshoot"] = np.where(some.any(axis=0), greatest, np.nan)
     numbers["activity_rate"] = numbers["activity"] / ((span_of_all[1] + 1 - span_of_all[0]) * dt)
-    return Flown(numbers, np.asarray(diverged), np.max(stack("peak"), axis=(0, 1)))
+    peaks = stack("peak")
+    greatest = np.max(peaks, axis=(0, 1))
+    return Flown(numbers, np.asarray(diverged), greatest, stack("itae"), peaks)
 
 
 _Finished = tuple[dict[str, Array], list[dict[str, Array]], Bool[Array, "*ensemble"]]

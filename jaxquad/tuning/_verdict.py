@@ -1,15 +1,20 @@
 """How far a design is from its limits, and its verdicts: stability, performance, convergence."""
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import NamedTuple
+from typing import NamedTuple, TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Bool
 
 from jaxquad._core import as_array
 
+from ._attainable import SETTLED
 from ._design_result import DesignResult, LinearMembers, Numbers, upper_bound, with_further
 from ._objective import Limit, QUANTITIES, Risk, risk_text
+
+
+if TYPE_CHECKING:
+    from ._certificate import Certificate
 
 
 class Distance(NamedTuple):
@@ -143,6 +148,8 @@ def _with_unstable(design: DesignResult, quantity: str) -> Numbers:
 
 
 WORTH, SATURATED = 0.5, 0.25  # most of doing nothing's error, and of the time at the limit
+BUSIER = 10.0  # most of the start's activity
+FEWEST = 64  # members that speak of an ensemble
 
 
 class Verdict(NamedTuple):
@@ -248,59 +255,99 @@ def _share(bad: Bool[np.ndarray, " members"], what: str, independent: bool) -> s
     return f" (proven: at most {most:.2g} % of all {what}, 95 % confidence)"
 
 
-def judge_performance(
-    design: DesignResult,
-    idle: DesignResult,
-    start: DesignResult | None,
-    error: str,
-    independent: bool,
-) -> Verdict:
-    """Whether a design is of use: against the command 0 (`idle`), and beside the `start`.
+def judge_performance(certificate: "Certificate") -> Verdict:
+    """Whether a design is of use, and whether its flights are what its linear loops say.
 
-    Every member has to stay in the range of the model, with at most half of the `error` of doing
-    nothing, and with the command at its limit for at most a quarter of the time.
+    Every member has to make at most half the error of doing nothing (the command 0), from event to
+    event, since a plant that was carried off once makes any error small. In all, and in each step, it may
+    make at most twice that of its linear loop, or of the fastest step that the drive allows: margins are those
+    of the linear loop, so they say little of a flight whose error comes for the greater part from
+    the limit, friction or resolution. Errors within the band in which a step counts as settled are
+    none. Full torque has to hold the disturbance
+    within half of the linear loop's peak, the command is at its limit for at most a quarter of the
+    time, and no member is lost.
+
+    Half a step of the encoder beyond the settling band cannot tell whether a step has settled. A
+    motor's losses grow with the square of the command's changes, so ten times the start's activity
+    is another load than what the start was taken to bear. Beyond the identified band no data say
+    what the plant does. Of fewer than 64 members, or of one plant, nothing is proven of an
+    ensemble: from 59 on, none that fails shows that at most 5 % do (95 % confidence).
     """
+    design, idle, error = certificate.design, certificate.idle, certificate.error
+    limits, start, independent = certificate.attainable, certificate.start, certificate.independent
     mine, nothing = design.of(error), idle.of(error)
     if not np.any(nothing > 0):
         text = "not known, since the scenario moves nothing: doing nothing makes no error"
         return Verdict("PERFORMANCE", False, text, "Give it a reference or a disturbance")
-    useless = ~(mine <= WORTH * nothing)
-    busy = design.of("saturation_share") > SATURATED
-    bad = design.lost | useless | busy
-    # Error, overshoot and time saturated, beside doing nothing and the start.
     shown = QUANTITIES[error]
-    references = [f"doing nothing {_mean(idle, error)}"]
-    references += [f"the start {_mean(start, error)}"] if start is not None else []
-    mean, worst = shown.text(float(np.mean(mine))), shown.text(float(np.max(mine)))
-    parts = [f"{shown.title} {mean} in the mean and {worst} at worst ({', '.join(references)})"]
+    compared = [f"doing nothing {_mean(idle, error)}"]
+    compared += [f"the start {_mean(start, error)}"] if start is not None else []
+    useless = ~(mine <= WORTH * nothing)
+    faster = "Let the design be faster: relax limits and penalties, or start with more bandwidth"
+    less = "Ask for less (smaller disturbance or step), or raise the limit of the command"
+    checks = [
+        (design.lost, "are lost (carried off beyond the range of the model)", less),
+        (useless, "make more than half the error of doing nothing", faster),
+        (
+            design.of("saturation_share") > SATURATED,
+            "have the command at its limit for more than a quarter of the time", less,
+        ),
+    ]  # fmt: skip
+    remarks = list(certificate.unsupported)
+    if limits is not None and design.by_part is not None:
+        flown = design.by_part
+        over = flown > np.maximum(WORTH * limits.nothing, limits.settled)
+        useless |= np.any(over & (limits.nothing > 0), axis=(0, 1))
+        if error == "itae":
+            mean = lambda x: shown.text(float(np.mean(np.sum(x, axis=(0, 1)))))
+            compared.append(f"the linear loop alone {mean(limits.linear)}")
+            compared.append(f"the drive allows {mean(limits.drive)}")
+        fastest = np.maximum(np.maximum(limits.linear, limits.drive) / WORTH, limits.settled)
+        imperfect = np.any(np.sum(flown, axis=0) > np.sum(fastest, axis=0), axis=0)
+        imperfect |= np.any((limits.drive > 0) & (flown > fastest), axis=(0, 1))
+        what = (
+            "make more than twice the error of their linear loops, which know neither limit, nor "
+            "friction, nor resolution"
+        )
+        checks.append((imperfect, what, "Raise the limit, reduce friction, or measure finer"))
+        held = np.maximum(WORTH * limits.linear_peak, limits.band)
+        degrees = np.degrees(np.max(limits.carried))
+        what = f"are carried off by the disturbance, up to {degrees:.3g} deg against full torque"
+        checks.append((np.any(limits.carried > held, axis=(0, 1)), what, less))
+        if limits.moved and limits.band > SETTLED * limits.moved:
+            text = (
+                f"half a step of the encoder is {np.degrees(limits.step) / 2:.3g} deg, beyond "
+                f"{SETTLED:.0%} of the manoeuvre of {np.degrees(limits.moved):.3g} deg"
+            )
+            remarks.append((text, "Take a finer encoder, or fly a larger manoeuvre"))
+    if start is not None:
+        busy, before = (float(np.median(x.of("activity_rate"))) for x in (design, start))
+        if before > 0 and busy > BUSIER * before:
+            text = f"the command's activity is {busy / before:.3g} times that of the start"
+            remarks.append((text, "Penalise activity with a knee near that of the start"))
+    numbers = f"{shown.title} {shown.text(float(np.mean(mine)))} in the mean and "
+    numbers += f"{shown.text(float(np.max(mine)))} at worst ({', '.join(compared)})"
     for quantity in ("overshoot", "saturation_share"):
         values: Numbers = design.of(quantity)
         if not np.isnan(values).any():
             title, text = QUANTITIES[quantity].title, QUANTITIES[quantity].text
-            parts.append(f"{title} {text(float(np.mean(values)))}, worst {text(np.max(values))}")
-    numbers = "; ".join(parts)
-    if not bad.any():
-        text = (
-            f"{_count(~bad)} members make less than half the error of doing nothing"
-            f"{_share(bad, 'do not', independent)}: {numbers}"
-        )
+            numbers += f"; {title} {text(float(np.mean(values)))}, worst {text(np.max(values))}"
+    checks = [(f"{_count(x)} members {what}", remedy) for x, what, remedy in checks if x.any()]
+    checks += remarks
+    if checks:
+        texts, remedies = zip(*checks, strict=True)
+        remedy = ". ".join(dict.fromkeys(remedies))
+        return Verdict("PERFORMANCE", False, f"{'; '.join(texts)}: {numbers}", remedy)
+    none = np.zeros(design.members, bool)
+    text = f"{_count(~none)} members make less than half the error of doing nothing"
+    text += " and less than twice that of their linear loops" * (limits is not None)
+    text += f"{_share(none, 'do not', independent)}: {numbers}"
+    if limits is None or (limits.varies and design.members >= FEWEST):
         return Verdict("PERFORMANCE", True, text)
-    reasons = [
-        f"{_count(which)} members {what}"
-        for which, what in (
-            (design.lost, "are lost (carried off beyond the range of the model)"),
-            (useless, "make more than half the error of doing nothing"),
-            (busy, "have the command at its limit for more than a quarter of the time"),
-        )
-        if which.any()
-    ]
-    faster = "relax limits and penalties, or start with a higher bandwidth"
-    remedy = f"Let the design be faster: {faster}"
-    if busy.any():
-        remedy = "Ask for less (smaller disturbance or step), or raise the limit of the command"
-    elif design.lost.any():
-        remedy = f"Ask for less (smaller disturbance or step), or let it be faster: {faster}"
-    return Verdict("PERFORMANCE", False, f"{'; '.join(reasons)}: {numbers}", remedy)
+    few = f"{design.members} members are too few to speak of others"
+    few = few if limits.varies else "all members are the same plant"
+    remedy = f"Let the ensemble have a spread, and certify on {FEWEST} members or more"
+    return Verdict("PERFORMANCE", None, f"not decided, since {few}; {text}", remedy)
 
 
 def _mean(design: DesignResult, error: str) -> str:
