@@ -73,7 +73,7 @@ def identified(fit: jq.identify.Fit) -> Case:
     band = float(OMEGA[0]), float(OMEGA[-1])
     posterior = jq.ensembles.Posterior(fit, plant=roll, band=band)
     case = case_of(posterior.plant, jq.Ensemble(posterior, **ASSUMED), wo=band[1])
-    return case._replace(free=HELD, half=HALF[:1])
+    return case._replace(free=HELD, half=())
 
 
 def assumed() -> Case:

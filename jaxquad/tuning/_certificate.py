@@ -11,7 +11,6 @@ from jaxtyping import ArrayLike, Float, PyTree
 
 from jaxquad.control import LADRC
 
-from ._attainable import Attainable
 from ._design_result import (
     DesignResult,
     DesignSummary,
@@ -20,7 +19,15 @@ from ._design_result import (
     upper_bound,
 )
 from ._objective import QUANTITIES
-from ._verdict import Distance, joined, judge_performance, judge_stability, NOT_TUNED, Verdict
+from ._verdict import (
+    Attainable,
+    Distance,
+    joined,
+    judge_performance,
+    judge_stability,
+    NOT_TUNED,
+    Verdict,
+)
 
 
 class Provenance(TypedDict):

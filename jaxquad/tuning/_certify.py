@@ -31,12 +31,11 @@ from jaxquad.simulation import (
     Simulation,
 )
 
-from ._attainable import evaluate_attainable
 from ._certificate import Certificate, find_ladrc, lag_remark, Provenance
 from ._design_result import analyse_further, evaluate_design, member_facts
 from ._objective import Limit, QUANTITIES
-from ._problem import decouple, DeviceChoice, Plant, require_same_rate, TimeSpan
-from ._verdict import measure_distances
+from ._problem import decouple, DeviceChoice, Plant, require_ensemble, require_same_rate, TimeSpan
+from ._verdict import evaluate_attainable, measure_distances
 
 
 if TYPE_CHECKING:
@@ -115,11 +114,7 @@ def certify(
     - `ValueError`: parts do not fit together, or a limit is on what is not computed.
     """
     key = jax.random.key(0) if key is None else key
-    if not isinstance(ensemble, Ensemble | Members):
-        raise ValueError(
-            f"ensemble is a {type(ensemble).__name__}: give jq.Ensemble(inertia=...), or "
-            "jq.ensembles.Members of it"
-        )
+    require_ensemble(ensemble)
     span, peers = TimeSpan(tuple(events), start, stop, load_start), peers or {}
     if name in peers:
         raise ValueError(f"a peer has the name {name!r} of the design itself: rename it")

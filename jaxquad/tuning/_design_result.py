@@ -224,7 +224,7 @@ def evaluate_design(
     controller: PyTree, members: Members, flight: Scenario, span: TimeSpan, devices: DeviceChoice
 ) -> DesignResult:
     """`controller` on all `members`, in a `flight` that has their noise in it."""
-    flown = fly(flying_loop(controller, members), flight, span, devices)
+    flown = fly_members(controller, members, flight, span, devices)
     numbers = flown.numbers
     linear = _linear(controller, members, flight)
     if linear is not None:
@@ -239,24 +239,26 @@ def evaluate_design(
     return DesignResult(numbers, unstable, flown.diverged, lost, why, flown.by_part)
 
 
-def flying_loop(controller: PyTree, members: Members) -> Loop:
-    """The loops of all members around a controller, its gains as wide as all of its kind have."""
+def fly_members(
+    controller: PyTree, members: Members, flight: Scenario, span: TimeSpan, devices: DeviceChoice
+) -> "Flown":
+    """All members around a controller, its gains as wide as all of its kind have."""
     loop = members.loop(controller)
-    return loop.with_controller(_widen(loop.controller, members.axes, members.size))
+    loop = loop.with_controller(_widen(loop.controller, members.axes, members.size))
+    flown = _fly(loop, flight, span, devices)
+    if flown.diverged.ndim:
+        return flown
+    wide = lambda x: np.broadcast_to(x[..., None], (*x.shape, members.size))
+    return jax.tree.map(wide, flown)  # of members that do not differ, one flew
 
 
 _MULTIPLE, _MOST = 8, 2048  # of members that fly, and at most
 
 
 def analyse_further(
-    loop: Loop,
-    ensemble: Ensemble,
-    scenario: Scenario,
-    key: Key[Array, ""],
-    *,
-    flown: int,
+    loop: Loop, ensemble: Ensemble, scenario: Scenario, key: Key[Array, ""], *, flown: int,
     count: int | None,
-) -> LinearMembers | None:
+) -> LinearMembers | None:  # fmt: skip
     """Of at least `count` further members, in slices of as many as have `flown`."""
 
     def analyse(drawn: Members) -> tuple[LoopNumbers | None, dict[str, np.ndarray]]:
@@ -365,7 +367,7 @@ class Flown(NamedTuple):
     peaks: Float[np.ndarray, "parts axes members"]  # rad, the greatest error from event to event
 
 
-def fly(loop: Loop, flight: Scenario, span: TimeSpan, devices: DeviceChoice = None) -> Flown:
+def _fly(loop: Loop, flight: Scenario, span: TimeSpan, devices: DeviceChoice) -> Flown:
     """From event to event the integrals' clock starts again, and the greatest overshoot counts."""
     check_run(loop, flight)
     samples, dt = len(flight.reference), loop.dt

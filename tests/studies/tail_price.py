@@ -36,7 +36,7 @@ from tuning_case import (  # noqa: E402
 )
 
 import jaxquad as jq  # noqa: E402
-from jaxquad.tuning._tail import take_members  # noqa: E402
+from jaxquad.tuning._cost import take_members  # noqa: E402
 
 
 PEAK, SLICE = 3.6, 2048
