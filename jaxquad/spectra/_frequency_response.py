@@ -16,11 +16,11 @@ from jaxquad.records import Record
 from ._error_covariance import ErrorCovariance, independent_errors
 from ._estimators import (
     check_band,
-    check_compatible,
     check_distinct,
     check_excitation,
     check_references,
     COHERENT,
+    compatible,
     Composite,
     DOMINATED,
     Estimator,
@@ -124,7 +124,6 @@ class FrequencyResponse:
     input_names: tuple[str, ...] = eqx.field(static=True)
     output_names: tuple[str, ...] = eqx.field(static=True)
     remarks: Sequence[Remark] = eqx.field(static=True, default=())
-    integrators: int = eqx.field(static=True, default=0)  # removed before windowing
     resolution: float = eqx.field(static=True, default=0.0)  # one cycle in a window, rad/s
     distortion: Distortion | None = None  # of a periodic excitation
     log_noise_covariance: Square | None = None
@@ -322,7 +321,11 @@ class FrequencyResponse:
 
 
 class Estimate(NamedTuple):
-    """What an estimator makes of records; nan and infinite errors where it is undetermined."""
+    """What an estimator makes of records; nan and infinite errors where it is undetermined.
+
+    `independent_errors` makes the `errors` of estimates that share no noise between frequencies;
+    `log_noise_covariance` of n independent averages is then the identity over n.
+    """
 
     omega: Grid
     response: Responses
@@ -379,8 +382,7 @@ def frequency_response(
     from ._periodic import estimate_periodic
 
     require_x64("a frequency response")
-    records = [record] if isinstance(record, Record) else list(record)
-    check_compatible(records)
+    records = compatible(record)
     check_distinct(records)
     first, method = records[0], "direct"
     grid = None if omega is None else np.atleast_1d(np.asarray(omega, float))
@@ -423,7 +425,6 @@ def frequency_response(
         input_names=first.input_names,
         output_names=first.output_names,
         remarks=Remarks(find_remarks),
-        integrators=0 if isinstance(estimator, Periodic) else estimator.integrators,
         resolution=estimate.resolution,
         distortion=estimate.distortion,
         log_noise_covariance=estimate.log_noise_covariance,

@@ -38,7 +38,7 @@ from jaxquad.simulation import (
     window,
 )
 
-from ._objective import LINEAR, QUANTITIES
+from ._objective import LINEAR, QUANTITIES, split_quantities
 from ._problem import decouple, DeviceChoice, TimeSpan
 
 
@@ -346,15 +346,18 @@ def _linear(controller: PyTree, members: Members, flight: Scenario) -> LoopNumbe
     stable = np.all([loop.stable for loop in loops], axis=0)
     worst = {"abscissa": np.max([loop.abscissa for loop in loops], axis=0)}
     for name in LoopNumbers._fields[2:]:
-        find = np.min if name.endswith("margin") else np.max
+        find = np.min if QUANTITIES[name].smaller_is_worse else np.max
         extreme = find([loop._asdict()[name] for loop in loops], axis=0)
         worst[name] = np.where(stable, extreme, np.nan)
     return LoopNumbers(stable, **worst)
 
 
-_OF_ALL = ("activity", "energy", "saturation_share", "peak", "rms", "disturbance_rmse")
 _INTEGRALS = ("itae", "iae", "ise")
 _OF_PARTS = (*_INTEGRALS, "overshoot", "peak")
+_OF_ALL = tuple(
+    name for name in split_quantities(QUANTITIES)[0]
+    if name not in (*_INTEGRALS, "overshoot", "activity_rate")
+)  # fmt: skip
 
 
 class Flown(NamedTuple):

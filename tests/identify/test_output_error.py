@@ -75,7 +75,7 @@ def test_a_refinement_that_stops_early_says_so_and_keeps_its_numbers_apart():
     short = refine(START, jq.Record(TIME, U, CLEAN + 0.05 * noise(1)), free=FREE, max_steps=1)
     assert fit.identifiable and not short.determined.any() and np.isfinite(short.values).all()
     assert "has not converged: the maximum of 1" in str(short)
-    assert short.verdict.remedies[0] == "take more steps (max_steps=)"
+    assert "max_steps=" in short.verdict.remedies[0]
 
 
 @pytest.mark.slow

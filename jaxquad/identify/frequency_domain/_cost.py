@@ -196,10 +196,8 @@ def usable(frf: FrequencyResponse, band: Band, least: float) -> Mask:
 
 @ft.lru_cache(maxsize=16)
 def _third_of_an_octave(omega: bytes) -> Float[np.ndarray, "frequencies frequencies"]:
-    """Weights of a mean around each frequency (the bytes of their array, rad/s).
-
-    Choosing single points whose coherence came out high by chance would bias the fit.
-    """
+    """Weights of a mean around each frequency (the bytes of their array, rad/s). Choosing single
+    points whose coherence came out high by chance would bias the fit."""
     place = np.log(np.frombuffer(omega))
     kernel = np.exp(-0.5 * ((place[:, None] - place[None, :]) / 0.2) ** 2)
     return kernel / kernel.sum(axis=1, keepdims=True)
@@ -221,10 +219,8 @@ WIDER_BAND = "wider band"  # kind of a remedy
 
 
 def widen_band(frfs: Sequence[FrequencyResponse], used: Sequence[Mask]) -> Message | None:
-    """The advice to excite more than the band of the points `used`, with numbers.
-
-    None where that is a decade or more, or nothing.
-    """
+    """The advice to excite more than the band of the points `used`, with numbers. None where that
+    is a decade or more, or nothing."""
     rows = [np.asarray(f.omega)[np.any(m, axis=(1, 2))] for f, m in zip(frfs, used, strict=True)]
     omega = np.concatenate(rows)
     if not omega.size or np.max(omega) >= _DECADE * np.min(omega):
@@ -240,24 +236,16 @@ def widen_band(frfs: Sequence[FrequencyResponse], used: Sequence[Mask]) -> Messa
 
 
 def precise_points(frf: FrequencyResponse) -> Mask:
-    """Points that have a response, each by its own random error: so small by no chance.
-
-    None where feedback dominates: what is known there is the controller, and not the plant.
-    """
+    """Points that have a response, each by its own random error: so small by no chance. None where
+    feedback dominates: what is known there is the controller, and not the plant."""
     error = np.nan_to_num(np.asarray(frf.random_error), nan=1.0)
     dominated = any(remark.kind == DOMINATED for remark in frf.remarks)
     return np.isfinite(np.asarray(frf.response)) & (error <= _PRECISE) & (not dominated)
 
 
-def points_of(frfs: Sequence[FrequencyResponse], used: Sequence[Mask]) -> list[Points]:
-    """The points of several responses, with a floor of 0.
-
-    Correlations are those of the errors relative to the response.
-    """
-    return [_points(frf, mask) for frf, mask in zip(frfs, used, strict=True)]
-
-
-def _points(frf: FrequencyResponse, used: Mask) -> Points:
+def points_of(frf: FrequencyResponse, used: Mask) -> Points:
+    """The points of a response, with a floor of 0. Correlations are those of the errors relative to
+    the response."""
     shared, correlations, errors = np.ones(used.shape), {}, frf.errors
     for o, i in np.ndindex(used.shape[1:]):
         mine = np.flatnonzero(used[:, o, i])
@@ -309,12 +297,8 @@ class Mixing(NamedTuple):
     idle: Bool[np.ndarray, ""] | None = None  # whether nothing is mixed, if programs are to ask
 
 
-def mixings_of(points: Sequence[Points], weights: Sequence[Weights]) -> tuple[Mixing | None, ...]:
-    """One for each response, `None` where the points share no noise."""
-    return tuple(_mixing(*pair) for pair in zip(points, weights, strict=True))
-
-
-def _mixing(points: Points, weights: Weights) -> Mixing | None:
+def mixing_of(points: Points, weights: Weights) -> Mixing | None:
+    """Of the points of a response; `None` where they share no noise."""
     if not points.correlations and points.between is None:
         return None
     none = unmixed(points.used.shape)
@@ -381,9 +365,7 @@ def expected_cost(
     mixing: Mixing | None, sizes: Float[np.ndarray, "frequencies outputs inputs 2"]
 ) -> Float[np.ndarray, "outputs inputs"]:
     """What noise alone leaves of each pair's cost; `sizes` are weights times random errors.
-
-    Whitened along frequency, pairs count as correlated at each frequency as before.
-    """
+    Whitened along frequency, pairs count as correlated at each frequency as before."""
     if mixing is None:
         return np.sum(sizes**2, axis=(0, 3))
     size = np.moveaxis(sizes[..., 0], 0, -1)

@@ -91,6 +91,16 @@ class Parameters:
         with np.errstate(over="ignore"):
             return self.scale[:n] * xp.where(np.array(self.logarithmic[:n]), xp.exp(z), ones)
 
+    def coordinates(self, values: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"] | None:
+        """`z` at physical values; None where one of them has lost its sign."""
+        ratio = values / np.asarray(self.scale)[: values.size]
+        logarithmic = np.array(self.logarithmic[: values.size])
+        if np.any(logarithmic & (ratio < 0)):
+            return None
+        return np.where(
+            logarithmic, np.log(np.where(logarithmic, np.maximum(ratio, 1e-300), 1.0)), ratio
+        )
+
     def insert(self, model: PyTree, z: Float[Numbers, " n"]) -> PyTree:
         """The model with its first `n` parameters set, and what is tied to them."""
         return self.replace(model, self.values(z))

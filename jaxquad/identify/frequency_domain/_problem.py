@@ -154,14 +154,8 @@ def make_problem(
 
 def on_device(model: PyTree) -> PyTree:
     """The model with JAX's arrays in the place of NumPy's."""
-    leaves, structure = jax.tree.flatten(model)
-    hosted = [k for k, leaf in enumerate(leaves) if isinstance(leaf, np.ndarray)]
-    if not hosted:
-        return model
-    # In one call: it takes as long as for a single array.
-    for k, array in zip(hosted, jax.device_put([leaves[k] for k in hosted]), strict=True):
-        leaves[k] = array
-    return jax.tree.unflatten(structure, leaves)
+    hosted, rest = eqx.partition(model, lambda leaf: isinstance(leaf, np.ndarray))
+    return eqx.combine(jax.device_put(hosted), rest)
 
 
 def _silent_pairs(
@@ -256,10 +250,8 @@ def weigh_parts(problem: Problem, k: int, magnitude: Part, phase: Part) -> tuple
 
 
 def misfits(z: Float[Array, " n"], problem: Problem) -> Float[Array, " residuals"]:
-    """The magnitudes and then the phases of one record after the other, then the priors.
-
-    Each is (outputs, inputs, frequencies), flattened.
-    """
+    """The magnitudes and then the phases of one record after the other, then the priors. Each is
+    (outputs, inputs, frequencies), flattened."""
     parts = [part.reshape(-1) for log in _log_ratios(z, problem) for part in log]
     return jnp.concatenate([*parts, prior_misfits(z, problem)])
 

@@ -37,7 +37,7 @@ from ..uncertainty._verdict import (
 )
 from ._parameters import Parameters
 from ._refits import Bands, explain_misfit, Explanation, fit_bands, Origin
-from ._starts import Minimum
+from ._solve import Minimum
 
 
 _SHOWN = 6  # optima of several starts

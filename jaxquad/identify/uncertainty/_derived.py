@@ -330,9 +330,7 @@ def with_reach(
     fit: "Fit", curve: Callable[[PyTree], Inexact[np.ndarray, "..."]]
 ) -> tuple[np.ndarray, Callable[[Callable[[np.ndarray], np.ndarray]], np.ndarray]]:
     """A curve of the model, and half of the 95 % band of what a function makes of its slopes.
-
-    Slopes are by differences: the program of the curve itself serves, whatever the model.
-    """
+    Slopes are by differences: the program of the curve itself serves, whatever the model."""
     value, rows = curve(fit.model), []
     # Directions along which no response changes are left out.
     covariance = fit.relative_covariance if fit.identifiable else known_covariance(fit)

@@ -44,11 +44,8 @@ Units = Float[np.ndarray, " all"]
 
 
 def units_of(solution: Solution) -> Units:
-    """What relative changes are relative to: the value, or the change that shows of one at zero.
-
-    Relative to itself, a lag at zero would look as if it had no effect, while in truth it trades
-    off with the delay.
-    """
+    """What relative changes are relative to: the value, or the change that shows of one at zero. A
+    lag at zero would look without effect, while it trades off with the delay."""
     units = np.asarray(solution.slopes).copy()
     units[list(solution.at_zero)] = solution.units_at_zero
     return units
@@ -84,13 +81,6 @@ class Noise(NamedTuple):
 
 def scaled_inverse(matrix: Matrix) -> Matrix:
     """Pseudo-inverse after unit scaling of the diagonal."""
-    return _scaled_inverse(matrix.tobytes(), len(matrix))
-
-
-@ft.lru_cache(maxsize=64)
-def _scaled_inverse(elements: bytes, count: int) -> Matrix:
-    # Ten parts of an assessment ask for the inverse of the same matrix.
-    matrix = np.frombuffer(elements).reshape(count, count)
     scale = np.sqrt(np.diagonal(matrix))
     scale = np.where(scale > 0, scale, 1.0)
     unit = matrix / np.outer(scale, scale)
@@ -98,10 +88,8 @@ def _scaled_inverse(elements: bytes, count: int) -> Matrix:
 
 
 def calibrated_covariance(bread: Matrix, noise: Noise) -> Matrix:
-    """Sandwich covariance: (J'WJ)^-1 J'W S W J (J'WJ)^-1, S the covariance of the errors.
-
-    It holds for any weights, and counts neighbouring frequencies that share their noise once only.
-    """
+    """Sandwich covariance: (J'WJ)^-1 J'W S W J (J'WJ)^-1, S the covariance of the errors. It holds
+    for any weights, and counts neighbouring frequencies that share their noise once only."""
     inverse = scaled_inverse(bread)
     return inverse @ (noise.data + noise.priors) @ inverse
 
@@ -149,14 +137,9 @@ class ResponseTerm:
         return np.exp(-self.misfit[..., 0] - 1j * self.misfit[..., 1])
 
     @ft.cached_property
-    def error_exponent(self) -> Float[np.ndarray, "frequencies outputs inputs"]:
-        """As in `FrequencyResponse`."""
-        return self.frf.error_exponent
-
-    @ft.cached_property
     def measured_error(self) -> Float[np.ndarray, "frequencies outputs inputs"]:
         """Random error relative to the model."""
-        return np.asarray(self.frf.random_error) * np.abs(self.ratio) ** self.error_exponent
+        return np.asarray(self.frf.random_error) * np.abs(self.ratio) ** self.frf.error_exponent
 
     @ft.cached_property
     def error(self) -> Float[np.ndarray, "frequencies outputs inputs"]:
@@ -243,7 +226,7 @@ class ErrorBudget:
         for record in self.records:
             pulls, used = record.pulls, record.used
             model = np.where(used, np.asarray(record.frf.response) / record.ratio, 1.0)
-            off = np.where(used, np.abs(record.ratio), 1.0) ** (1 - record.error_exponent)
+            off = np.where(used, np.abs(record.ratio), 1.0) ** (1 - record.frf.error_exponent)
             # Magnitude and phase of the misfit are the parts of dT over T.
             columns = (pulls[..., 0, :] + 1j * pulls[..., 1, :]) / (model.conj() * off)[..., None]
             errors = record.frf.errors
@@ -356,15 +339,11 @@ def error_budget(
 
 
 class Weighting(NamedTuple):
-    """How the points of a fit count: as the noise says, and with what the model leaves unexplained.
-
-    `budget` is that of the problem at a solution, by changes relative to its own units. `by_noise`
-    is the problem under the weights of the noise alone, where its own have a floor on the error.
-    """
+    """How the points of a fit count, by the noise and by what the model leaves unexplained."""
 
     points: Sequence[Points]
-    budget: ErrorBudget
-    by_noise: Problem | None = None
+    budget: ErrorBudget  # at a solution, by changes relative to its own units
+    by_noise: Problem | None = None  # under weights without a floor on the error, if there is one
 
 
 def weighting_at(problem: Problem, points: Sequence[Points], solution: Solution) -> Weighting:
@@ -383,10 +362,8 @@ def find_discrepancy(
     prior: PriorRows,
     moving: Sequence[int],
 ) -> tuple[Mixture, Mixture]:
-    """The discrepancy of a fit, under the prior and under one of a larger mean.
-
-    `moving` are the parameters that can take up a misfit: not those that a bound holds against it.
-    """
+    """The discrepancy of a fit, under the prior and under one of a larger mean. `moving` are the
+    parameters that can take up a misfit: not those that a bound holds against it."""
     columns = np.asarray(moving, int)
     rows = np.concatenate([prior.slopes[:, columns], prior.misfit[:, None]], axis=1)
     # Products of slopes and misfit under noise alone; along the components of the kernels, gains of
@@ -453,11 +430,8 @@ def _components(
 
 @ft.lru_cache(maxsize=16)
 def kernel_basis(omega: bytes) -> Float[np.ndarray, "lengths frequencies rank"]:
-    """Roots of the kernels of all lengths at frequencies (the bytes of their array, rad/s).
-
-    Where an Ornstein-Uhlenbeck process is depends on its two neighbours alone, so the inverse of
-    its kernel has three diagonals, which serve for many frequencies.
-    """
+    """Roots of the kernels of all lengths at frequencies (the bytes of their array, rad/s). Only
+    neighbours matter to such a process: an inverse kernel has three diagonals."""
     place = np.log(np.frombuffer(omega))
     order = np.argsort(place)
     if place.size <= _DENSE or not np.min(np.diff(place[order])) > 1e-9:
