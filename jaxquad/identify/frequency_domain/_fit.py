@@ -29,7 +29,7 @@ from jaxquad.spectra import FrequencyResponse
 from ..uncertainty._assess import assess, DOUBT, unfitted
 from ..uncertainty._error_budget import weighting_at
 from ..uncertainty._verdict import without_numbers
-from ..uncertainty._zero_bounds import solve_within_bounds
+from ..uncertainty._zero_bounds import linearise, solve_within_bounds
 from ._cost import (
     Band,
     Cost,
@@ -51,6 +51,7 @@ from ._feedthrough import (
     limited,
     remarks_on_samples,
     sample_limits,
+    Solved,
     unsampled,
 )
 from ._parameters import Condition, Free, Numbers, Parameters, select_parameters, Tie
@@ -278,9 +279,15 @@ def _fit(
         starts = spread_starts(parameters, options.starts, fastest=fastest)
         solution, minima = solve_from_many(problem, starts, solver, max_steps)
         solution = solve_within_bounds(problem, solution, solver, max_steps)
-    solve_from = lambda problem, z: solve_within_bounds(problem, z, solver, max_steps)
+
+    def solve_from(problem: Problem, z: Numbers) -> Solved:
+        end = solve_within_bounds(problem, np.asarray(z), solver, max_steps)
+        local = linearise(problem, end)
+        return Solved(end, end.z, local.cost, local.jacobian.T @ local.jacobian)
+
     if delays:
-        problem, solution = find_samples(problem, solution, delays, solve_from)
+        problem, sampled = find_samples(problem, solution.z, delays, solve_from)
+        solution = sampled.solution
     descents.append(Descent(problem, points, solution))
     again = weigh(points, solution)
     if not are_close(weights, again, 1e-4):
@@ -303,11 +310,11 @@ def _fit(
         descents.append(Descent(problem, raised, solution))
         _check_finite(solution)
         weighting = weighting_at(problem, points, solution)
-    limits, within = sample_limits(problem, solution, delays, solve_from)
+    limits, z = sample_limits(problem, solution.z, delays, solve_from)
     if limits:
         problem = limited(problem, limits)
         descents.clear()  # what limits a delay to its sample has no derivative
-        solution = solve_from(problem, within.z)
+        solution = solve_from(problem, z).solution
         weighting = weighting_at(problem, points, solution)
     if lifted:
         weighting = weighting._replace(by_noise=weighted(points, weigh(points, solution)))
