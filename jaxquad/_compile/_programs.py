@@ -40,6 +40,8 @@ Numbers = Array | np.ndarray
 Options = Callable[[], dict[str, Any]]
 Others = tuple[Any, ...]  # at the places of arrays None, else what is there, with its type
 _MOST = 256  # programs of a function
+# Shapes of a program. Each costs some 5 MB and 50 of the 65,530 memory maps that a process may have.
+_MOST_SHAPES = 128
 _ARRAYS = jax.Array, np.ndarray, np.generic  # as for `eqx.is_array`
 
 
@@ -165,23 +167,34 @@ _Call = Callable[[Sequence[Numbers]], PyTree]
 
 
 class _Program:
-    """Of all arguments of a structure and of some settings: one for each shape of the arrays."""
+    """Of all arguments of a structure and of some settings: one for each shape of the arrays.
+
+    Beyond `_MOST_SHAPES` all are dropped, and compiled anew where they are asked for again.
+    """
 
     def __init__(
         self, function: Callable[..., PyTree], options: Options, structure: PyTree, others: Others
     ):
-        def run(arrays: Sequence[Any]) -> tuple[list[Any], _Form]:
-            args = jax.tree.unflatten(structure, _together(arrays, others))
-            leaves, form = jax.tree.flatten(function(*args))
-            results, rest = _arrays_and_others(leaves)
-            return results, _Form(form, rest)
-
-        run.__name__ = function.__name__
-        self._function, self._options, self._run = function, options, run
+        self._function, self._options = function, options
         self._settings = structure, others
-        self.plain = jax.jit(run, compiler_options=options() or None)
+        self.plain, self._traced = self._jit(), 0
         self._compiled: dict[tuple, _Call] = {}
         self._lock = threading.Lock()
+
+    def _run(self, arrays: Sequence[Any]) -> tuple[list[Any], _Form]:
+        structure, others = self._settings
+        args = jax.tree.unflatten(structure, _together(arrays, others))
+        leaves, form = jax.tree.flatten(self._function(*args))
+        results, rest = _arrays_and_others(leaves)
+        return results, _Form(form, rest)
+
+    def _jit(self) -> Any:
+        def run(arrays: Sequence[Any]) -> tuple[list[Any], _Form]:
+            self._traced += 1  # only where a shape is new
+            return self._run(arrays)
+
+        run.__name__ = self._function.__name__
+        return jax.jit(run, compiler_options=self._options() or None)
 
     def __call__(self, arrays: Sequence[Numbers]) -> PyTree:
         folder = _folder()
@@ -190,8 +203,11 @@ class _Program:
         kinds = _kinds(arrays)
         with self._lock:
             if kinds not in self._compiled:
+                if len(self._compiled) >= _MOST_SHAPES:
+                    self._compiled.clear()
                 self._compiled[kinds] = self._find(arrays, folder)
-        return self._compiled[kinds](arrays)
+            program = self._compiled[kinds]
+        return program(arrays)
 
     def _find(self, arrays: Sequence[Numbers], folder: Path) -> _Call:
         """From the disk or the compiler; by `jax.jit` where it has no name."""
@@ -221,6 +237,8 @@ class _Program:
         return lambda arrays: form.filled(run(list(arrays)))
 
     def _by_jit(self, arrays: Sequence[Numbers]) -> PyTree:
+        if self._traced >= _MOST_SHAPES:  # what nobody holds is freed, with what it has compiled
+            self.plain, self._traced = self._jit(), 0
         results, form = self.plain(arrays)
         return form.filled(results)
 

@@ -295,7 +295,7 @@ def _run_members(
         _, accumulator = eqx.combine(parts, static)
         total, output = accumulator.update(carry[1], result)
         if oldest:
-            output = inner.queue.newest, output
+            output = inner.queue[0], output
         return (inner._replace(queue=None), total), output
 
     parts = arrays, jax.lax.stop_gradient(start)
