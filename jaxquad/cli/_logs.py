@@ -341,7 +341,8 @@ A LADRC for the angle of the axis, scheduled with the inertia, is tuned on plant
 from everything the record leaves uncertain. Each flies a step, a torque pulse and a step back. The
 folder gets the report, the certificate and a C header.
 exit codes: 0 done, 2 unusable input, 3 the record does not determine the plant, 4 the design is not
-to be flown, since STABILITY, PERFORMANCE or CONVERGENCE fails (it is written all the same)
+to be flown, since STABILITY, PERFORMANCE or CONVERGENCE fails or too few plants decide it (it is
+written all the same)
 """,
 )
 def tune(declared: argparse.ArgumentParser) -> Run:
