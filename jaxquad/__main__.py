@@ -2,7 +2,13 @@
 
 import sys
 
-from jaxquad.cli import main
+
+try:
+    from jaxquad.cli import main
+except KeyboardInterrupt:
+    print("jaxquad: interrupted", file=sys.stderr)
+    sys.exit(130)
 
 
-sys.exit(main())
+if __name__ == "__main__":
+    sys.exit(main())

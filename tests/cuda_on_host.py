@@ -11,7 +11,7 @@ import jax
 import numpy as np
 import pytest
 
-from jaxquad._xla import _kernel_memory, _nvrtc, _switch
+from jaxquad._xla import _cuda, _passes, _switch
 
 
 _HOST = """
@@ -49,16 +49,16 @@ def run_on_host(monkeypatch):
     """Kernels of a GPU run here, from now on."""
     if shutil.which("g++") is None:
         pytest.skip("needs g++")
-    monkeypatch.setattr(_kernel_memory, "launch", _launch)
-    monkeypatch.setattr(_kernel_memory, "WARP", 1)
-    monkeypatch.setattr(_nvrtc, "ptx_of", lambda text, architecture: "")
+    monkeypatch.setattr(_passes, "launch", _launch)
+    monkeypatch.setattr(_passes, "WARP", 1)
+    monkeypatch.setattr(_cuda, "ptx_of", lambda text, architecture: "")
 
 
 def for_cuda(function, *args):
     """What XLA for a GPU gets, with a word in place of what NVRTC makes."""
     with pytest.MonkeyPatch.context() as patch, _switch.device_kernels("forced"):
-        patch.setattr(_kernel_memory, "launch", _nvrtc.launch)
-        patch.setattr(_nvrtc, "ptx_of", lambda text, architecture: "made by NVRTC")
+        patch.setattr(_passes, "launch", _cuda.launch)
+        patch.setattr(_cuda, "ptx_of", lambda text, architecture: "made by NVRTC")
         return jax.jit(function).trace(*args).lower(lowering_platforms=("cuda",)).as_text()
 
 

@@ -8,6 +8,8 @@ import pytest
 from conftest import ROOT
 from package_messages import PACKAGE, parsed
 
+from jaxquad.records.firmware import firmware_log
+
 
 ORDER = (
     "_core", "_xla", "_compile", "records", "datasets", "excitation", "models", "spectra",
@@ -15,6 +17,11 @@ ORDER = (
     "export", "plot", "report", "autopilot", "workflows", "cli",
 )  # fmt: skip
 FILES = sorted(path for path in PACKAGE.rglob("*.py") if path.parent != PACKAGE)
+FIRMWARES = {
+    path.stem.strip("_")
+    for path in PACKAGE.glob("autopilot/firmwares/*.py")
+    if "\nFIRMWARE = " in path.read_text()
+}
 
 
 def imports(path: Path) -> Iterator[tuple[str, ...]]:
@@ -31,7 +38,7 @@ def imports(path: Path) -> Iterator[tuple[str, ...]]:
 
 def test_the_list_of_rooms_is_that_of_the_folders():
     folders = {path.parent.relative_to(PACKAGE).parts[0] for path in FILES}
-    assert folders == set(ORDER)
+    assert folders == set(ORDER), "enter a new room in ORDER, docs/design.md and its diagram"
 
 
 @pytest.mark.parametrize("room", ORDER)
@@ -41,9 +48,11 @@ def test_a_room_imports_lower_ones_only_and_through_their_faces(room):
             if name[0] != "jaxquad" or name[1:2] == (room,):
                 continue
             assert len(name) > 1, f"{path} imports the package as a whole"
-            assert ORDER.index(name[1]) < ORDER.index(room), f"{path} imports {'.'.join(name)}"
+            line = f"{path.relative_to(ROOT)} imports {'.'.join(name)}"
+            before = ORDER[: ORDER.index(room)]
+            assert name[1] in before, f"{line}: a room imports only those before it in ORDER"
             private = [part for part in name[2:] if part.startswith("_")]
-            assert not private, f"{path} imports {'.'.join(name)}"
+            assert not private, f"{line}: export it in the face of {name[1]}"
 
 
 def test_what_knows_the_compilers_has_one_door():
@@ -54,13 +63,20 @@ def test_what_knows_the_compilers_has_one_door():
 
 
 def test_no_file_but_its_own_asks_whether_a_firmware_is_the_one():
-    firmwares = {"ardupilot", "px4", "betaflight", "crazyflie"}
     for path in (path for path in FILES if "formats" not in path.parts):
-        others = firmwares - ({*path.stem.split("_")} if "firmwares" in path.parts else set())
+        others = FIRMWARES - ({*path.stem.split("_")} if "firmwares" in path.parts else set())
         for node in ast.walk(parsed(path)):
             if isinstance(node, ast.Compare):
                 words = {x.value for x in ast.walk(node) if isinstance(x, ast.Constant)}
-                assert not others & words, (path, node.lineno)
+                line = f"{path.relative_to(ROOT)}:{node.lineno}"
+                assert not others & words, f"{line}: ask a method or field of Firmware instead"
+
+
+def test_the_file_format_of_a_firmware_of_the_package_is_among_the_formats():
+    for name in FIRMWARES:
+        log = firmware_log(name)
+        assert log is not None, f"enter {name} in _LOGS of jaxquad/__init__.py"
+        assert log.reader is None, f"enter the reader of {name} in READERS of records/formats"
 
 
 VAGUE = {

@@ -10,9 +10,10 @@ import shutil
 import tempfile
 import time
 import warnings
+import zlib
 from collections.abc import Callable
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 from typing import Any, Literal, NamedTuple
 
 import jax
@@ -20,18 +21,40 @@ import platformdirs
 from jax.experimental.compilation_cache import compilation_cache
 from jaxtyping import PyTree
 
-from . import _plain
+
+# The compilers' functions without compilers: all names that the package takes from `jaxquad._xla`.
+PLAIN = SimpleNamespace(
+    reason="",  # why there are no compilers
+    as_one_kernel=lambda function, *args: function(*args),
+    scan_on_device=lambda step, carry, signals, members, scan: None,
+    why_no_device_kernels=lambda: PLAIN.reason,
+    why_plain=lambda: PLAIN.reason,
+    or_plain=lambda name, kind, run: run(),
+    set_kernel=lambda kernel: _require_switch(kernel),
+    switches=tuple,
+    left_plain=tuple,
+    compiler_options=dict,
+    brief_options=dict,
+    hasty_options=dict,
+    no_fuse=lambda function, *args: function(*args),
+    evaluate_once=lambda function, *, least: function,
+)
+
+
+def _require_switch(kernel: str) -> None:
+    if kernel not in ("auto", "off"):
+        raise ValueError(f'kernel is "{kernel}", but it must be "auto" or "off"')
 
 
 @ft.cache
-def compilers() -> ModuleType:
+def compilers() -> ModuleType | SimpleNamespace:
     """`jaxquad._xla`; without it, or with a JAX that lacks what it needs, plain scans."""
     try:
         import jaxquad._xla as xla
     except (ImportError, AttributeError) as error:  # JAX's interfaces to its compiler may move.
-        _plain.reason = f"this JAX ({jax.__version__}) lacks what kernels are made with ({error})"
-        warnings.warn(f"loops take longer than they could: {_plain.reason}", stacklevel=2)
-        return _plain
+        PLAIN.reason = f"this JAX ({jax.__version__}) lacks what kernels are made with ({error})"
+        warnings.warn(f"loops take longer than they could: {PLAIN.reason}", stacklevel=2)
+        return PLAIN
     return xla
 
 
@@ -123,16 +146,29 @@ def evaluate_once(function: Callable[..., PyTree], *, least: int = 1024) -> Call
 # Compiled programs on the disk, for the next process.
 #
 # JAX writes its entries in place, so that a process that is killed, or two that write the same one,
-# leave damaged entries behind; and its own limit of size stops all writing after one such accident.
-# So each process has a folder of its own, which begins with hard links to what is there. New
-# entries are linked into the shared folder whole.
+# leave damaged entries behind, which JAX never replaces; and its own limit of size stops all
+# writing after one such accident. So each process has a folder of its own, which begins with hard
+# links to what is there. New entries are linked into the shared folder whole, JAX's own with a
+# checksum before their name. A damaged entry is removed, and made again.
 
 _VARIABLE = "JAXQUAD_CACHE"  # "off", or a folder
 _ENTRIES = "*-cache"  # as JAX names them
 _MOST_BYTES, _MOST_ENTRIES = 256 * 2**20, 4000
-_ABANDONED = 86_400.0  # s after which the folder of a process that was killed goes
+_ABANDONED = 86_400.0  # s after which the folder of a process that was killed goes without locks
+_STARTING = 60.0  # s in which a process locks its folder
 _LEAST = 0.0  # s of compile time from which a program is kept: reading one takes 1 ms
 _OWN = "process-"  # begins the name of a process's own folder
+_TRACED = "traced-"  # begins entries that hold a checksum themselves
+_descriptors: list[int] = []  # of this process's own folder, which is locked until it ends
+
+
+class ProgramWarning(UserWarning):
+    """A kept program was damaged."""
+
+
+def warn_of_damage() -> None:
+    text = "a kept program was damaged: it is removed and compiled again"
+    warnings.warn(text, ProgramWarning, stacklevel=2)
 
 
 def enable_compile_cache() -> Path | None:
@@ -157,9 +193,10 @@ def enable_compile_cache() -> Path | None:
         shared.mkdir(parents=True, exist_ok=True)
         _prune(shared)
         mine = Path(tempfile.mkdtemp(prefix=_OWN, dir=shared))
+        if (place := _locked(mine)) is not None:
+            _descriptors.append(place)
         for path in shared.glob(_ENTRIES):
-            with contextlib.suppress(FileNotFoundError):  # Another process has just removed it.
-                os.link(path, mine / path.name)
+            _link_entry(path, mine)
     except OSError as error:
         warnings.warn(
             f"compiled programs are not kept: {error}. Name another folder by {_VARIABLE}, or "
@@ -175,6 +212,40 @@ def enable_compile_cache() -> Path | None:
     atexit.register(shutil.rmtree, mine, ignore_errors=True)
     atexit.register(share_programs)
     return shared
+
+
+def _locked(folder: Path) -> int | None:
+    """The folder, open and locked until its process ends; None where another process has it."""
+    try:
+        import fcntl
+    except ImportError:  # Windows
+        return None
+    place = os.open(folder, os.O_RDONLY)
+    try:
+        fcntl.flock(place, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        os.close(place)
+        return None
+    return place
+
+
+def _link_entry(path: Path, mine: Path) -> None:
+    """Put an entry of the shared folder into a process's own; what is damaged is removed."""
+    checksum, _, name = path.name.rpartition(".")
+    try:
+        sound = path.is_file() and (
+            name.startswith(_TRACED) or checksum == f"{zlib.crc32(path.read_bytes()):08x}"
+        )
+        if sound:
+            os.link(path, mine / name)
+            return
+        shutil.rmtree(path) if path.is_dir() else path.unlink()
+    except FileNotFoundError:  # another process has just removed it
+        return
+    except FileExistsError:  # two processes have compiled it
+        path.unlink(missing_ok=True)
+        return
+    warn_of_damage()
 
 
 def _jax_folder() -> Path | None:
@@ -212,9 +283,14 @@ def _prune(shared: Path) -> None:
         size += stat.st_size
         if size > _MOST_BYTES or k >= _MOST_ENTRIES:
             path.unlink(missing_ok=True)
-    for folder in shared.glob(f"{_OWN}*"):
-        if folder.stat().st_mtime < time.time() - _ABANDONED:
-            shutil.rmtree(folder, ignore_errors=True)
+    for folder in shared.glob(f"{_OWN}*"):  # their links keep the space of entries
+        with contextlib.suppress(OSError):  # it is gone
+            age = time.time() - folder.stat().st_mtime
+            place = _locked(folder) if age > _STARTING else None
+            if place is not None or age > _ABANDONED:
+                shutil.rmtree(folder, ignore_errors=True)
+            if place is not None:
+                os.close(place)
 
 
 def share_programs() -> None:
@@ -226,5 +302,9 @@ def share_programs() -> None:
     if mine is None:
         return
     for path in mine.glob(_ENTRIES):
-        with contextlib.suppress(OSError):  # It is there already, or the disk is full.
-            os.link(path, mine.parent / path.name)
+        if path.stat().st_nlink > 1:
+            continue
+        with contextlib.suppress(OSError):  # it is there already, or the disk is full
+            is_traced = path.name.startswith(_TRACED)
+            checksum = "" if is_traced else f"{zlib.crc32(path.read_bytes()):08x}."
+            os.link(path, mine.parent / f"{checksum}{path.name}")

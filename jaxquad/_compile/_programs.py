@@ -8,6 +8,7 @@ name the program, beside the source of jaxquad and the versions of what traces. 
 anything of another's making have no such name: its source may change.
 """
 
+import contextlib
 import functools as ft
 import hashlib
 import io
@@ -17,6 +18,9 @@ import pickle
 import sys
 import threading
 import warnings
+import weakref
+import zlib
+from collections import deque
 from collections.abc import Callable, Sequence
 from importlib.metadata import version
 from pathlib import Path
@@ -33,15 +37,14 @@ from jaxtyping import Array, PyTree
 
 from jaxquad._core import thread_settings
 
-from ._door import brief_options, compiler_options, compilers, own_folder
+from ._door import brief_options, compiler_options, compilers, own_folder, warn_of_damage
 
 
 Numbers = Array | np.ndarray
 Options = Callable[[], dict[str, Any]]
 Others = tuple[Any, ...]  # at the places of arrays None, else what is there, with its type
 _MOST = 256  # programs of a function
-# Shapes of a program. Each costs some 5 MB and 50 of the 65,530 memory maps that a process may have.
-_MOST_SHAPES = 128
+_MOST_LOADED = 192  # compiled ones of the process: each takes up to 5 MB, and 49 of 65,530 maps
 _ARRAYS = jax.Array, np.ndarray, np.generic  # as for `eqx.is_array`
 
 
@@ -167,34 +170,23 @@ _Call = Callable[[Sequence[Numbers]], PyTree]
 
 
 class _Program:
-    """Of all arguments of a structure and of some settings: one for each shape of the arrays.
-
-    Beyond `_MOST_SHAPES` all are dropped, and compiled anew where they are asked for again.
-    """
+    """Of all arguments of a structure and of some settings: one for each shape of the arrays."""
 
     def __init__(
         self, function: Callable[..., PyTree], options: Options, structure: PyTree, others: Others
     ):
-        self._function, self._options = function, options
+        def run(arrays: Sequence[Any]) -> tuple[list[Any], _Form]:
+            args = jax.tree.unflatten(structure, _together(arrays, others))
+            leaves, form = jax.tree.flatten(function(*args))
+            results, rest = _arrays_and_others(leaves)
+            return results, _Form(form, rest)
+
+        run.__name__ = function.__name__
+        self._function, self._options, self._run = function, options, run
         self._settings = structure, others
-        self.plain, self._traced = self._jit(), 0
+        self.plain = jax.jit(run, compiler_options=options() or None)
         self._compiled: dict[tuple, _Call] = {}
         self._lock = threading.Lock()
-
-    def _run(self, arrays: Sequence[Any]) -> tuple[list[Any], _Form]:
-        structure, others = self._settings
-        args = jax.tree.unflatten(structure, _together(arrays, others))
-        leaves, form = jax.tree.flatten(self._function(*args))
-        results, rest = _arrays_and_others(leaves)
-        return results, _Form(form, rest)
-
-    def _jit(self) -> Any:
-        def run(arrays: Sequence[Any]) -> tuple[list[Any], _Form]:
-            self._traced += 1  # only where a shape is new
-            return self._run(arrays)
-
-        run.__name__ = self._function.__name__
-        return jax.jit(run, compiler_options=self._options() or None)
 
     def __call__(self, arrays: Sequence[Numbers]) -> PyTree:
         folder = _folder()
@@ -202,12 +194,18 @@ class _Program:
             return self._by_jit(arrays)
         kinds = _kinds(arrays)
         with self._lock:
-            if kinds not in self._compiled:
-                if len(self._compiled) >= _MOST_SHAPES:
-                    self._compiled.clear()
-                self._compiled[kinds] = self._find(arrays, folder)
-            program = self._compiled[kinds]
-        return program(arrays)
+            call = self._compiled.get(kinds)
+            if call is None:
+                call = self._compiled[kinds] = self._find(arrays, folder)
+                _count_loaded(self, kinds)
+        return call(arrays)
+
+    def drop(self, kinds: tuple | None) -> None:
+        """Forget a compiled program; None for those of `jax.jit`."""
+        if kinds is None:
+            self.plain.clear_cache()
+        else:
+            self._compiled.pop(kinds, None)
 
     def _find(self, arrays: Sequence[Numbers], folder: Path) -> _Call:
         """From the disk or the compiler; by `jax.jit` where it has no name."""
@@ -237,10 +235,26 @@ class _Program:
         return lambda arrays: form.filled(run(list(arrays)))
 
     def _by_jit(self, arrays: Sequence[Numbers]) -> PyTree:
-        if self._traced >= _MOST_SHAPES:  # what nobody holds is freed, with what it has compiled
-            self.plain, self._traced = self._jit(), 0
+        loaded = self.plain._cache_size()
         results, form = self.plain(arrays)
+        if self.plain._cache_size() > loaded:
+            _count_loaded(self, None)
         return form.filled(results)
+
+
+_loaded: deque[tuple[weakref.ref[_Program], tuple | None]] = deque()  # the oldest first
+
+
+def _count_loaded(program: _Program, kinds: tuple | None) -> None:
+    """Count a program that was compiled or read; beyond the most, the oldest ones are dropped."""
+    _loaded.append((weakref.ref(program), kinds))
+    while len(_loaded) > _MOST_LOADED:
+        with contextlib.suppress(IndexError):  # another thread has dropped it
+            oldest, of_oldest = _loaded.popleft()
+            if (owner := oldest()) is not None:
+                owner.drop(of_oldest)
+            while of_oldest is None and (oldest, None) in _loaded:  # it forgets all at once
+                _loaded.remove((oldest, None))
 
 
 def _is_outermost(leaves: list) -> bool:
@@ -290,6 +304,7 @@ class _Place(int):
     """Of an array among a program's results."""
 
 
+_CHECKSUM = 4  # bytes in front of what is stored
 _LAPACK = "lapack_"  # in the names of its functions, which only a process that traces them loads
 
 
@@ -300,19 +315,25 @@ def _write(path: Path, run: jax.stages.Compiled, form: _Form) -> None:
             return
         content, *_ = serialize(run)
         count = run.out_tree.num_leaves
-        path.write_bytes(pickle.dumps((content, count, form.filled([*map(_Place, range(count))]))))
+        stored = pickle.dumps((content, count, form.filled([*map(_Place, range(count))])))
+        path.write_bytes(zlib.crc32(stored).to_bytes(_CHECKSUM) + stored)
     except Exception as error:  # JAX calls its own interface experimental
         warnings.warn(f"a program is not kept for the next process: {error}", stacklevel=2)
 
 
 def _read(path: Path, arguments: int) -> _Call | None:
     try:
-        content, count, result = pickle.loads(path.read_bytes())
+        stored = path.read_bytes()
+        if zlib.crc32(stored[_CHECKSUM:]).to_bytes(_CHECKSUM) != stored[:_CHECKSUM]:
+            raise ValueError("it is damaged")
+        content, count, result = pickle.loads(stored[_CHECKSUM:])
         taken = jax.tree.structure((([0] * arguments,), {}))
         results = jax.tree.structure([0] * count)
         run = deserialize_and_load(content, taken, results, None, jax.devices()[:1])
-    except Exception as error:  # damaged, or of another making
-        warnings.warn(f"{path.name} cannot be read ({error}): it is compiled anew", stacklevel=2)
+    except Exception:  # damaged, or of another making
+        for place in (path, path.parent.parent / path.name):  # its own, and the shared one
+            place.unlink(missing_ok=True)
+        warn_of_damage()
         return None
     leaves, structure = jax.tree.flatten(result)
     others = tuple([None if isinstance(x, _Place) else (type(x), x) for x in leaves])

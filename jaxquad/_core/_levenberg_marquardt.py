@@ -224,8 +224,7 @@ def decrement(normal: Normal) -> Float[Array, " *batch"]:
 
 
 def solve_definite(
-    matrix: Float[Array, "parameters parameters *batch"],
-    vector: Float[Array, " parameters *batch"],
+    matrix: Float[Array, "parameters parameters *batch"], vector: Float[Array, " parameters *batch"]
 ) -> tuple[Float[Array, " parameters *batch"], Bool[Array, " *batch"]]:
     """Gauss-Jordan elimination of a symmetric matrix, and whether it is positive definite."""
     count = vector.shape[0]

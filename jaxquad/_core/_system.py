@@ -5,6 +5,8 @@ import functools as ft
 import logging
 import math
 import os
+import shutil
+import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -28,7 +30,7 @@ def write_file(path: str | Path, content: str | bytes) -> Path:
     **Arguments:**
 
     - `path`: its folders are made as needed.
-    - `content`: a text is encoded as UTF-8; what cannot be becomes a question mark.
+    - `content`: a text is encoded as UTF-8, as `readable` makes it.
 
     **Returns:** the path.
     """
@@ -37,12 +39,14 @@ def write_file(path: str | Path, content: str | bytes) -> Path:
     draft = path.with_name(f"{path.name}.{os.getpid()}.part")
     try:
         with draft.open("wb") as file:
-            file.write(content.encode("utf-8", "replace") if isinstance(content, str) else content)
+            file.write(readable(content).encode() if isinstance(content, str) else content)
             file.flush()
             os.fsync(file.fileno())
         draft.replace(path)
-    except BaseException:
+    except BaseException as error:
         draft.unlink(missing_ok=True)
+        if isinstance(error, OSError):  # a full disk names no file
+            error.filename = str(path)
         raise
     if os.name != "nt":  # a new name is on the disk only once its folder is
         folder = os.open(path.parent, os.O_RDONLY)
@@ -53,14 +57,48 @@ def write_file(path: str | Path, content: str | bytes) -> Path:
     return path
 
 
+@contextlib.contextmanager
+def staged_files(folder: Path) -> Iterator[Path]:
+    """A folder of drafts whose files move to `folder` at the end of the `with`: all, or none."""
+    new = [path for path in (folder, *folder.parents) if not path.exists()]
+    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        draft = Path(tempfile.mkdtemp(prefix=".", suffix=".part", dir=folder))
+        try:
+            yield draft
+            for path in sorted(draft.iterdir()):
+                path.replace(folder / path.name)
+        finally:
+            shutil.rmtree(draft, ignore_errors=True)
+    except BaseException as error:
+        for path in new:
+            with contextlib.suppress(OSError):  # it holds something else
+                path.rmdir()
+        if isinstance(error, OSError):
+            error.filename = str(folder)
+        raise
+
+
+def readable(text: str) -> str:
+    """A text without what UTF-8 cannot hold: bytes in the name of a file, half a pair in JSON."""
+    if text.isascii():
+        return text
+    try:
+        return text.encode("utf-8", "surrogateescape").decode("utf-8", "replace")
+    except UnicodeEncodeError:
+        return text.encode("utf-8", "replace").decode()
+
+
 def plain_content(value: object) -> Any:
-    """JSON's own types, with null for what is not finite."""
+    """JSON's own types, with null for what is not finite, and texts as `readable` makes them."""
     if isinstance(value, float):  # first what there is most of
         return float(value) if math.isfinite(value) else None
-    if value is None or isinstance(value, str | int):
+    if isinstance(value, str):
+        return readable(value)
+    if value is None or isinstance(value, int):
         return value
     if isinstance(value, Mapping):
-        return {str(key): plain_content(item) for key, item in value.items()}
+        return {readable(str(key)): plain_content(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
         return [plain_content(item) for item in value]
     if hasattr(value, "__array__"):  # of NumPy or JAX

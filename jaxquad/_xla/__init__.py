@@ -1,6 +1,6 @@
 """What knows XLA, MLIR and CUDA: loops as one kernel, compiler options, operations kept apart.
 
-`jaxquad._compile` is the only one that imports it; its `_plain.py` has the same names without it.
+`jaxquad._compile` is the only one that imports it; its `PLAIN` has the same names without it.
 """
 
 from ._kernel import (

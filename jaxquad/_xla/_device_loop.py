@@ -16,7 +16,7 @@ from jax.extend.core import ClosedJaxpr, jaxpr_as_fun, Primitive
 from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array, PyTree
 
-from ._kernel_memory import BLOCK, kept_avals, memory_type
+from ._cuda import CannotCompile
 from ._lanes import NotInLanes, NUMBERS, numbers
 from ._loop import (
     Flat,
@@ -31,8 +31,7 @@ from ._loop import (
     step_in_lanes,
     without_invariants,
 )
-from ._nvrtc import CannotCompile
-from ._passes import holds_cotangents, run_forward, run_reverse
+from ._passes import BLOCK, holds_cotangents, kept_avals, memory_type, run_forward, run_reverse
 from ._switch import note, Result, Scan, Step, warn_once
 
 

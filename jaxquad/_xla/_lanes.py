@@ -19,7 +19,7 @@ import numpy as np
 from jax.core import Tracer
 from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal, Primitive
 
-from ._cuda_text import EXPRESSIONS, FUNCTIONS, TYPES
+from ._cuda import EXPRESSIONS, FUNCTIONS, TYPES
 from ._switch import MOST_CELLS
 
 

@@ -18,7 +18,7 @@ from jax.extend.core import ClosedJaxpr, jaxpr_as_fun, JaxprEqn, Var
 from jax.typing import DTypeLike
 from jaxtyping import Array
 
-from ._cuda_text import EXPRESSIONS
+from ._cuda import EXPRESSIONS
 from ._lanes import as_cells, CALLS, cells_of, Lane, Lanes, NotInLanes, NUMBERS, numbers
 
 

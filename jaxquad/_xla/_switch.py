@@ -19,7 +19,7 @@ import numpy as np
 import platformdirs
 from jaxtyping import Array, PyTree
 
-from . import _nvrtc
+from . import _cuda
 
 
 TESTED = ("0.10.2", "0.12.0.1")  # versions of jaxlib
@@ -257,9 +257,9 @@ def why_no_trust_in_gpu() -> str | None:
 
 def _largest_difference(mode: str) -> float:
     """Of values and derivatives, relative to the largest number of each array."""
-    from ._cuda_text import PRELUDE
+    from ._cuda import PRELUDE
 
-    _nvrtc.ptx_of(PRELUDE, _nvrtc.architecture())  # raises what is wrong with NVRTC
+    _cuda.ptx_of(PRELUDE, _cuda.architecture())  # raises what is wrong with NVRTC
     x = jnp.linspace(0.2, 0.8, 2 * _MEMBERS, dtype=jnp.float32).reshape(2, _MEMBERS)
     gain, push = jnp.array([0.9, 0.4], jnp.float32), jnp.linspace(0.0, 0.5, _SAMPLES)
     args = x, gain, push.astype(jnp.float32)[:, None]

@@ -35,12 +35,6 @@ from ._flight_channels import (
     read_flown as read_flown,
     settings_of as settings_of,
 )
-from ._flown_law import (
-    flown_law as flown_law,
-    FlownLaw as FlownLaw,
-    loop_of_law as loop_of_law,
-    StoredFilters as StoredFilters,
-)
 from ._gains import (
     Cascade as Cascade,
     cascade_of as cascade_of,
@@ -55,29 +49,31 @@ from ._gains import (
     RateGains as RateGains,
     torque_per_unit as torque_per_unit,
 )
+from ._identified_log import (
+    flown_law as flown_law,
+    FlownLaw as FlownLaw,
+    loop_of_law as loop_of_law,
+    StoredFilters as StoredFilters,
+    study_throttle as study_throttle,
+)
 from ._law import (
     AngleLoop as AngleLoop,
-    filter_gyro as filter_gyro,
     FirmwareLoop as FirmwareLoop,
     FlownLoop as FlownLoop,
-    gyro_rest as gyro_rest,
     LoopState as LoopState,
     pick_axis as pick_axis,
     RateLoop as RateLoop,
 )
 from ._law_check import check_law as check_law, check_loop as check_loop
-from ._over_throttle import study_throttle as study_throttle
 from ._page import (
     B0Section as B0Section,
     PilotPage as PilotPage,
     write_pilot_page as write_pilot_page,
 )
 from ._parameters import (
-    change_filters as change_filters,
     change_table as change_table,
     check_ranges as check_ranges,
     find_parameter as find_parameter,
-    firmware_of as firmware_of,
     flown_loop as flown_loop,
     list_parameters as list_parameters,
     parameter_file as parameter_file,
@@ -90,8 +86,18 @@ from ._parameters import (
     WordChange as WordChange,
     write_parameter_files as write_parameter_files,
 )
-from ._proposal import AutopilotProposal as AutopilotProposal, AxesProposal as AxesProposal
+from ._proposal import (
+    AutopilotProposal as AutopilotProposal,
+    AxesProposal as AxesProposal,
+    judge as judge,
+)
 from ._rate_design import design_gains as design_gains
+from ._rate_loops import (
+    certify_angle as certify_angle,
+    delay_margin as delay_margin,
+    hold_plants as hold_plants,
+    RateLoops as RateLoops,
+)
 from ._replay import (
     FlownController as FlownController,
     hold_response as hold_response,
@@ -115,24 +121,18 @@ from .firmwares._betaflight import (
 )
 from .firmwares._betaflight_adrc import (
     adrc_parameters as adrc_parameters,
+    ADRCProposal as ADRCProposal,
+    ADRCStage as ADRCStage,
+    ADRCTargets as ADRCTargets,
     b0_law as b0_law,
     betaflight_adrc_loop as betaflight_adrc_loop,
     Flown as Flown,
     FlownADRC as FlownADRC,
 )
-from .firmwares._betaflight_adrc_design import (
-    ADRCProposal as ADRCProposal,
-    ADRCStage as ADRCStage,
-    ADRCTargets as ADRCTargets,
-    propose_adrc as propose_adrc,
-)
 from .firmwares._betaflight_adrc_result import (
     ADRCAutopilot as ADRCAutopilot,
     doubted_throttle as doubted_throttle,
-)
-from .firmwares._betaflight_demo import (
-    CHIRP_TRUTH as CHIRP_TRUTH,
-    write_chirp_log as write_chirp_log,
+    propose_adrc as propose_adrc,
 )
 from .firmwares._betaflight_law import (
     adrc_b0 as adrc_b0,
@@ -143,6 +143,10 @@ from .firmwares._betaflight_law import (
     dynamic_cutoff as dynamic_cutoff,
     ItermRelax as ItermRelax,
     tpa_factor as tpa_factor,
+)
+from .firmwares._betaflight_log import (
+    CHIRP_TRUTH as CHIRP_TRUTH,
+    write_chirp_log as write_chirp_log,
 )
 from .firmwares._crazyflie import (
     CrazyflieAttitude as CrazyflieAttitude,

@@ -24,7 +24,6 @@ from ._rate_loops import (
     Paths,
     Response,
 )
-from ._stages import SharedChange
 
 
 _WINDOW = 0.5  # s
@@ -342,6 +341,13 @@ def noise_growth(
         return rms
     unseen = np.sqrt((power / before)[:, ~measured].max(axis=1))
     return np.maximum(rms, unseen)
+
+
+class SharedChange(NamedTuple):
+    """What changed filters do to the axes that were not tuned."""
+
+    delay_ms: tuple[float, float]  # of the gyro's filters, and with the D term's, over what flew
+    noise: float  # the greatest growth of a command's noise
 
 
 def shared_change(

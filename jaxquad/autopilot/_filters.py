@@ -230,22 +230,26 @@ class FilterChain(eqx.Module):
 
     def response(self, frequency_hz: Frequencies) -> Complex[Array, " frequencies"]:
         """The complex response at these frequencies in Hz."""
-        return _response(self.sections(), as_float(frequency_hz), self.rate_hz)
+        _, parts = self._section_responses(as_float(frequency_hz))
+        return jnp.asarray(ft.reduce(operator.mul, parts))
 
     def delay_ms(self, frequency_hz: Frequencies) -> Float[Array, " frequencies"]:
         """The phase delay in ms at these frequencies in Hz, which are above 0."""
-        return _delay_ms(self.sections(), as_float(frequency_hz), self.rate_hz)
+        at = as_float(frequency_hz)
+        xp, parts = self._section_responses(at)
+        # The phase of each section stays within half a turn, that of a chain does not.
+        phase = ft.reduce(operator.add, map(xp.angle, parts))
+        return jnp.asarray(-1e3 * phase / (2 * np.pi * xp.asarray(at)))
 
     def shares(self, frequency_hz: Frequencies) -> tuple[FilterShare, ...]:
         """Response and delay of each filter alone, and last of the whole chain.
 
         The responses multiply to that of the whole, and the delays add up to its delay.
         """
-        at = as_float(frequency_hz)
-        parts = [(filter.in_words(), filter.sections(self.rate_hz)) for filter in self.filters]
+        parts = [(x.in_words(), FilterChain((x,), self.rate_hz)) for x in self.filters]
         return tuple(
-            FilterShare(name, _response(x, at, self.rate_hz), _delay_ms(x, at, self.rate_hz))
-            for name, x in [*parts, ("all", self.sections())]
+            FilterShare(name, chain.response(frequency_hz), chain.delay_ms(frequency_hz))
+            for name, chain in [*parts, ("all", self)]
         )
 
     def init(self, like: Float[Array, "..."]) -> Memory:
@@ -255,6 +259,33 @@ class FilterChain(eqx.Module):
     def step(self, memory: Memory, sample: Float[Array, "..."]) -> tuple[Memory, Array]:
         """The filtered `sample`."""
         return run_sections(self.sections(), memory, sample)
+
+    def _section_responses(
+        self, frequency_hz: Array
+    ) -> tuple[ModuleType, list[Array | np.ndarray]]:
+        """Ones, and the response of each section, and what has computed them.
+
+        NumPy computes it unless something is traced: XLA would compile for each size.
+        """
+        sections, rate_hz = self.sections(), self.rate_hz
+        numbers = [x for section in sections for x in section if x is not None]
+        if any(x.size > 1 for x in numbers):
+            raise ValueError(
+                "the filter has one cutoff per axis or member: take one axis before asking for its "
+                "response."
+            )
+        if all(map(is_concrete, (*numbers, frequency_hz))):
+            xp, back = np, np.exp(-2j * np.pi * np.asarray(frequency_hz) / rate_hz)
+        else:
+            turn = 2 * np.pi * frequency_hz / rate_hz
+            xp, back = jnp, jax.lax.complex(jnp.cos(turn), -jnp.sin(turn))
+        parts = [0 * back + 1]
+        for section in sections:
+            b0, b1, a1, b2, a2 = (
+                0.0 if x is None else xp.asarray(x).reshape(()).astype(back.dtype) for x in section
+            )
+            parts.append((b0 + back * (b1 + back * b2)) / (1 + back * (a1 + back * a2)))
+        return xp, parts
 
 
 def rest_of(sections: Sequence[Section], like: Array) -> Memory:
@@ -278,48 +309,6 @@ def run_sections(
             after.append((first + state[1], b2 * sample - a2 * passed))
         sample = passed
     return tuple(after), sample
-
-
-Values = Array | np.ndarray
-
-
-def _response(sections: Sequence[Section], frequency_hz: Array, rate_hz: float) -> Array:
-    _, parts = _section_responses(sections, frequency_hz, rate_hz)
-    return jnp.asarray(ft.reduce(operator.mul, parts))
-
-
-def _delay_ms(sections: Sequence[Section], frequency_hz: Array, rate_hz: float) -> Array:
-    """Section by section: the phase of each stays within half a turn, that of a chain does not."""
-    xp, parts = _section_responses(sections, frequency_hz, rate_hz)
-    phase = ft.reduce(operator.add, map(xp.angle, parts))
-    return jnp.asarray(-1e3 * phase / (2 * np.pi * xp.asarray(frequency_hz)))
-
-
-def _section_responses(
-    sections: Sequence[Section], frequency_hz: Array, rate_hz: float
-) -> tuple[ModuleType, list[Values]]:
-    """Ones, and the response of each section, and what has computed them.
-
-    NumPy computes it unless something is traced: XLA would compile for each number of frequencies.
-    """
-    numbers = [x for section in sections for x in section if x is not None]
-    if any(x.size > 1 for x in numbers):
-        raise ValueError(
-            "the filter has one cutoff per axis or member: take one axis before asking for its "
-            "response."
-        )
-    if all(map(is_concrete, (*numbers, frequency_hz))):
-        xp, back = np, np.exp(-2j * np.pi * np.asarray(frequency_hz) / rate_hz)
-    else:
-        turn = 2 * np.pi * frequency_hz / rate_hz
-        xp, back = jnp, jax.lax.complex(jnp.cos(turn), -jnp.sin(turn))
-    parts = [0 * back + 1]
-    for section in sections:
-        b0, b1, a1, b2, a2 = (
-            0.0 if x is None else xp.asarray(x).reshape(()).astype(back.dtype) for x in section
-        )
-        parts.append((b0 + back * (b1 + back * b2)) / (1 + back * (a1 + back * a2)))
-    return xp, parts
 
 
 def _require_below_nyquist(name: str, value: Array, rate_hz: float) -> None:

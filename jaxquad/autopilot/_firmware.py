@@ -122,8 +122,7 @@ class OuterLoop:
     ) -> "OuterLoop | None":  # fmt: skip
         """Of a parameter among the `values` of a log; None where it is missing or 0."""
         value = float(values.get(name, 0.0))
-        chain = FilterChain() if smooth is None else smooth
-        return cls(name, value, unit, late, closed, chain) if value > 0 else None
+        return cls(name, value, unit, late, closed, smooth or FilterChain()) if value > 0 else None
 
 
 class Channels(NamedTuple):
@@ -132,10 +131,16 @@ class Channels(NamedTuple):
     unfiltered: Sequence[str] = ()  # the gyro before its filters, of roll, pitch and yaw
     terms: Sequence[str] = ()  # P, I, D and F of the command
     motors: Sequence[str] = ()  # their commands
+    motor_ends: tuple[float, float] = (0.0, 1.0)  # the lowest and the highest of these
     output: Mapping[str, float] = {}  # the sum of the terms
+    output_limit: float = np.inf  # of that, before the mixer
     stick: Mapping[str, float] = {}  # the throttle that filters and TPA follow
+    stick_ends: tuple[float, float] = (0.0, 1.0)  # of that
     mixed: Mapping[str, float] = {}  # what the motors made of the output
     slewed: Mapping[str, float] = {}  # the share that a slew limiter leaves of P and D
+    # Patterns of channels, in turns per minute, that notches of a mode follow.
+    tracked: Mapping[int, str] = {}
+    resolution: tuple[float, float] = (0.0, 0.0)  # steps of rates (rad/s) and terms; 0 is none
 
 
 class Firmware(abc.ABC):
@@ -160,6 +165,7 @@ class Firmware(abc.ABC):
     notches: tuple[tuple[str, str], ...] = ()  # static ones: the parameters of centre and width
     words: bool = False  # whether some of its parameters are words
     has_adrc: bool = False  # whether it can fly Betaflight's proposed ADRC
+    no_ladrc: str = "it has no disturbance observer"  # why it cannot run a LADRC of the angle
 
     @abc.abstractmethod
     def flown_loop(
@@ -169,8 +175,8 @@ class Firmware(abc.ABC):
         """The rate loop of a log's parameters. Raises ValueError where a gain is missing."""
 
     @abc.abstractmethod
-    def channels(self, prefix: str, axis: int) -> Channels:
-        """Of a log whose channels begin with `prefix`."""
+    def channels(self, prefix: str, axis: int, values: Mapping[str, str]) -> Channels:
+        """Of a log with these parameters whose channels begin with `prefix`."""
 
     @abc.abstractmethod
     def what_to_fly(self, axis: str) -> str:
@@ -187,37 +193,11 @@ class Firmware(abc.ABC):
         """
         return []
 
-    def tracked_channels(self) -> Mapping[int, str]:
-        """Patterns of channels, in turns per minute, that notches of a mode follow."""
-        return {}
-
-    def motor_ends(self, values: Mapping[str, str]) -> tuple[float, float]:
-        """The lowest and the highest command of a motor."""
-        return 0.0, 1.0
-
-    def stick_throttle(
-        self, command: Float[np.ndarray, " samples"], values: Mapping[str, str]
-    ) -> Float[np.ndarray, " samples"] | None:
-        """0 to 1, of the `stick` of `channels`; None where it is not what the law follows."""
-        return command
-
-    def output_limit(self, values: Mapping[str, str], axis: int) -> float:
-        """Of the law's output, before the mixer."""
-        return np.inf
-
-    def resolution(self, values: Mapping[str, str]) -> tuple[float, float]:
-        """Steps in which rates (rad/s) and terms are logged; 0 where they are not rounded."""
-        return 0.0, 0.0
-
     def with_hold(self, values: Mapping[str, str], hold: float | None) -> Mapping[str, str]:
         """The parameters with the loop's interval in s that the log's stamps show."""
         return values
 
     # The law
-
-    def levelled(self, loop: FlownLoop) -> FlownLoop:
-        """The rate loop as it is inside an angle loop that was closed."""
-        return loop
 
     def angle_loop(
         self, values: Mapping[str, str], axis: int, dt: float, *, levelled: bool
@@ -290,10 +270,6 @@ class Firmware(abc.ABC):
                 return {row.name: p}
         raise ValueError(f"{self.log.title} has no angle loop here.")
 
-    def no_ladrc(self) -> str:
-        """Why it cannot run a LADRC of the angle."""
-        return "it has no disturbance observer"
-
     def parameter_file(
         self, values: Values, title: str, *, version: tuple[int, ...], profile: int | None,
         raised: Sequence[str], words: Words,
@@ -314,7 +290,6 @@ def number_text(value: Number, is_whole: bool) -> str:
 
 
 def joined_lines(rows: Sequence[str]) -> str:
-    """A text file of these lines."""
     return "\n".join([*rows, ""])
 
 

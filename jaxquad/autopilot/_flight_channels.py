@@ -10,7 +10,7 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Float
 
-from jaxquad._core import Message, Number
+from jaxquad._core import Number
 from jaxquad.identify import Fit, KnownFilter, measured_chain, MeasuredChain
 from jaxquad.records import (
     AXES,
@@ -25,10 +25,9 @@ from jaxquad.records import (
     Settings as LogSettings,
 )
 
-from ._filters import FilterChain
 from ._firmware import firmware_named, HOVER, OuterLoop, Span
 from ._law import FlownLoop, RateLoop
-from ._parameters import change_filters, flown_loop, gains_of, parameters_of
+from ._parameters import flown_loop, gains_of, parameters_of
 
 
 Samples = Float[np.ndarray, " samples"]
@@ -138,7 +137,7 @@ def read_channels_if_any(
     setup, axis, span = proposal.setup, AXES.index(proposal.setup.axis), _span(settings)
     filtered = [f"{prefix}{name}" for name in firmware.log.rates]
     setpoint, rate = f"{prefix}{firmware.log.setpoints[axis]}", filtered[axis]
-    names = firmware.channels(prefix, axis)
+    names = firmware.channels(prefix, axis, values)
     injected = {setup.reference: 1.0} if setup.injected_at == "mixer" else {}
     try:
         logged = frozenset(channel.name for channel in channels(path))
@@ -148,7 +147,7 @@ def read_channels_if_any(
         wanted += [*names.output, *names.stick, *names.mixed, *names.slewed, *injected]
         records = _read(path, logged, [*wanted, *setup.throttle], span)
         tracked_hz: dict[int, tuple[float, ...]] = {}
-        for mode, pattern in firmware.tracked_channels().items():
+        for mode, pattern in names.tracked.items():
             turned = sorted(name for name in logged if re.fullmatch(pattern, name))
             speeds = _read(path, logged, turned, (None, None)).items()
             medians = [_median(record, name, span) / 60 for name, record in speeds]
@@ -169,7 +168,7 @@ def read_channels_if_any(
     raw = records.get(unfiltered[axis]) if unfiltered else None
     motors = [name for name in names.motors if name in records]
     output, mixed, stick = sum_at(names.output), sum_at(names.mixed), sum_at(names.stick)
-    limit = firmware.output_limit(values, axis)
+    limit, (low, high) = names.output_limit, names.stick_ends
     external = not injected and setup.reference != setpoint and setup.reference in records
     return FlightChannels(
         rates=tuple(at_rate(name, _in_radians) for name in filtered if name in records),
@@ -189,10 +188,10 @@ def read_channels_if_any(
         else mixed - np.clip(output, -limit, limit),
         reference=at_rate(setup.reference) if external else None,
         motors=np.stack([at_rate(x) for x in motors], axis=1) if motors else None,
-        motor_ends=firmware.motor_ends(values), throttle=sum_at(setup.throttle),
-        stick=None if stick is None else firmware.stick_throttle(stick, values),
+        motor_ends=names.motor_ends, throttle=sum_at(setup.throttle),
+        stick=None if stick is None else np.clip((stick - low) / (high - low), 0.0, 1.0),
         slewed=sum_at(names.slewed), late=setup.late_s.get(setpoint, 0.0),
-        resolution=firmware.resolution(values),
+        resolution=names.resolution,
         names=(rate, "" if raw is None else unfiltered[axis]), tracked_hz=tracked_hz,
     )  # fmt: skip
 
@@ -270,23 +269,13 @@ class FlownAutopilot:
     filters_text: str  # which of both
 
     @property
-    def parameters(self) -> dict[str, float]:
-        """Of all axes by the firmware's names."""
-        return self.loop.parameters()
-
-    @property
-    def unmodelled(self) -> tuple[Message, ...]:
-        """What of the firmware the law leaves out."""
-        return self.loop.unmodelled
-
-    @property
     def measured(self) -> tuple[KnownFilter, ...] | None:
         """The gyro's filters as measured; None where they are those of the law."""
         return self.filters if any(isinstance(x, MeasuredChain) for x in self.filters) else None
 
     def with_filters(self, parameters: Mapping[str, Number]) -> RateLoop:
         """The law as it is read from a log with these cutoffs and notches."""
-        values = change_filters(self.firmware, self.values, parameters)
+        values = firmware_named(self.firmware).change_filters(self.values, parameters)
         tracked = None if self.flight is None else self.flight.tracked_hz
         return flown_loop(
             self.firmware, values, self.version, throttle=self.throttle, tracked_hz=tracked
@@ -327,14 +316,14 @@ def read_flown(
     values = firmware.with_hold(logged.values, setup.hold)
     tracked = {} if flight is None else flight.tracked_hz
     loop = firmware.flown_loop(values, logged.version, throttle=throttle, tracked_hz=tracked)
-    loop = firmware.levelled(loop) if setup.levelled else loop
+    if setup.levelled:
+        loop = dataclasses.replace(loop, law=loop.law.levelled())
     if not np.any(gains_of(loop.law, axis) > 0):
         raise ValueError(
             f"{path}: P, I and D of {setup.axis} are all 0, so there is no rate loop to tune"
         )
     angle = firmware.angle_loop(logged.values, axis, loop.law.dt, levelled=setup.levelled)
-    chains = tuple(chain for chain in loop.law.gyro_chains() if chain.filters)
-    filters, text = best_filters(chains, loop.unmodelled, flight, axis)
+    filters, text = best_filters(loop, flight, axis)
     return FlownAutopilot(
         proposal.vehicle, tuple(logged.version), axis, loop, loop.law, values, throttle, flight,
         angle, filters, text,
@@ -345,11 +334,11 @@ _SHOWN = 10.0  # Hz, of the delay in print
 
 
 def best_filters(
-    chains: tuple[FilterChain, ...], unmodelled: Sequence[Message], flight: FlightChannels | None,
-    axis: int,
-) -> tuple[tuple[KnownFilter, ...], str]:  # fmt: skip
+    loop: FlownLoop, flight: FlightChannels | None, axis: int
+) -> tuple[tuple[KnownFilter, ...], str]:
     """As measured where notches follow motors or spectrum, else those of the parameters."""
-    hidden = [text for text in unmodelled if text.kind == "notch"]
+    chains = tuple(chain for chain in loop.law.gyro_chains() if chain.filters)
+    hidden = [text for text in loop.unmodelled if text.kind == "notch"]
     missing = "" if not hidden else f" (not {'; '.join(text.partition(':')[0] for text in hidden)})"
     if hidden and flight is not None and len(flight.unfiltered) > axis and not flight.averaged:
         unfiltered, filtered = flight.unfiltered[axis], flight.rates[axis]

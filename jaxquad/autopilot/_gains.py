@@ -205,8 +205,7 @@ def find_inexpressible(firmware: str, controller: object) -> tuple[str, ...]:
     kind = firmware_named(firmware)
     name, reasons = kind.log.title, []
     if isinstance(controller, LADRC | ScheduledLADRC | AdaptiveLADRC):
-        why = kind.no_ladrc()
-        return (f"{name} cannot run a LADRC of the angle: {why}. Use ladrc_as_pid.",)
+        return (f"{name} cannot run a LADRC of the angle: {kind.no_ladrc}. Use ladrc_as_pid.",)
     if not isinstance(controller, PID):
         return (f"A {type(controller).__name__} is not known: give a jq.PID.",)
     if np.any(np.asarray(controller.derivative_weight) != 0):

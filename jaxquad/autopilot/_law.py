@@ -110,6 +110,9 @@ class FirmwareLoop(eqx.Module):
         """What `tunable` names unless it is 0."""
 
 
+_UNROLLED = 2  # samples of the gyro, up to which a loop costs more than it saves
+
+
 class RateLoop(FirmwareLoop):
     """The rate loop of a firmware: rates in rad/s in, behind filters of the gyro.
 
@@ -142,6 +145,41 @@ class RateLoop(FirmwareLoop):
     def gains(self) -> dict[str, Array]:
         return {name: vars(self)[name] for name in self.tuned}
 
+    def filter_gyro(
+        self, memory: Memories, rate: Signal, *more: Section
+    ) -> tuple[dict[str, PyTree], tuple[Signal, Signal]]:
+        """The filtered rate at this sample, and it through the sections `more` at the gyro's rate.
+
+        Between two samples of the loop the rate is taken as straight.
+        """
+        sections, before = self.gyro.sections(), memory["rate"]
+        count = samples_between(self.gyro, self.dt) if self.gyro.filters else 1
+
+        def advance(memories: tuple[Memory, Memory], part: Array):
+            gyro, smooth = run_sections(sections, memories[0], before + part * (rate - before))
+            derivative, further = run_sections(more, memories[1], smooth)
+            return (gyro, derivative), (smooth, further)
+
+        memories, passed = (memory["gyro"], memory["derivative"]), (rate, rate)
+        parts = jnp.arange(1, count + 1, dtype=rate.dtype) / count
+        if count <= _UNROLLED:
+            for k in range(count):
+                memories, passed = advance(memories, parts[k])
+        else:
+            memories, (smooth, further) = jax.lax.scan(advance, memories, parts)
+            passed = smooth[-1], further[-1]
+        return {"gyro": memories[0], "derivative": memories[1], "rate": rate}, passed
+
+    def gyro_rest(self, zero: Signal, *more: Section) -> dict[str, PyTree]:
+        """What `filter_gyro` remembers at rest."""
+        return {"gyro": self.gyro.init(zero), "derivative": rest_of(more, zero), "rate": zero}
+
+    def low_passed(self, cutoff_hz: Array, before: Signal, value: Signal) -> Signal:
+        """x += k (value - x) from `before`, k = 1 for a cutoff of 0 (alpha of PX4, ArduPilot)."""
+        on = cutoff_hz > 0
+        w = 2 * np.pi * self.dt * jnp.where(on, cutoff_hz, 1.0)
+        return before + broadcast_gain(jnp.where(on, w / (w + 1), 1.0), value) * (value - before)
+
     def gyro_chains(self) -> list[FilterChain]:
         """All filters of the gyro, at their own rates."""
         return [self.gyro]
@@ -153,6 +191,10 @@ class RateLoop(FirmwareLoop):
     def without_gyro_filters(self) -> "RateLoop":
         """The law as it acts on the logged rate: a plant up to that contains the filters."""
         return dataclasses.replace(self, gyro=FilterChain())
+
+    def levelled(self) -> "RateLoop":
+        """The law as it is inside an angle loop that was closed."""
+        return self
 
     def holds_integral(self, axis: int) -> bool:
         """Whether the integral can be held while the set-point moves (iterm_relax)."""
@@ -192,17 +234,15 @@ class FlownLoop(eqx.Module, Generic[RateLaw]):
         """The law as it acts on the logged rate."""
         return dataclasses.replace(self, law=self.law.without_gyro_filters())
 
-    def at_sample(self, throttle: Array, surge: Array, integral_share: Array) -> RateLaw:
+    def moments(
+        self, throttle: Series, before: Series, mixer_range: Series | None
+    ) -> tuple[Series, ...]:
+        """What `at_moment` takes, by the throttle now and a loop before, and the mixer's range."""
+        return ()
+
+    def at_moment(self, *moment: Array) -> RateLaw:
         """The law at one sample of a log."""
         return self.law
-
-    def surge(self, throttle: Series) -> Series:
-        """Anti-gravity's measure of a moving throttle times its gain, at the loop's samples."""
-        return np.zeros_like(throttle)
-
-    def integral_share(self, mixer_range: Series) -> Series:
-        """Of what the integral grows by, while the motors use this share of the mixer's range."""
-        return np.ones_like(mixer_range)
 
     def setpoint_speed(self, slope: Samples, fed: Samples) -> Samples:
         """In rad/s^2, by the slope of the set-point and the logged F."""
@@ -303,40 +343,6 @@ def samples_between(chain: FilterChain, dt: float) -> int:
     return round(count)
 
 
-_UNROLLED = 2  # samples of the gyro, up to which a loop costs more than it saves
-
-
-def filter_gyro(
-    chain: FilterChain, dt: float, memory: Memories, rate: Signal, *more: Section
-) -> tuple[dict[str, PyTree], tuple[Signal, Signal]]:
-    """The filtered rate at this sample, and it through the sections `more` at the gyro's rate.
-
-    Between two samples of the loop the rate is taken as straight.
-    """
-    sections, before = chain.sections(), memory["rate"]
-    count = samples_between(chain, dt) if chain.filters or more else 1
-
-    def advance(memories: tuple[Memory, Memory], part: Array):
-        gyro, smooth = run_sections(sections, memories[0], before + part * (rate - before))
-        derivative, further = run_sections(more, memories[1], smooth)
-        return (gyro, derivative), (smooth, further)
-
-    memories, passed = (memory["gyro"], memory["derivative"]), (rate, rate)
-    parts = jnp.arange(1, count + 1, dtype=rate.dtype) / count
-    if count <= _UNROLLED:
-        for k in range(count):
-            memories, passed = advance(memories, parts[k])
-    else:
-        memories, (smooth, further) = jax.lax.scan(advance, memories, parts)
-        passed = smooth[-1], further[-1]
-    return {"gyro": memories[0], "derivative": memories[1], "rate": rate}, passed
-
-
-def gyro_rest(chain: FilterChain, zero: Signal, *more: Section) -> dict[str, PyTree]:
-    """What `filter_gyro` remembers at rest."""
-    return {"gyro": chain.init(zero), "derivative": rest_of(more, zero), "rate": zero}
-
-
 def split_reference(reference: Reference, before: Signal, dt: float) -> tuple[Signal, Signal]:
     """The reference and its rate of change: a set-point's own, else the last difference."""
     if isinstance(reference, Setpoint):
@@ -345,7 +351,6 @@ def split_reference(reference: Reference, before: Signal, dt: float) -> tuple[Si
 
 
 def sum_of(terms: Terms) -> Signal:
-    """P + I + D + F."""
     return terms["P"] + terms["I"] + terms["D"] + terms["F"]
 
 
@@ -355,18 +360,17 @@ def bounded(value: Signal, limit: Array) -> Signal:
     return jnp.clip(value, -most, most)
 
 
-def low_pass_share(cutoff_hz: Array, dt: float, like: Signal) -> Array:
-    """k of x += k (u - x), 1 for a cutoff of 0: the alpha of PX4 and ArduPilot."""
-    on = cutoff_hz > 0
-    w = 2 * np.pi * dt * jnp.where(on, cutoff_hz, 1.0)
-    return broadcast_gain(jnp.where(on, w / (w + 1), 1.0), like)
-
-
 def law_responses(
     law: RateLoop, axis: int, omega: Float[np.ndarray, " frequencies"]
 ) -> Complex[np.ndarray, "2 frequencies"]:
     """From the set-point and from the rate, both in rad/s, to the command."""
-    linear = law.linear(axis)
+    return linear_responses(law.linear(axis), omega)
+
+
+def linear_responses(
+    linear: LinearController, omega: Float[np.ndarray, " frequencies"]
+) -> Complex[np.ndarray, "2 frequencies"]:
+    """Likewise, of one axis' linear form."""
     A, c = np.asarray(linear.A), np.asarray(linear.C)
     into = np.stack([linear.reference_in, linear.measurement_in], axis=1)
     through = np.array([linear.reference_through, linear.measurement_through])

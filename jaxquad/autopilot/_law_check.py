@@ -14,6 +14,7 @@ from jaxtyping import Bool, Complex, Float
 
 from jaxquad._core import plain_content
 from jaxquad.identify import filter_response, MISFIT, usable
+from jaxquad.plot import FlownAgain
 from jaxquad.records import Record
 from jaxquad.spectra import frequency_response, JointInputOutput, LocalPolynomial
 
@@ -91,7 +92,6 @@ class LawCheck:
 
     @property
     def text(self) -> str:
-        """In words."""
         if not self.terms:
             return "the log holds neither the terms of the law nor its output"
         shares = ", ".join(
@@ -113,7 +113,6 @@ class LawCheck:
         )
 
     def content(self) -> dict[str, object]:
-        """All numbers, for JSON."""
         terms = {name: x._asdict() | {"share": x.share} for name, x in self.terms.items()}
         return {
             "flew": self.flew,
@@ -241,10 +240,7 @@ class LoopCheck:
     used: Bool[np.ndarray, " frequencies"]  # where the former is coherent
     limited: float  # share of samples with a motor at an end of its range
     plant_misfit: float  # of the plant's fit, relative to its errors
-    time: Samples  # s, of a part of the flight
-    setpoint: Samples  # rad/s
-    rate: Samples  # rad/s
-    again: Samples  # rad/s
+    shown: FlownAgain  # a part of the flight, of the page
 
     @property
     def misfit(self) -> float:
@@ -306,7 +302,6 @@ class LoopCheck:
         return f"{numbers}, {at}. {cause[0].upper()}{cause[1:]}"
 
     def content(self) -> dict[str, object]:
-        """All numbers, for JSON."""
         parts = lambda x: {"magnitude": np.abs(x), "phase_rad": np.angle(x)}
         return plain_content(
             {
@@ -367,6 +362,6 @@ def check_loop(plant: IdentifiedPlant, flown: FlownAutopilot) -> LoopCheck:
         law, omega, both[:, 0], np.asarray(response.random_error)[:, 0, 0],
         both[:, 1] * filter_response(flown.filters, omega),
         used & np.isfinite(both).all(axis=1), float(np.mean(flight.limited)),
-        float(np.sqrt(plant.fit.chi_squared)), time[part], flight.setpoint[part], rate[part],
-        behind[part],
+        float(np.sqrt(plant.fit.chi_squared)),
+        FlownAgain(time[part], flight.setpoint[part], rate[part], behind[part]),
     )  # fmt: skip

@@ -13,27 +13,16 @@ import jaxquad.report as report
 from jaxquad._core import write_file
 from jaxquad.identify import GainBand
 from jaxquad.plot import FlownAgain, Spectrum, StepBand, ThrottleCurve
-from jaxquad.records import AXES
-from jaxquad.report import (
-    attempt,
-    Cell,
-    FAILED,
-    Headline,
-    Provenance,
-    provenance_section,
-    reason_of,
-    render_page,
-    Table,
-)
+from jaxquad.report import Cell, Headline, Provenance, Table
 
 from ._filter_bank import gyro_noise, GyroNoise, hann_spectra, NoNoise, SLOWEST
 from ._filters import FilterChain
 from ._firmware import firmware_named
 from ._flight_channels import FlightChannels
+from ._identified_log import StepGrid
 from ._law import RateLoop
 from ._parameters import gains_in, gains_of, ParameterChange, WordChange
-from ._rate_loops import gyro_chain_response, law_paths, StepGrid
-from ._stages import limits_text, Stage, WAYS
+from ._rate_loops import DesignSettings, gyro_chain_response, law_paths, Stage, WAYS
 
 
 if TYPE_CHECKING:
@@ -92,19 +81,19 @@ def write_pilot_page(path: str | Path, *pages: PilotPage) -> Path:
     for page in pages:
         sections = {
             "changes": {"changes": page.changes, "stages": page.stages},
-            **{name: attempt(section, page) for name, section in SECTIONS.items()},
+            **{name: report.attempt(section, page) for name, section in SECTIONS.items()},
             "text": {"text": page.text} if page.text else None,
         }
-        sections |= {name: {FAILED: reason} for name, reason in page.failures.items()}
+        sections |= {name: {report.FAILED: reason} for name, reason in page.failures.items()}
         axes.append({
             "title": page.title, "headlines": list(page.headlines), "remarks": list(page.remarks),
             "sections": {name: section for name, section in sections.items() if section},
         })  # fmt: skip
-    text = render_page(
+    text = report.render_page(
         "pilot.html",
         title=f"{first.headlines[0].word}: {first.title}" if len(pages) == 1 else first.overview,
         axes=axes,
-        origin=None if origin is None else attempt(provenance_section, origin),
+        origin=None if origin is None else report.attempt(report.provenance_section, origin),
     )
     return write_file(path, text)
 
@@ -147,7 +136,6 @@ def filters_section(page: PilotPage) -> PageSection:
 
 
 def noise_section(page: PilotPage) -> PageSection:
-    """Spectra of gyro and D term."""
     if not page.gyro:
         return None
     image = report.embed_figure(
@@ -160,7 +148,6 @@ def noise_section(page: PilotPage) -> PageSection:
 
 
 def steps_section(page: PilotPage) -> PageSection:
-    """Steps of the set-point, and their overshoot."""
     if not page.steps:
         return None
     image = report.embed_figure(
@@ -193,7 +180,6 @@ def again_section(page: PilotPage) -> PageSection:
 
 
 def b0_section(page: PilotPage) -> PageSection:
-    """b0 over the throttle."""
     if page.b0 is None:
         return None
     levels, taken, curve, text = page.b0
@@ -254,7 +240,7 @@ Part = TypeVar("Part")
 
 def pilot_page(proposal: "AutopilotProposal", origin: Provenance, overview: str) -> PilotPage:
     """All that the page shows; what cannot be computed says why. `overview` is of all axes."""
-    flown, flight, new = proposal.flown, proposal.flight, proposal.new
+    flown, flight, new = proposal.flown, proposal.flown.flight, proposal.new
     law, axis, filters = flown.law, flown.axis, proposal.filters
     failures: dict[str, str] = {}
 
@@ -262,7 +248,7 @@ def pilot_page(proposal: "AutopilotProposal", origin: Provenance, overview: str)
         try:
             return compute()
         except Exception as error:  # the page holds the rest
-            failures[section] = reason_of(error)
+            failures[section] = report.reason_of(error)
             return missing
 
     def spectra() -> tuple[GyroNoise | None, Spectra, Spectra]:
@@ -299,12 +285,11 @@ def pilot_page(proposal: "AutopilotProposal", origin: Provenance, overview: str)
         if throttle.curve is not None:
             level = "warn" if throttle.curve.change else "good"
             headlines.append(Headline(level, "THRUST CURVE", throttle.curve.text))
-    version = ".".join(map(str, flown.version))
     return PilotPage(
-        title=f"{flown.firmware} {version}, rate loop of {AXES[axis]}".replace(" ,", ","),
+        title=proposal.title,
         headlines=headlines,
         remarks=[
-            *(f"not modelled: {text}" for text in flown.unmodelled),
+            *(f"not modelled: {text}" for text in flown.loop.unmodelled),
             *([flown.filters_text] if flown.filters_text else []),
             *([limits_text(proposal.settings)] if new else []),
         ],
@@ -326,9 +311,7 @@ def pilot_page(proposal: "AutopilotProposal", origin: Provenance, overview: str)
         changes=change_rows(proposal.changes) if new else None,
         text=str(proposal),
         unit=firmware_named(flown.firmware).unit,
-        again=None if check is None else FlownAgain(
-            check.time, check.setpoint, check.rate, check.again
-        ),
+        again=None if check is None else check.shown,
         again_text="" if check is None else f"{check.verdict[0].upper()}{check.verdict[1:]}.",
         overview=overview,
         provenance=origin,
@@ -448,3 +431,12 @@ def change_rows(changes: Sequence[ParameterChange], words: Sequence[WordChange] 
     rows += [[Cell(word.name), word.old, word.new, "", "", word.reason] for word in words]
     heads = ("parameter", "old", "new", "unit", "range", "reason")
     return Table("From what flew to the proposal", heads, rows)
+
+
+def limits_text(limits: DesignSettings) -> str:
+    """Of what the limits are relative to, and when to stop."""
+    return (
+        f"limits: noise {limits.noise:g} times and gains {limits.change:g} times those of this "
+        "flight at most. They compound from log to log: stop where a log keeps what flew, or the "
+        "motors get warm"
+    )

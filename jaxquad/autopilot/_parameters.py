@@ -1,7 +1,7 @@
 """Parameters of the firmwares: stored, in a law, changed, and in files that are loaded."""
 
 import dataclasses
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple, TypeVar
 
@@ -80,11 +80,6 @@ def check_ranges(firmware: str, values: Mapping[str, Number]) -> tuple[str, ...]
     return tuple(beyond)
 
 
-def firmware_of(law: FirmwareLoop) -> str:
-    """Which firmware a law is of."""
-    return _rate_loop(law).firmware
-
-
 def list_parameters(law: FirmwareLoop, *, axes: Sequence[str] = AXES) -> dict[str, float]:
     """The parameters that a law amounts to, not rounded: gains, filters, those of an angle loop.
 
@@ -145,7 +140,7 @@ def _rate_loop(law: FirmwareLoop) -> RateLoop:
 
 def _places(law: FirmwareLoop) -> Iterator[tuple[Parameter, Array]]:
     """The rows that have a place in a law, with what is there."""
-    for row in PARAMETERS[firmware_of(law)].values():
+    for row in PARAMETERS[_rate_loop(law).firmware].values():
         value = _value_at(law, row.field)
         if isinstance(value, Array):
             yield row, value
@@ -200,18 +195,6 @@ def flown_loop(
     )
 
 
-def change_filters(
-    firmware: str, values: Mapping[str, str], parameters: Mapping[str, Number]
-) -> dict[str, str]:
-    """The values of a log as they would be with other cutoffs and notches, by their names.
-
-    **Raises:**
-
-    - `ValueError`: Betaflight's header has no line for one of them.
-    """
-    return firmware_named(firmware).change_filters(values, parameters)
-
-
 FIELDS = ("p", "i", "d")
 Gains = Float[np.ndarray, " gains"]
 
@@ -261,6 +244,9 @@ class ParameterChange(NamedTuple):
     old: float
     new: float
     reason: str = ""  # why it changes
+
+
+Changes = Sequence[ParameterChange]
 
 
 class WordChange(NamedTuple):
@@ -385,32 +371,39 @@ def write_parameter_files(
 
     - `ValueError`: as in `propose_changes` and `parameter_file`, or nothing changes.
     """
-    folder, suffix = Path(folder), firmware_named(firmware).suffix
     raised = [x for x in AXES if old.get(f"d_max_{x}", 0.0) > old.get(f"d_{x}", 0.0)]
-    text = lambda changes, title, back=False: parameter_file(
-        firmware, changes, revert=back, version=version, profile=profile, raised=raised, title=title
-    )
-    stages, table, changes = [], [], ()
-    for share in sorted(shares):
-        changes = propose_changes(
+    text = lambda changes, title, revert: parameter_file(
+        firmware, changes, revert=revert, version=version, profile=profile, raised=raised,
+        title=title,
+    )  # fmt: skip
+    on_the_way = {name: f"on the way to {value:.5g}" for name, value in new.items()}
+    stages = {
+        round(100 * share): propose_changes(
             firmware, old, new, share=share, beyond=beyond, at_once=at_once,
-            reasons=reasons if share >= 1 else {x: f"on the way to {new[x]:.5g}" for x in new},
-        )  # fmt: skip
-        percent = round(100 * share)
-        title = f"{percent} % of the way from what flew to the proposal"
-        stages.append((folder / f"{stem}_{percent:03d}.{suffix}", text(changes, title)))
-        table.append(f"## {title}\n\n{change_table(changes)}")
-    if not changes:
+            reasons=reasons if share >= 1 else on_the_way,
+        )
+        for share in sorted(shares)
+    }  # fmt: skip
+    if not any(stages.values()):
         raise ValueError(
             "Nothing changes: what is proposed is stored as the values that flew. Propose more, or "
             "leave the files out."
         )
-    back = write_file(folder / f"{stem}_revert.{suffix}", text(changes, "what flew", True))
-    written = tuple(write_file(path, content) for path, content in stages)
-    return ParameterFiles(written, back, write_file(folder / f"{stem}.md", "\n".join(table)))
+    texts = stage_texts(stem, firmware_named(firmware).suffix, stages, text)
+    *written, back, table = (write_file(Path(folder) / name, x) for name, x in texts.items())
+    return ParameterFiles(tuple(written), back, table)
 
 
-_STEM = "proposal"
+def stage_texts(
+    stem: str, suffix: str, stages: Mapping[int, Changes],
+    text: Callable[[Changes, str, bool], str], words: Sequence[WordChange] = (),
+) -> dict[str, str]:  # fmt: skip
+    """Files of changes by their percent of the way, what reverts them, and a table, by name."""
+    titles = {k: f"{k} % of the way from what flew to the proposal" for k in stages}
+    texts = {f"{stem}_{k:03d}.{suffix}": text(stages[k], titles[k], False) for k in stages}
+    texts[f"{stem}_revert.{suffix}"] = text(stages[max(stages)], "what flew", True)
+    table = (f"## {titles[k]}\n\n{change_table(stages[k], words)}" for k in stages)
+    return texts | {f"{stem}.md": "\n".join(table)}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -442,11 +435,10 @@ class ProposedParameters:
                 ParameterChange(find_parameter(self.firmware, name), value, value)
                 for name, value in self.old.items()
             ]
-            return [self.write_one(f"{_STEM}_revert", same, "what flew", folder, revert=True)]
+            return [self.write_one("proposal_revert", same, "what flew", folder, revert=True)]
         files = write_parameter_files(
-            folder, self.firmware, self.old, self.new, stem=_STEM, shares=(1 / 3, 1.0),
-            reasons=self.reasons, beyond=list(self.new), version=self.version or (2025, 12),
-            at_once=self.at_once, profile=None,
+            folder, self.firmware, self.old, self.new, reasons=self.reasons, beyond=list(self.new),
+            at_once=self.at_once, version=self.version or (2025, 12), profile=None,
         )  # fmt: skip
         return [*files.stages, files.revert, files.table]
 

@@ -33,9 +33,8 @@ from ._parameters import (
     parameters_of,
     propose_changes,
 )
-from ._proposal import AutopilotProposal
-from ._rate_loops import Gains, grouped, OneGains, RateLoops
-from ._stages import BELIEVED, certify_angle, certify_gains, FilterVerdict, judge, Stage, SWINGING
+from ._proposal import AutopilotProposal, BELIEVED, FilterVerdict, judge, SWINGING
+from ._rate_loops import certify_angle, certify_gains, Gains, grouped, OneGains, RateLoops, Stage
 
 
 _THIRD = 1 / 3
@@ -105,7 +104,7 @@ class _Design:
     """What one axis' search and certificates are made of."""
 
     def __init__(self, proposal: AutopilotProposal):
-        flight, throttle = proposal.flight, proposal.throttle
+        flight, throttle = proposal.flown.flight, proposal.throttle
         assert flight is not None and throttle is not None
         self.settings, self.flown, self.throttle = proposal.settings, proposal.flown, throttle
         self.source, self.edge = proposal.plants, proposal.identification.band[1]  # rad/s
@@ -233,7 +232,6 @@ class _Design:
         return float(values[-1])
 
     def _third(self, new: Mapping[str, float], filters: Mapping[str, float]) -> dict[str, float]:
-        """A third of the way, as the firmware stores it."""
         flown, changed = self.flown, self.flown_filters(filters)
         old = flown.old | changed
         if flown.angle is not None and flown.angle.name in new:

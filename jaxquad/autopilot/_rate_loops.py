@@ -7,7 +7,7 @@ Source: docs/autopilots.md.
 
 import dataclasses
 from collections.abc import Iterable, Sequence
-from typing import NamedTuple
+from typing import Any, Literal, NamedTuple, Protocol, runtime_checkable
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -15,8 +15,8 @@ import numpy as np
 from jaxtyping import Bool, Complex, Float
 
 from jaxquad.identify import draw_models, filter_response, Fit, GainOverThrottle, KnownFilter
-from jaxquad.plot import StepBand
 
+from ._firmware import OuterLoop
 from ._flight_channels import FlownAutopilot
 from ._law import law_responses, RateLoop
 from ._parameters import FIELDS
@@ -46,11 +46,9 @@ class LoopQualities(NamedTuple):
 
     def or_worse(self, other: "LoopQualities") -> "LoopQualities":
         """The worse of each plant; effects of torque and of noise are those of the first."""
-        greater = {x: np.maximum(getattr(self, x), getattr(other, x)) for x in _GREATER}
+        names = ("peak", "resonance", "crossover")
+        greater = {x: np.maximum(getattr(self, x), getattr(other, x)) for x in names}
         return self._replace(stable=self.stable & other.stable, **greater)
-
-
-_GREATER = ("peak", "resonance", "crossover")
 
 
 class Filters(NamedTuple):
@@ -76,6 +74,21 @@ class RateLoops:
     forward: Response | None = None  # of the law's feed-forward, from the set-point to the command
     angle: Response | None = None  # of the angle loop around this one: `OuterLoop.path`
     others: tuple["RateLoops", ...] = ()  # at other throttles, under the law there
+
+    @classmethod
+    def of(
+        cls, law: RateLoop, axis: int, plants: Responses, omega: Frequencies,
+        filters: Sequence[KnownFilter] | None = None, angle: OuterLoop | None = None,
+    ) -> "RateLoops":  # fmt: skip
+        """Of plants up to the gyro's filters, which are the law's if they are not given."""
+        chain = gyro_chain_response(law, omega)
+        passed = chain if filters is None else filter_response(filters, omega)
+        return cls(
+            omega, *law_paths(law, axis, omega), plants * passed,
+            cells_of(omega) * np.abs(passed) ** 2, passed, law.d_ceiling(axis), chain,
+            law.holds_integral(axis), forward_path(law, axis, omega),
+            None if angle is None else angle.path(omega),
+        )  # fmt: skip
 
     @property
     def groups(self) -> tuple["RateLoops", ...]:
@@ -123,22 +136,9 @@ class RateLoops:
         return together(parts) if self.others else qualities
 
     def relaxed_qualities(self, gains: Gains) -> LoopQualities:
-        """With the integral held where it can be held in flight, D as set and at its ceiling."""
-        parts = []
-        for group in self.groups:
-            if not group.relaxed:
-                parts.append(group.qualities(gains))
-                continue
-            base, raised = (
-                group._qualities(*group.paths(gains * np.array([[1.0, 0.0, factor]])))
-                for factor in (1.0, group.ceiling)
-            )
-            parts.append(base.or_worse(raised))
-        return together(parts)
-
-    def open_loops(self, gains: OneGains) -> Responses:
-        """Of the rate, of all groups."""
-        return np.concatenate([gains @ group.feedback * group.plants for group in self.groups])
+        """Likewise, with the integral held where it can be held in flight."""
+        still = lambda group: gains * np.array([[1.0, 0.0 if group.relaxed else 1.0, 1.0]])
+        return together([group.qualities(still(group)) for group in self.groups])
 
     def outer_loops(self, gains: OneGains, angle_gain: float) -> Responses:
         """Of the angle with a gain in 1/s, of all groups; the true rate is before the filters."""
@@ -187,7 +187,6 @@ class RateLoops:
 
 
 def grouped(groups: Iterable[RateLoops]) -> RateLoops:
-    """The loops of several throttles as one."""
     first, *others = groups
     return dataclasses.replace(first, others=tuple(others))
 
@@ -249,7 +248,6 @@ def law_paths(law: RateLoop, axis: int, omega: Frequencies) -> tuple[Parts, Part
 
 
 def gyro_chain_response(law: RateLoop, omega: Frequencies) -> Response:
-    """Of all filters of the gyro."""
     return filter_response(law.gyro_chains(), omega)
 
 
@@ -309,12 +307,9 @@ class PlantSource:
 
         Raises ValueError where a drawn gain is not above 0.
         """
-        law, axis, angle = flown.law, flown.axis, flown.angle
+        law = flown.law
         if omega is None:
             omega = np.geomspace(_LOWEST, 0.999 * np.pi / law.dt, _FREQUENCIES)
-        back, ahead = law_paths(law, axis, omega)
-        chain = gyro_chain_response(law, omega)
-        passed = chain if self.filters is None else filter_response(self.filters, omega)
         gain, lag, delay, damping = self._drawn(count, seed, throttle)
         if np.any(gain <= 0):
             raise ValueError(
@@ -324,17 +319,11 @@ class PlantSource:
             )
         per_radian = np.pi / 180 if self.unit == "deg/s" else 1.0
         plants = hold_plants(per_radian * gain, lag, delay, omega, law.dt, damping)
-        white = cells_of(omega) * np.abs(passed) ** 2
-        return RateLoops(
-            omega, back, ahead, plants * passed, white, passed, law.d_ceiling(axis), chain,
-            law.holds_integral(axis), forward_path(law, axis, omega),
-            None if angle is None else angle.path(omega),
-        )  # fmt: skip
+        return RateLoops.of(law, flown.axis, plants, omega, self.filters, flown.angle)
 
     def _drawn(
         self, count: int, seed: int, throttle: float | None
     ) -> tuple[Column, Column, Column, Column]:
-        """Gain, lag, delay and damping."""
         if self.over is None:
             names = len(self.fit.names)
             scores = np.zeros((names, -(-count // _AT_ONCE) * _AT_ONCE))
@@ -350,31 +339,108 @@ class PlantSource:
         return gain[:, None], lag, delay, np.full_like(lag, damping)
 
 
-_PERIOD, _SHOWN, _FINEST = 8.0, 1.2, 1 / 400  # s, of a computed step, of a shown one, of a sample
+Kind = Literal["proposed", "kept", "cannot tell", "not to be flown"]
+WAYS = ("what flew", "a third of the way", "all of it")
 
 
-class StepGrid(NamedTuple):
-    """Frequencies from whose closed responses steps are computed."""
+@runtime_checkable
+class Limits(Protocol):
+    """What is kept: `DesignSettings`, or the `ADRCTargets`."""
 
-    dt: float  # of the computed step in s
-    omega: Float[np.ndarray, " frequencies"]  # rad/s
-    fade: Float[np.ndarray, " frequencies"]  # where the law runs faster than the step is computed
+    @property
+    def sensitivity(self) -> float: ...
+    @property
+    def resonance(self) -> float: ...
+    @property
+    def noise(self) -> float: ...
+    @property
+    def change(self) -> float: ...
 
-    @classmethod
-    def of(cls, dt: float) -> "StepGrid":
-        """For a law of this interval."""
-        coarse = max(dt, _FINEST)
-        count = 2 * int(_PERIOD / coarse / 2)
-        omega = 2 * np.pi * np.arange(1, count // 2) / (count * coarse)
-        fade = np.cos(np.linspace(0, np.pi / 2, omega.size)) ** 2
-        return cls(coarse, omega, fade if coarse > dt else np.ones(omega.size))
 
-    def band(self, closed: Complex[np.ndarray, "plants frequencies"]) -> StepBand:
-        """Of the responses from set-point to rate: median and 95 % of the plants."""
-        response = np.pad(self.fade * closed, ((0, 0), (1, 1)))
-        response[:, 0] = 1.0
-        impulse = np.fft.irfft(response, 2 * (self.omega.size + 1), axis=1)
-        shown = int(_SHOWN / self.dt)
-        steps = np.cumsum(impulse, axis=1)[:, :shown]
-        low, middle, high = np.percentile(steps, [2.5, 50.0, 97.5], axis=0)
-        return StepBand(np.arange(shown) * self.dt, middle, low, high)
+@runtime_checkable
+class DesignSettings(Limits, Protocol):
+    """What is kept, and how many plants: `jq.workflows.AutopilotSettings`."""
+
+    @property
+    def keep_filters(self) -> bool: ...
+    @property
+    def members(self) -> int: ...
+    @property
+    def fresh(self) -> int: ...
+    @property
+    def seed(self) -> int: ...
+    def content(self) -> dict[str, Any]: ...
+    def words(self) -> list[str]: ...
+
+
+class OuterStage(NamedTuple):
+    """What the angle loop around a rate loop gives on fresh plants."""
+
+    parameter: str  # of its gain
+    value: float
+    closed: bool  # whether it was closed in the flight
+    stable: float  # share of the plants
+    peak: float  # the greatest Ms
+    resonance: float  # the greatest peak from set-point to angle
+    delay_margin: float  # the least, in s
+
+
+class Stage(NamedTuple):
+    """What gains give on fresh plants."""
+
+    gains: tuple[float, ...]  # P, I and D
+    stable: float  # share of the plants
+    peak: float  # the greatest
+    resonance: float  # the greatest
+    crossover: float  # the median, in rad/s
+    rejection: float  # relative to what flew
+    noise: float  # relative to what flew
+    peaks: tuple[float, ...] = ()  # the greatest Ms at each throttle
+    relaxed: float | None = None  # the greatest Ms with the integral held; None where it never is
+    delay_margin: float = float("inf")  # the least, in s
+    angle: OuterStage | None = None  # of the angle loop around it
+
+    @property
+    def margin_text(self) -> str:
+        """The least delay margin in ms; none of a loop that is not stable."""
+        return f"{1e3 * self.delay_margin:.1f}" if self.stable == 1 else "none"
+
+    def content(self) -> dict[str, object]:
+        return {**self._asdict(), "angle": None if self.angle is None else self.angle._asdict()}
+
+
+def certify_angle(loops: RateLoops, gains: OneGains, angle: OuterLoop, value: float) -> OuterStage:
+    """The angle loop with a value of its parameter around the rate loop with these gains."""
+    around = loops.outer_loops(gains, angle.unit * value)
+    distance = 1 + around
+    stable = is_stable(np.real(distance)[None], np.imag(distance)[None])
+    peak = np.max(1 / np.abs(distance).min(axis=1))
+    resonance = np.max(np.abs(around / distance).max(axis=1))
+    margin = np.min(delay_margin(around, loops.omega))
+    numbers = map(float, (np.mean(stable), peak, resonance, margin))
+    return OuterStage(angle.name, value, angle.closed, *numbers)
+
+
+def certify_gains(loops: Sequence[RateLoops], designs: Sequence[OneGains]) -> list[Stage]:
+    """What each of the designs gives under its own law, the first of which is what flew."""
+    rms, stages, flown = lambda x: float(np.sqrt(np.mean(x**2))), [], None
+    for loop, gains in zip(loops, designs, strict=True):
+        parts = [group.qualities(gains[None]) for group in loop.groups]
+        qualities = together(parts)
+        flown = flown or qualities
+        relaxed = any(group.relaxed for group in loop.groups)
+        still = loop.relaxed_qualities(gains[None]) if relaxed else None
+        stable = qualities.stable if still is None else qualities.stable & still.stable
+        opened = np.concatenate([gains @ x.feedback * x.plants for x in loop.groups])
+        stages.append(
+            Stage(
+                tuple(map(float, gains)), float(np.mean(stable)), float(np.max(qualities.peak)),
+                float(np.max(qualities.resonance)), float(np.median(qualities.crossover)),
+                rms(qualities.rejection) / rms(flown.rejection),
+                rms(qualities.noise) / rms(flown.noise),
+                tuple(float(np.max(part.peak)) for part in parts),
+                None if still is None else float(np.max(still.peak)),
+                float(np.min(delay_margin(opened, loop.omega))),
+            )
+        )  # fmt: skip
+    return stages

@@ -28,7 +28,7 @@ from jaxquad.identify import (
 from jaxquad.records import Record, select
 from jaxquad.spectra import frequency_response, FrequencyResponse, LocalPolynomial
 
-from ._law import FlownLoop
+from ._law import FlownLoop, linear_responses
 
 
 Samples = Float[Array | np.ndarray, "samples axes"]
@@ -51,9 +51,7 @@ class _Row(NamedTuple):
     setpoint: Array
     speed: Array
     rate: Array
-    throttle: Array
-    surge: Array
-    integral_share: Array
+    moment: tuple[Array, ...]  # of `FlownLoop.at_moment`
     integral: Array
     anew: Array
 
@@ -154,23 +152,18 @@ class _Grid:
         speed = np.diff(r, axis=0, prepend=r[:1]) / self.interval
         if feed_forward is not None:
             speed = flown.setpoint_speed(speed, self.fine(feed_forward))
-        # Throttle, anti-gravity's surge and the integral's share are of the loop before.
-        before, surge = self.fine(throttle, self.interval), flown.surge(self.fine(throttle))
-        share = np.ones_like(before)
-        if mixer_range is not None:
-            share = flown.integral_share(self.fine(mixer_range, self.interval))
+        mixed = None if mixer_range is None else self.fine(mixer_range, self.interval)
+        moments = flown.moments(self.fine(throttle), self.fine(throttle, self.interval), mixed)
         start, anew = np.zeros_like(r), np.zeros(len(r), bool)
         if integral is not None:
             start = self.fine(integral, self.interval)  # what the law adds to at this sample
             anew = np.arange(len(r)) % max(1, round(restart / self.interval)) == 0
-        surge = np.concatenate([[0.0], surge[:-1]])
         more = -(-len(r) // _BLOCK) * _BLOCK - len(r)
         pad = lambda x: jnp.asarray(np.concatenate([x, np.repeat(x[-1:], more, axis=0)]))
-        return _Row(*map(pad, (r, speed, rate, before, surge, share, start, anew)))
+        return _Row(*jax.tree.map(pad, (r, speed, rate, moments, start, anew)))
 
 
 def _straight(at: np.ndarray, time: np.ndarray, signal: np.ndarray) -> np.ndarray:
-    """A series, or each column of one, at other times."""
     if signal.ndim == 1:
         return np.interp(at, time, signal)
     return np.stack([np.interp(at, time, column) for column in signal.T], axis=1)
@@ -183,9 +176,7 @@ def _replayed(flown: FlownLoop, rows: _Row):
     def sample(memory, row: _Row):
         memory = {**memory, "integral": jnp.where(row.anew, row.integral, memory["integral"])}
         reference = Setpoint(row.setpoint, row.speed, zero)
-        memory, _, terms = flown.at_sample(row.throttle, row.surge, row.integral_share).advance(
-            memory, zero, reference, row.rate
-        )
+        memory, _, terms = flown.at_moment(*row.moment).advance(memory, zero, reference, row.rate)
         return memory, terms
 
     return jax.lax.scan(sample, flown.law.rest(zero), rows)[1]
@@ -201,9 +192,7 @@ def _flown_again(flown: FlownLoop, step: tuple[Array | np.ndarray, ...], wait: i
         memory, state, queue = carry
         rate = state[1]
         reference = Setpoint(row.setpoint, row.speed, zero)
-        memory, command, _ = flown.at_sample(row.throttle, row.surge, row.integral_share).advance(
-            memory, zero, reference, rate
-        )
+        memory, command, _ = flown.at_moment(*row.moment).advance(memory, zero, reference, rate)
         queue = jnp.concatenate([(command + row.rate)[None], queue])  # the newest one first
         moved = matrix @ state + jnp.outer(now, queue[-2]) + jnp.outer(before, queue[-1])
         return (memory, moved, queue[:-1]), rate
@@ -212,12 +201,11 @@ def _flown_again(flown: FlownLoop, step: tuple[Array | np.ndarray, ...], wait: i
     return jax.lax.scan(sample, start, rows)[1]
 
 
-@eqx.filter_jit
 def predict_loop(
     law: LinearController,
     plant: Complex[Array | np.ndarray, "... frequencies"],
     omega: Float[Array | np.ndarray, " frequencies"],
-) -> Complex[Array, "... frequencies"]:
+) -> Complex[np.ndarray, "... frequencies"]:
     """The closed loop's response from set-point to measurement.
 
     **Arguments:**
@@ -227,20 +215,9 @@ def predict_loop(
         command included (`hold_response`); draws of it on leading axes.
     - `omega`: rad/s, below pi/dt.
     """
-    turn = omega * law.dt
-    z = jax.lax.complex(jnp.cos(turn), jnp.sin(turn))
-    inputs = jnp.stack([law.reference_in, law.measurement_in], axis=1)
-    through = jnp.stack([law.reference_through, law.measurement_through])
-    states = len(law.A)
-
-    def at(z: Array) -> Array:
-        resolvent = z * jnp.eye(states, dtype=z.dtype) - law.A.astype(z.dtype)
-        return law.C.astype(z.dtype) @ jnp.linalg.solve(resolvent, inputs.astype(z.dtype))
-
-    ahead, back = (jax.vmap(at)(z) + through.astype(z.dtype)[None]).T
-    plant = jnp.asarray(plant, z.dtype)
-    wide = (1,) * (plant.ndim - 1) + (-1,)
-    return plant * ahead.reshape(wide) / (1 - plant * back.reshape(wide))
+    ahead, back = linear_responses(law, np.asarray(omega))
+    plant = np.asarray(plant)
+    return plant * ahead / (1 - plant * back)
 
 
 def hold_response(
@@ -434,8 +411,8 @@ def reproduce_flight(
         reference_through=(1 + _CHANGE) * law.reference_through,
         measurement_through=(1 + _CHANGE) * law.measurement_through,
     )
-    loops = np.asarray(predict_loop(law, np.stack(plants), omega))
-    by_gain = (np.asarray(predict_loop(louder, plants[0], omega)) / loops[0] - 1) / _CHANGE
+    loops = predict_loop(law, np.stack(plants), omega)
+    by_gain = (predict_loop(louder, plants[0], omega) / loops[0] - 1) / _CHANGE
     slopes = (loops[1:] / loops[0] - 1) / _CHANGE
     spread = np.real(np.einsum("pf,pq,qf->f", slopes.conj(), fit.relative_covariance, slopes))
     predicted = loops[0] * filter_response(filters, omega)

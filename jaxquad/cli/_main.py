@@ -1,7 +1,9 @@
 """`jaxquad`: from a flight record to an identified model, on the command line."""
 
 import argparse
+import contextlib
 import difflib
+import io
 import os
 import re
 import sys
@@ -9,15 +11,14 @@ import warnings
 from collections.abc import Callable, Sequence
 from importlib.metadata import version
 
-from jaxquad._core import is_ours
+from jaxquad._core import is_ours, readable
 from jaxquad.records import RecordWarning
 from jaxquad.report import PageWarning
 from jaxquad.workflows import in_options
 
 from ._first import demo, design
-from ._logs import batch, channels, identify, NOT_IDENTIFIABLE, report, verify
+from ._logs import autopilot, batch, channels, identify, NOT_IDENTIFIABLE, report, tune, verify
 from ._options import check_out, shown_stages
-from ._tune import autopilot, tune
 
 
 # In order of use.
@@ -57,24 +58,20 @@ def main(argv: Sequence[str] | None = None) -> int:
     **Returns:** the exit code, see `jaxquad --help`.
     """
     words = sys.argv[1:] if argv is None else list(argv)
+    if isinstance(sys.stdout, io.TextIOWrapper):  # which may know fewer letters than names of files
+        sys.stdout.reconfigure(errors="replace")
     try:
-        if not words:
-            print(_WAY, end="")
-            return 0
-        options, unknown = make_parser().parse_known_args(words)
-        if unknown:
-            return _fail(_describe_unknown(options, unknown), _UNUSABLE)
-        with warnings.catch_warnings(), shown_stages(options):
-            for kind in (RecordWarning, PageWarning):
-                warnings.simplefilter("always", kind)
-            warnings.showwarning = printer_of_warnings()
-            check_out(options)
-            return options.run(options)
-    except BrokenPipeError:  # `jaxquad ... | head` has read enough
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return _CLOSED
+        try:
+            return _run(words)
+        finally:
+            sys.stdout.flush()  # a full disk shows here, or never
     except OSError as error:  # what the system could not do: `out/a.png: no space left on device`
         place, why = error.filename or "what is printed", error.strerror
+        if error.filename is None:  # else the end of the process tries once more
+            with contextlib.suppress(io.UnsupportedOperation):  # of a test
+                os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        if isinstance(error, BrokenPipeError):  # `jaxquad ... | head` has read enough
+            return _CLOSED
         return _fail(f"{place}: {why.lower()}" if why else str(error), _UNUSABLE)
     except ValueError as error:
         code = _UNUSABLE
@@ -86,6 +83,21 @@ def main(argv: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         print("jaxquad: interrupted", file=sys.stderr)
         return _INTERRUPTED
+
+
+def _run(words: Sequence[str]) -> int:
+    if not words:
+        print(_WAY, end="")
+        return 0
+    options, unknown = make_parser().parse_known_args(words)
+    if unknown:
+        return _fail(_describe_unknown(options, unknown), _UNUSABLE)
+    with warnings.catch_warnings(), shown_stages(options):
+        for kind in (RecordWarning, PageWarning):
+            warnings.simplefilter("always", kind)
+        warnings.showwarning = printer_of_warnings()
+        check_out(options)
+        return options.run(options)
 
 
 def _describe_unknown(options: argparse.Namespace, words: Sequence[str]) -> str:
@@ -101,7 +113,7 @@ def _describe_unknown(options: argparse.Namespace, words: Sequence[str]) -> str:
 
 
 def _fail(message: str, code: int) -> int:
-    print("jaxquad: error:", *message.split(), file=sys.stderr)
+    print("jaxquad: error:", *readable(message).split(), file=sys.stderr)
     return code
 
 
@@ -113,15 +125,22 @@ def printer_of_warnings() -> Callable[..., None]:
         text = " ".join(in_options(message).split())
         if is_ours(kind) and text not in printed:
             printed.add(text)
-            print("!", text, file=sys.stderr)
+            print("!", readable(text), file=sys.stderr)
 
     return show
+
+
+class _Parser(argparse.ArgumentParser):
+    """argparse says nothing where its help cannot be printed."""
+
+    def _print_message(self, message, file=None):
+        (file or sys.stderr).write(message)
 
 
 def make_parser() -> argparse.ArgumentParser:
     """The parser of the whole command line."""
     listed = (f"  {x.name:<9} {x.help}\n  {'':<9} {x.example}" for x in _COMMANDS)
-    parser = argparse.ArgumentParser(
+    parser = _Parser(
         prog="jaxquad",
         usage="jaxquad COMMAND ...",
         description="From a flight record to an identified model with honest error bars.",

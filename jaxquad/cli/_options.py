@@ -7,13 +7,14 @@ import gc
 import json
 import logging
 import os
+import shutil
 import sys
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
-from jaxquad._core import STAGES
+from jaxquad._core import readable, STAGES
 from jaxquad.workflows import (
     AutopilotSettings,
     BatchSettings,
@@ -114,21 +115,43 @@ def check_out(options: argparse.Namespace) -> None:
         raise ValueError(f"--out is {out}, but nothing may be written to {place}")
 
 
+@contextlib.contextmanager
 def folder_to_write(
     options: argparse.Namespace, wanted: Path, name: str, same: Mapping[str, object],
     sources: Sequence[Path | str],
-) -> Path:  # fmt: skip
-    """The folder that is wanted, or one beside it where that holds the result of other settings."""
-    if options.force:
-        return wanted
-    folder = free_folder(wanted, name, same, sources=sources)
-    if folder != wanted:
-        print(
-            f"! {wanted} holds the result of other settings or of another file, and is kept: this "
-            f"result is in {folder} (--force writes into {wanted})",
-            file=sys.stderr,
-        )
-    return folder
+) -> Iterator[Path]:  # fmt: skip
+    """The folder that is wanted, or one beside it where that holds the result of other settings.
+
+    Another `jaxquad` that wants to write there waits until this one has written.
+    """
+    wanted.parent.mkdir(parents=True, exist_ok=True)
+    with _locked(wanted.parent):
+        folder = wanted if options.force else free_folder(wanted, name, same, sources=sources)
+        if folder != wanted:
+            text = f"! {wanted} holds the result of other settings or of another file, and is kept:"
+            text += f" this result is in {folder} (--force writes into {wanted})"
+            print(readable(text), file=sys.stderr)
+        for draft in folder.glob(".*.part"):  # of a process that was killed
+            shutil.rmtree(draft, ignore_errors=True)
+        yield folder
+
+
+@contextlib.contextmanager
+def _locked(folder: Path) -> Iterator[None]:
+    """One process at a time is within it; the death of one opens it. Without locks, all are."""
+    try:
+        import fcntl
+
+        place = os.open(folder, os.O_RDONLY)
+    except (ImportError, OSError):  # Windows, or a folder that may not be read
+        yield
+        return
+    try:
+        with contextlib.suppress(OSError):  # a network's disk without locks
+            fcntl.flock(place, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(place)
 
 
 class _NamedOnce(argparse.Action):

@@ -10,6 +10,7 @@ from ._information import (
     MeasuredNoise as MeasuredNoise,
     noise_covariance as noise_covariance,
     optimal_powers as optimal_powers,
+    PowerProblem as PowerProblem,
     Powers as Powers,
     predict_accuracy as predict_accuracy,
     Prediction as Prediction,

@@ -364,53 +364,55 @@ class Certificate(NamedTuple):
     gap: Float[Array, ""]  # the best design's log information exceeds this one's by no more
 
 
-def optimal_powers(
-    per_power: PerPower, costs: Costs, criterion: Criterion, names: tuple[str, ...], share: Share
-) -> Powers:
-    """Maximise the mean of the models' log information, each limit's `costs @ power` at most 1.
+class PowerProblem(NamedTuple):
+    """What powers of lines buy and cost: each limit's `costs @ power` is at most 1."""
 
-    No line takes more than `share` of what the limits leave it alone. Each step multiplies the
-    powers by the information that a unit of cost buys at each line, to the criterion's exponent,
-    and the prices of the limits by their use. With a single limit that is the algorithm of Silvey,
-    Titterington and Torsney (1978), under which D- and A-optimality never fall (Yu, 2010).
+    per_power: PerPower
+    costs: Costs
+    criterion: Criterion
+    names: tuple[str, ...]  # of the parameters
+    share: Share  # of what the limits leave a line alone, which it takes at most
+
+    @property
+    def cap(self) -> Power:
+        return self.share / jnp.max(self.costs, axis=0)
+
+    def feasible(self, power: Power) -> Power:
+        return power / jnp.maximum(jnp.max(self.costs @ power), 1.0)
+
+
+def optimal_powers(problem: PowerProblem) -> Powers:
+    """Maximise the mean of the models' log information within the limits.
+
+    Each step multiplies the powers by the information that a unit of cost buys at each line, to the
+    criterion's exponent, and the prices of the limits by their use. With a single limit that is the
+    algorithm of Silvey, Titterington and Torsney (1978), under which D- and A-optimality never fall
+    (Yu, 2010).
     """
-    price = jnp.full(costs.shape[0], 1 / costs.shape[0], costs.dtype)
-    start = Powers(_feasible(_cap(costs, share), costs), price)
-    steps = jnp.asarray(_STEPS)
-    return _improve(start, per_power, costs, criterion, names, share, steps)[0]
+    limits = problem.costs.shape[0]
+    price = jnp.full(limits, 1 / limits, problem.costs.dtype)
+    start = Powers(problem.feasible(problem.cap), price)
+    return _improve(start, problem, jnp.asarray(_STEPS))[0]
 
 
-def certify_powers(
-    powers: Powers,
-    per_power: PerPower,
-    costs: Costs,
-    criterion: Criterion,
-    names: tuple[str, ...],
-    share: Share,
-) -> Certificate:
+def certify_powers(powers: Powers, problem: PowerProblem) -> Certificate:
     """Bound what any powers within the limits could gain over these, whatever they are.
 
     Weak duality; with one limit and no cap, the equivalence theorem of Kiefer and Wolfowitz (1960).
     """
-    return _improve(powers, per_power, costs, criterion, names, share, jnp.asarray(0))[1]
+    return _improve(powers, problem, jnp.asarray(0))[1]
 
 
 @eqx.filter_jit
 def _improve(
-    powers: Powers,
-    per_power: PerPower,
-    costs: Costs,
-    criterion: Criterion,
-    names: tuple[str, ...],
-    share: Share,
-    steps: Int[Array, ""],
+    powers: Powers, problem: PowerProblem, steps: Int[Array, ""]
 ) -> tuple[Powers, Certificate]:
     """At most so many steps on; with none, only the certificate, at no second compilation."""
-    cap = _cap(costs, share)
+    costs, criterion, cap = problem.costs, problem.criterion, problem.cap
 
     def information(power):
-        totals = jnp.einsum("f,mfpq->mpq", power, per_power)
-        return jnp.mean(jax.vmap(lambda m: criterion.log_information(m, names))(totals))
+        totals = jnp.einsum("f,mfpq->mpq", power, problem.per_power)
+        return jnp.mean(jax.vmap(lambda m: criterion.log_information(m, problem.names))(totals))
 
     slope = jax.grad(information)
 
@@ -431,7 +433,7 @@ def _improve(
         return Powers(jnp.minimum(scale * wanted, cap), price)
 
     def certificate(state):
-        power, cost = _feasible(state.power, costs), state.price @ costs
+        power, cost = problem.feasible(state.power), state.price @ costs
         slopes = slope(power)
         # Any powers within the limits could do better by so much: concavity, and the best filling.
         order = jnp.argsort(-slopes / cost)
@@ -452,12 +454,4 @@ def _improve(
     unknown = Certificate(jnp.zeros_like(powers.power), jnp.asarray(jnp.inf))
     start = (powers, unknown, jnp.zeros_like(steps))
     state, proof, _ = jax.lax.while_loop(unfinished, improve, start)
-    return state._replace(power=_feasible(state.power, costs)), proof
-
-
-def _cap(costs: Costs, share: Share) -> Power:
-    return share / jnp.max(costs, axis=0)
-
-
-def _feasible(power: Power, costs: Costs) -> Power:
-    return power / jnp.maximum(jnp.max(costs @ power), 1.0)
+    return state._replace(power=problem.feasible(state.power)), proof

@@ -19,6 +19,7 @@ from ._information import (
     DOptimal,
     Noise,
     optimal_powers,
+    PowerProblem,
     Powers,
     Prediction,
     unit_information,
@@ -208,7 +209,8 @@ def optimal_multisine(
             """Complex amplitudes of the limited signals, in units of their limits."""
             return limits.filters * np.sqrt(2 * power) / limits.peaks[:, None]
 
-        best = optimal_powers(informations, jnp.asarray(costs), criterion, names, share)
+        problem = PowerProblem(informations, jnp.asarray(costs), criterion, names, share)
+        best = optimal_powers(problem)
         power = np.asarray(best.power)
         used = costs.max(axis=0) * power
         power = np.where(used > _FAINT * used.max(), power, 0.0)
@@ -216,8 +218,8 @@ def optimal_multisine(
         reached = multisine_peaks(orders, phase, signals(power))
         power, reached = power / reached.max() ** 2, reached / reached.max()
         crest = reached / np.sqrt(0.5 * np.sum(np.abs(signals(power)) ** 2, axis=1))
-        powers, costs = Powers(jnp.asarray(power), best.price), jnp.asarray(limits.costs(crest))
-        proof = certify_powers(powers, informations, costs, criterion, names, share)
+        problem = problem._replace(costs=jnp.asarray(limits.costs(crest)))
+        proof = certify_powers(Powers(jnp.asarray(power), best.price), problem)
         dispersion = len(names) * np.asarray(proof.dispersion)
         efficiency = min(1.0, float(np.exp(-np.asarray(proof.gap))))
         totals = np.einsum("f,mfpq->mpq", power, per_power)

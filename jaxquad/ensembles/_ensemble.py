@@ -30,7 +30,7 @@ from ._members import (
     nominal_value,
     Payload,
     plant_inertia,
-    QUANTITIES,
+    UNCERTAIN,
     VariablePlant,
     vary_plant,
 )
@@ -215,7 +215,7 @@ class Ensemble(eqx.Module):
     def distributions(self) -> dict[str, Distribution]:
         """The distribution of each quantity that has one."""
         fields = vars(self)
-        named: dict[str, Distribution | None] = {name: fields[name] for name in QUANTITIES}
+        named: dict[str, Distribution | None] = {name: fields[name] for name in UNCERTAIN}
         if self.payload is not None:
             named |= {f"payload {name}": x for name, x in vars(self.payload).items()}
         return {name: one for name, one in named.items() if one is not None}

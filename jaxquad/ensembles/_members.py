@@ -21,7 +21,7 @@ from ._distributions import as_distribution, Distribution, distribution_or_none
 
 # Factors of nominal values; the other quantities replace these.
 FACTORS = ("inertia", "torque_gain", "assumed_inertia")
-QUANTITIES = (*FACTORS, "lag", "delay", "damping", "stiffness", "coulomb", "noise", "gust")
+UNCERTAIN = (*FACTORS, "lag", "delay", "damping", "stiffness", "coulomb", "noise", "gust")
 VariablePlant = DecoupledAxes | Multirotor
 Numbers = Float[np.ndarray, "..."]
 Drawn = Mapping[str, Numbers]  # [axes] or [axes, members] of each quantity

@@ -35,7 +35,12 @@ from .frequency_domain._cost import (
     usable as usable,
     WIDER_BAND as WIDER_BAND,
 )
-from .frequency_domain._fit import fit as fit, guess_lagged_integrator as guess_lagged_integrator
+from .frequency_domain._fit import (
+    fit as fit,
+    guess_lagged_integrator as guess_lagged_integrator,
+    solve_from_many as solve_from_many,
+    spread_starts as spread_starts,
+)
 from .frequency_domain._parameters import (
     Changed as Changed,
     Free as Free,
@@ -60,12 +65,7 @@ from .frequency_domain._refits import (
 )
 from .frequency_domain._result import Fit as Fit
 from .frequency_domain._sampled import as_sampled as as_sampled
-from .frequency_domain._solve import least_squares as least_squares
-from .frequency_domain._starts import (
-    Minimum as Minimum,
-    solve_from_many as solve_from_many,
-    spread_starts as spread_starts,
-)
+from .frequency_domain._solve import least_squares as least_squares, Minimum as Minimum
 from .frequency_domain._structure import (
     fit_damped as fit_damped,
     reduce_structure as reduce_structure,
@@ -95,6 +95,8 @@ from .output_error._verify import (
     Agreement as Agreement,
     compare as compare,
     Comparison as Comparison,
+    CONTRADICTS as CONTRADICTS,
+    GOOD_TIC as GOOD_TIC,
     Verification as Verification,
     verify as verify,
 )

@@ -18,6 +18,7 @@ from jaxquad._core import (
     begin,
     CONVERGED,
     decrement,
+    Message,
     Normal,
     require_x64,
     RUNNING,
@@ -33,12 +34,13 @@ from .frequency_domain._cost import (
     least_coherence,
     MaximumLikelihood,
     Mixing,
-    mixings_of,
+    mixing_of,
     Points,
     points_of,
     Range,
     usable,
 )
+from .frequency_domain._feedthrough import free_delays
 from .frequency_domain._fit import check_options
 from .frequency_domain._parameters import (
     Free,
@@ -51,17 +53,15 @@ from .frequency_domain._parameters import (
 )
 from .frequency_domain._problem import make_problem, Problem, problem_normal
 from .frequency_domain._result import Fit
-from .frequency_domain._sampled import behind_hold, hold_of
+from .frequency_domain._sampled import behind_hold, direct_part, hold_of
 from .frequency_domain._solve import solution_at, stopped_early
 from .uncertainty._assess import assess
 from .uncertainty._error_budget import weighting_at
 
 
 class Member(NamedTuple):
-    """What members are fitted to, after the axes of each array that are named here.
-
-    Frequencies are filled up to a length that many records share, with weights of 0.
-    """
+    """What members are fitted to, after the axes of each array that are named here. Frequencies are
+    filled up to a length that many records share, with weights of 0."""
 
     inverse: tuple[Numbers, Numbers]  # frequencies outputs inputs: 1 / measured, real, imaginary
     weights: Numbers  # frequencies outputs inputs parts
@@ -79,44 +79,25 @@ class Batch(NamedTuple):
 
     @property
     def evaluates_singly(self) -> bool:
-        """Whether members are evaluated one after the other: a `jq.StateSpace` without ties."""
+        """Whether members are evaluated one by one: a `jq.StateSpace`, whose states are a loop of
+        their own. Other models become one kernel, at a quarter of the cost."""
         return type(self.model) is StateSpace and not self.parameters.ties and not self.hold
 
 
 Active = Bool[Array, " members"]
 Places = Float[Array, "parameters members"]
-Evaluate = Callable[[Places, Active], Normal]
-
-
-def normal_equations_of(batch: Batch, member: Member) -> Evaluate:
-    """Cost, gradient and Gauss-Newton Hessian of members on the last axis of `member`.
-
-    A `jq.StateSpace` is evaluated one member after the other, without those that are not active:
-    its states are a loop of their own. Any other model of plain arithmetic becomes one kernel, at a
-    quarter of the cost of what evaluates the rest: at all frequencies at once.
-    """
-    if batch.evaluates_singly:
-        return _one_by_one(batch, member)
-    return lambda z, active: _at_all_frequencies(batch, z, member)
+Evaluate = Callable[[Places, Active], Normal]  # cost, gradient and Gauss-Newton Hessian
 
 
 def _one_by_one(batch: Batch, member: Member) -> Evaluate:
-    # With the members first: transposed once, not at each evaluation.
-    measured = jnp.moveaxis(1 / jax.lax.complex(*member.inverse), (3, 0), (0, 3))
-    weights = jnp.moveaxis(member.weights, (4, 3, 0), (0, 1, 4))
-    factor = across = None
-    if member.factor is not None:
-        factor = tuple(jnp.moveaxis(x, (4, 0, 1), (0, 3, 4)) for x in member.factor)
-    if member.across is not None:
-        across = tuple(jnp.moveaxis(x, -1, 0) for x in member.across)
-    members = (jnp.real(measured), jnp.imag(measured)), weights, factor, across
+    """One member after the other, without those that are not active."""
+    members = jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), member)
 
-    def normal(z, member):
-        measured, weights, factor, across = member
+    def normal(z: Array, member: Member) -> Normal:
         mixing = None
-        if factor is not None:
-            factor = jax.lax.complex(*factor)
-            across = None if across is None else jax.lax.complex(*across)
+        if member.factor is not None:
+            factor = jnp.moveaxis(jax.lax.complex(*member.factor), (0, 1), (2, 3))
+            across = None if member.across is None else jax.lax.complex(*member.across)
             # Traced, in the place of NumPy's arrays; correlations matter to nothing here.
             mixing = Mixing(factor, factor, across, across)  # pyright: ignore[reportArgumentType]
         problem = Problem(
@@ -125,8 +106,8 @@ def _one_by_one(batch: Batch, member: Member) -> Evaluate:
             conditions=(UNCHANGED,),
             quantities=(),
             omega=(batch.omega,),
-            measured=(jnp.moveaxis(jax.lax.complex(*measured), -1, 0),),
-            weights=(jnp.moveaxis(weights, (3, 0), (0, 3)),),
+            measured=(1 / jax.lax.complex(*member.inverse),),
+            weights=(member.weights,),
             prior=np.zeros((0, 2)),
             aliases=(None,),
             silent=((),),
@@ -181,10 +162,8 @@ def _at_all_frequencies(batch: Batch, z: Array, member: Member) -> Normal:
 def _columns(
     batch: Batch, z: list[Array], omega: Array, real: Array, imag: Array, weights: Array
 ) -> list[tuple[Array, Array]]:
-    """Weighted slopes by each parameter, and then the weighted misfit, at one frequency.
-
-    Each in magnitude and in phase.
-    """
+    """Weighted slopes by each parameter, and then the weighted misfit, at one frequency. Each in
+    magnitude and in phase."""
 
     def response(z):
         # As `Parameters.insert`, but without a vector that would make each depend on all.
@@ -236,14 +215,9 @@ class BatchSolution(NamedTuple):
     converged: Bool[Numbers, " batch"]  # stopped, and with nothing left to save
 
 
-Mixings = Sequence[Mixing | None]
-
-
-def _members(measured: np.ndarray, weights: np.ndarray, mixings: Mixings) -> Member:
-    """What the members are fitted to, which are on the first axis.
-
-    `mixings`, one for each member or none at all, take points together that share noise.
-    """
+def _members(measured: np.ndarray, weights: np.ndarray, mixings: Sequence[Mixing | None]) -> Member:
+    """What the members are fitted to, which are on the first axis. `mixings`, one for each member
+    or none at all, take points together that share noise."""
     if (*measured.shape, 2) != weights.shape:
         raise ValueError(
             f"measured has shape {measured.shape} and weights {weights.shape}: give at least one "
@@ -254,8 +228,7 @@ def _members(measured: np.ndarray, weights: np.ndarray, mixings: Mixings) -> Mem
     with np.errstate(invalid="ignore"):
         inverse = _pad(np.where(used, 1 / np.where(used, measured, 1.0), 1.0), 1)
     weights = _pad(weights, 1)
-    if weights.shape[1] > measured.shape[1]:
-        weights[:, measured.shape[1] :] = 0
+    weights[:, measured.shape[1] :] = 0
     parts = np.real(inverse), np.imag(inverse)
     if all(mixing is None for mixing in mixings):
         return Member(parts, weights, None)
@@ -331,11 +304,11 @@ def _solve_call(where, members, z0, chunks, max_steps) -> BatchSolution:
         mine, start = jax.tree.map(
             lambda x: jax.lax.dynamic_index_in_dim(x, k, keepdims=False), (members, z0)
         )
-        return _descend(normal_equations_of(where, mine), start, max_steps)
+        together = lambda z, active: _at_all_frequencies(where, z, mine)
+        evaluate = _one_by_one(where, mine) if where.evaluates_singly else together
+        return _descend(evaluate, start, max_steps)
 
-    def add(k, total):
-        return jax.tree.map(lambda out, x: out.at[k].set(x), total, chunk(k))
-
+    add = lambda k, total: jax.tree.map(lambda out, x: out.at[k].set(x), total, chunk(k))
     shapes = jax.eval_shape(chunk, jnp.zeros((), int))
     room = jax.tree.map(lambda x: jnp.zeros((len(z0), *x.shape), x.dtype), shapes)
     stacked = jax.lax.fori_loop(0, chunks, add, room)
@@ -345,9 +318,7 @@ def _solve_call(where, members, z0, chunks, max_steps) -> BatchSolution:
 
 def _descend(evaluate: Evaluate, z0: Array, max_steps: Array) -> tuple:
     """Where members stop, with the cost, what is left to save, steps, and whether they converged.
-
-    As `minimise` does, and with one evaluation at the end, in the same loop: it compiles once.
-    """
+    As `minimise` does, and with one evaluation at the end, in the same loop: it compiles once."""
 
     def step(walk):
         state, _, _ = walk
@@ -390,8 +361,8 @@ class BatchFit(eqx.Module):
         """
         points, steps = self.points[k], int(self.steps[k])
         problem = make_problem(self.model, self.parameters, [points.frf])
-        mixings = mixings_of([points], [self.weights[k]]) if self.mixed else None
-        problem = problem.weighted([self.weights[k]], mixings)
+        mixing = mixing_of(points, self.weights[k]) if self.mixed else None
+        problem = problem.weighted([self.weights[k]], [mixing])
         message = "" if self.converged[k] else stopped_early(STALLED, steps)
         solution = solution_at(problem, self.z[k], message, steps)
         return assess(problem, weighting_at(problem, [points], solution), solution)
@@ -466,15 +437,20 @@ def fit_batch(
         raise ValueError(
             f"the inputs of the responses are held for {holds} s: fit those of one hold together"
         )
-    points = points_of(frfs, used)
-
-    def weights_at(ratios) -> np.ndarray:
-        rows = zip(points, ratios, strict=True)
-        return np.stack([cost.weights(*row) for row in rows])
-
-    weights, mixed = weights_at(np.ones(measured.shape)), isinstance(cost, MaximumLikelihood)
+    passes = holds[0] and eqx.filter_eval_shape(direct_part, model) is not None
+    if passes and free_delays(make_problem(model, parameters, frfs[:1])):
+        raise ValueError(
+            Message(
+                f"the input is held for {holds[0]:g} s and passes directly to an output, late by a "
+                "free delay that shows only in whole samples: fit the responses one by one with "
+                "jq.fit, which tries these, or leave the delay out of «free=»"
+            )
+        )
+    points = [points_of(*pair) for pair in zip(frfs, used, strict=True)]
+    weigh = lambda ratios: np.stack([cost.weights(*x) for x in zip(points, ratios, strict=True)])
+    weights, mixed = weigh(np.ones(measured.shape)), isinstance(cost, MaximumLikelihood)
     # Without a floor on the errors, they do not depend on the weights.
-    mixings = mixings_of(points, list(weights)) if mixed else ()
+    mixings = [mixing_of(*x) for x in zip(points, weights, strict=True)] if mixed else ()
     where = Batch(model, parameters, holds[0], _pad(omega))
     together, single = (np.asarray(part) for part in _both_ways(model, where.omega))
     if together.shape != (*where.omega.shape, *measured.shape[2:]):
@@ -491,7 +467,7 @@ def fit_batch(
     start = parameters.start[: parameters.count]
     start = np.array(np.broadcast_to(start, (len(measured), parameters.count)))
     solution = _solve(where, _members(measured, weights, mixings), start, max_steps)
-    again = weights_at(_ratios(where, measured, solution))
+    again = weigh(_ratios(where, measured, solution))
     if not np.allclose(weights, again, rtol=1e-4):
         weights, start = again, np.where(np.isfinite(solution.z), solution.z, 0.0)
         solution = _solve(where, _members(measured, weights, mixings), start, max_steps)
@@ -511,9 +487,7 @@ def _sizes(where, z) -> Float[Array, "batch frequencies outputs inputs"]:
     return jax.vmap(one)(z)
 
 
-def _ratios(
-    where: Batch, measured: np.ndarray, solution: BatchSolution
-) -> Float[np.ndarray, "batch frequencies outputs inputs"]:
+def _ratios(where: Batch, measured: np.ndarray, solution: BatchSolution) -> np.ndarray:
     """|model / measurement| of every member; 1 where a fit ran away."""
     parts = [_sizes(where, solution.z[chunk]) for chunk in _places(len(solution.z), 2 * _CHUNK)]
     sizes = np.concatenate([np.asarray(part) for part in parts])

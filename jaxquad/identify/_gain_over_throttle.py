@@ -1,6 +1,7 @@
 """The gain over the throttle: levels of throttle in records, one lag and delay, a gain for each."""
 
 import dataclasses
+import functools as ft
 import warnings
 from collections.abc import Sequence
 
@@ -82,6 +83,10 @@ class _Segment:
 _Level = list[_Segment]
 
 
+def _mean(level: _Level) -> float:
+    return float(np.concatenate([segment.throttle for segment in level]).mean())
+
+
 def gain_over_throttle(
     record: Record | Sequence[Record],
     *,
@@ -142,7 +147,17 @@ def gain_over_throttle(
         # In a loop transients are short and need no model of the whole record, as 1/s alone does.
         estimator = JointInputOutput(LocalPolynomial(global_order=0))
     estimator = estimator or LocalPolynomial()
-    respond = lambda level, curve: _respond(level, omega, estimator, filters, curve, flown_curve)
+
+    def respond(level: _Level, curve: float) -> FrequencyResponse:
+        """The response at one level, with the command weighted by the curve around its mean."""
+        slope, parts = ft.partial(relative_slope, curve=curve, flown=flown_curve), []
+        for segment in level:
+            one, inside = segment.record, slice(segment.first, segment.end)
+            columns = _columns(one)[inside]
+            columns[:, 0] *= slope(segment.throttle) / slope(_mean(level))
+            parts.append(_with_columns(one, one.time[inside], columns))
+        return without_filters(frequency_response(parts, omega, estimator=estimator), filters)
+
     responses = [respond(level, flown_curve) for level in levels]
     enough = [usable(response, None, 0.6).sum() >= _FEWEST for response in responses]
     if not all(enough):
@@ -201,36 +216,20 @@ def _columns(record: Record) -> Float[np.ndarray, "samples channels"]:
 
 
 def _with_columns(
-    record: Record, time: np.ndarray, columns: Float[np.ndarray, "samples channels"], hold
+    record: Record, time: np.ndarray, columns: Float[np.ndarray, "samples channels"]
 ) -> Record:
+    parts = {"inputs": columns[:, :1], "outputs": columns[:, 1:2], "references": columns[:, 2:]}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RecordWarning)  # of what was repaired or is constant
-        return Record(
-            time,
-            columns[:, :1],
-            columns[:, 1:2],
-            columns[:, 2:],
-            input_names=record.input_names,
-            output_names=record.output_names,
-            reference_names=record.reference_names,
-            input_units=record.input_units,
-            output_units=record.output_units,
-            reference_units=record.reference_units,
-            source=record.source,
-            hold=hold,
-            time_unit="s",
-        )
+        return dataclasses.replace(record, time=time, time_unit="s", repaired=None, **parts)
 
 
 def _find_levels(
     records: Sequence[Record], throttle: str, span: tuple[float, float], rate: float, width: float,
     shortest: float,
 ) -> tuple[list[_Level], tuple[str, ...]]:  # fmt: skip
-    """Segments of nearly the same mean together, in the order of throttle; and what is left out.
-
-    A segment lasts at least `shortest` s, and the throttle moves by at most `width` within it. Its
-    record has command, rate and reference without the throttle, at no more than `rate`.
-    """
+    """Segments of nearly the same mean together, in the order of throttle, without its channel and
+    at no more than `rate`; and what is left out."""
     if span[0] == span[1]:
         raise ValueError(f"throttle_range is {span}: give the values at no and at full throttle")
     if not (0 < width <= 0.5 and shortest > 0):
@@ -255,15 +254,12 @@ def _find_levels(
                 "channels with jq.records.select"
             )
         axis = select(record, inputs=sides[0], outputs=sides[1], references=sides[2])
-        axis = _with_columns(axis, axis.time, _columns(axis), record.hold)
+        axis = _with_columns(axis, axis.time, _columns(axis))
         if record.sample_rate > 1.2 * rate:
             columns = [*_columns(axis).T, values]
             channels = [Channel(str(k), axis.time, column) for k, column in enumerate(columns)]
             time, resampled = resample(channels, rate)
-            axis, values = (
-                _with_columns(axis, time, resampled[:, :-1], record.hold),
-                resampled[:, -1],
-            )
+            axis, values = _with_columns(axis, time, resampled[:, :-1]), resampled[:, -1]
         first, low, high = 0, values[0], values[0]
         for k, value in enumerate(values):
             low, high = min(low, value), max(high, value)
@@ -294,29 +290,6 @@ def _find_levels(
     count = len(segments) - len(excited)
     text = f"{count} stretches of steady throttle had no excitation and are left out"
     return levels, (text,) if count else ()
-
-
-def _mean(level: _Level) -> float:
-    return float(np.concatenate([segment.throttle for segment in level]).mean())
-
-
-def _respond(
-    level: _Level,
-    omega: Float[np.ndarray, " frequencies"],
-    estimator: Estimator,
-    filters: Sequence[KnownFilter],
-    curve: float,
-    flown: float,
-) -> FrequencyResponse:
-    """The response at one level, with the command weighted by the curve around its mean."""
-    middle = relative_slope(_mean(level), curve, flown)
-    records = []
-    for segment in level:
-        record, inside = segment.record, slice(segment.first, segment.end)
-        columns = _columns(record)[inside]
-        columns[:, 0] *= relative_slope(segment.throttle, curve, flown) / middle
-        records.append(_with_columns(record, record.time[inside], columns, record.hold))
-    return without_filters(frequency_response(records, omega, estimator=estimator), filters)
 
 
 def _fit_levels(

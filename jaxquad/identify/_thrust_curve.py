@@ -55,9 +55,7 @@ class FirmwareValue(NamedTuple):
 
     def content(self) -> dict[str, object]:
         """All of it, for JSON."""
-        content: dict[str, object] = dict(self._asdict())
-        content["interval_95"] = content.pop("interval")
-        return content
+        return {"interval_95" if k == "interval" else k: x for k, x in self._asdict().items()}
 
 
 def _parameter(firmware: CurveFirmware) -> tuple[str, float, float, float]:
@@ -157,7 +155,7 @@ class ThrottleLevels(NamedTuple):
         """In words, for gains at other throttles; empty where there are several levels."""
         if self.throttle.size > 1:
             return ""
-        return _advise_flight(float(self.throttle[0]), 0.2, float(self.seconds[0]), _AS_WELL)
+        return _advise_flight(float(self.throttle[0]), 0.2, float(self.seconds[0]))
 
 
 class PlantsOverThrottle(NamedTuple):
@@ -285,8 +283,8 @@ class GainOverThrottle(eqx.Module):
         - `UndeterminedError`: the record holds too little of the curve; says what to fly.
         - `ValueError`: for another firmware.
         """
-        (name, factor, least, most), curve = _parameter(firmware), self.curve
-        if curve is None or _reach(curve) > _SHARP:
+        (name, factor, least, most), curve = _parameter(firmware), self._sharp_curve
+        if curve is None:
             raise UndeterminedError(f"{name}: {self.what_to_fly()}")
         convert = _cubic if firmware == "betaflight 2025.12" else float
         slope = (convert(curve.value + 1e-4) - convert(curve.value - 1e-4)) / 2e-4
@@ -336,15 +334,15 @@ class GainOverThrottle(eqx.Module):
         if curve is None:
             return (
                 f"the log holds one level of throttle ({first:.2f}), which shows no curve: "
-                f"{_advise_flight(first, 0.2, seconds, _AS_WELL)}"
+                f"{_advise_flight(first, 0.2, seconds)}"
             )
         reach = _reach(curve)
         if reach <= _SHARP:
             return f"the log holds enough of the thrust curve ({first:.2f} .. {last:.2f} throttle)"
         wanted = (last - first) * reach / _SHARP
         if wanted <= 0.6:
-            words = "from {:.2f} to {:.2f}"
-            advice = _advise_flight((first + last) / 2, wanted, seconds, words)
+            middle = (first + last) / 2
+            advice = _advise_flight(middle, wanted, seconds, "from {:.2f} to {:.2f}")
         else:
             advice = (
                 f"fly from 0.20 to 0.80, with {wanted / 0.6:.1f} times the amplitude or "
@@ -421,10 +419,13 @@ class GainOverThrottle(eqx.Module):
         return f"{', '.join(times)} (95 %){end}"
 
     def _firmware_values(self) -> list[FirmwareValue]:
-        curve = self.curve
-        if curve is None or _reach(curve) > _SHARP:
-            return []
-        return [self.firmware_value(name) for name in ("px4", "ardupilot", "betaflight")]
+        names = ("px4", "ardupilot", "betaflight") if self._sharp_curve is not None else ()
+        return [self.firmware_value(name) for name in names]
+
+    @property
+    def _sharp_curve(self) -> Combination | None:
+        """Where it is known well enough for a firmware's parameter."""
+        return None if (curve := self.curve) is None or _reach(curve) > _SHARP else curve
 
     def _line(self) -> _Line | None:
         n = self.throttle.size
@@ -432,18 +433,14 @@ class GainOverThrottle(eqx.Module):
             return None
         from scipy.special import chdtrc
 
-        x = actuator(self.throttle, self.flown)
-        scale = 1 - self.flown + 2 * self.flown * x
-        gains = self.gain * scale
-        covariance = np.asarray(self.fit.covariance)[:n, :n] * np.outer(scale, scale)
-        columns = np.stack([np.ones(n), x], axis=1)
+        columns, covariance = self._rows(self.throttle), np.asarray(self.fit.covariance)[:n, :n]
         weighted = np.linalg.solve(covariance, columns)
         gather = np.linalg.solve(columns.T @ weighted, weighted.T)
-        ends = gather @ gains
-        rest = gains - columns @ ends
+        ends = gather @ self.gain
+        rest = self.gain - columns @ ends
         misfit = float(rest @ np.linalg.solve(covariance, rest))
         probability = float(chdtrc(n - 2, misfit)) if n > 2 else 1.0
-        return _Line(ends, gather * scale, misfit, probability)
+        return _Line(ends, gather, misfit, probability)
 
     def _rows(self, throttle: Float[ArrayLike, "..."]) -> Float[np.ndarray, "... 2"]:
         """The gain at a throttle is this times the line's ends."""
@@ -487,10 +484,9 @@ class GainOverThrottle(eqx.Module):
             )
 
 
-_AS_WELL = "{:.2f} and {:.2f} as well"
-
-
-def _advise_flight(middle: float, span: float, seconds: float, words: str) -> str:
+def _advise_flight(
+    middle: float, span: float, seconds: float, words: str = "{:.2f} and {:.2f} as well"
+) -> str:
     lower = float(np.clip(middle - span / 2, 0.15, 0.85 - min(span, 0.7)))
     turns = ", in turns of about 8 s, as the vehicle sinks or climbs" if seconds > 10 else ""
     levels = words.format(lower, min(lower + span, 0.85))

@@ -42,7 +42,10 @@ class Controller(Protocol):
     - `applied(state, achieved)`: gets what the drive really gave, before the next sample;
     - `signals(state)`: a dict of arrays `[axes, *ensemble]` to record;
     - `prepared()`: the controller to run, with what is the same for all samples computed;
-    - `linear(axis, member)`: a `jq.control.LinearController` to analyse.
+    - `linear(axis, member)`: a `jq.control.LinearController` to analyse and to certify;
+    - `tunable()`: what `jq.tune` varies, see `jq.control.Tunable`;
+    - `scheduled_at(inertia)`: the gains of an inertia, see `jq.control.ScheduledController`;
+    - `c_source(axes, precision)`: a `jq.export.Source` for `jq.export.write_c_header`.
     """
 
     def init(self, like: Vector) -> PyTree: ...
@@ -68,7 +71,11 @@ class Sensor(Protocol):
 
 @runtime_checkable
 class LinearisablePlant(Protocol):
-    """A plant that `jq.analyse`, `jq.tune` and `jq.certify` can analyse as a linear loop."""
+    """A plant that `jq.analyse` can analyse as a linear loop.
+
+    Members of an ensemble, and so `jq.tune` and `jq.certify`, need more than that: a
+    `jq.DecoupledAxes` or a `jq.models.Multirotor`.
+    """
 
     def linearise(self, axis: int) -> LinearAxis:
         """One axis about rest."""

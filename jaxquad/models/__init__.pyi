@@ -11,6 +11,7 @@ from ._attitude import (
     rotation_matrix as rotation_matrix,
 )
 from ._convert import (
+    feedthrough as feedthrough,
     from_control as from_control,
     realise as realise,
     series as series,

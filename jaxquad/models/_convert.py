@@ -65,6 +65,24 @@ def state_space(model: TransferFunction) -> StateSpace:
     return StateSpace(F=A, G=B, H0=C - dot(H1, A), H1=H1, input_delay=late)
 
 
+def feedthrough(
+    model: TransferFunction | StateSpace,
+) -> tuple[Float[Array, "outputs inputs"], Float[Array, "outputs inputs"]] | None:
+    """What passes directly from the inputs to the outputs, and how late in s; None if nothing can.
+
+    A hold shows it a whole number of samples late: y = D u(t - delay) changes between samples.
+    """
+    if isinstance(model, TransferFunction):
+        if model.numerator.size < model.denominator.size:
+            return None
+        gain = model.numerator[0] / model.denominator[0]
+        return gain[None, None], jnp.asarray(model.delay)[None, None]
+    if model.H1 is None:
+        return None
+    gain, late = explicit(model)[3], model.lateness
+    return gain, jnp.zeros_like(gain) if late is None else late
+
+
 def series(first: StateSpace, second: StateSpace) -> StateSpace:
     """Two models in series: the outputs of `first` drive the inputs of `second`.
 

@@ -18,6 +18,8 @@ from matplotlib.axis import Axis
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
 
+from jaxquad._core import readable
+
 
 WIDTH = 6.5
 _LEFT, _RIGHT, _TOP, _BOTTOM, _GAP = 0.9, 0.15, 0.2, 0.5, 0.12
@@ -108,7 +110,8 @@ def arrange(
     title and the first row, for what stands on it; `left` and `right` are margins of each column.
     Panels of the caller stay where they are: title and legend go into the first of them.
     """
-    legend = legend or {}
+    title = visible(title)
+    legend = {visible(name): artist for name, artist in (legend or {}).items()}
     if not panels.new:
         if title:
             panels[0].set_title(title, fontsize=10)
@@ -266,7 +269,7 @@ COHERENT = 0.6  # magnitude-squared coherence from which a frequency is commonly
 
 def visible(text: str) -> str:
     """A text with U+FFFD for characters that control a display instead of showing on it."""
-    return _HIDDEN.sub("\ufffd", text)
+    return _HIDDEN.sub("\ufffd", readable(text))
 
 
 def short_names(names: Sequence[str]) -> tuple[str, ...]:

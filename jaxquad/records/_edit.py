@@ -12,7 +12,6 @@ from ._channel import (
     Channel,
     chosen_span,
     clock_start,
-    FEWEST,
     longest_gap,
     longest_step,
     nonuniformity,
@@ -23,7 +22,7 @@ from ._channel import (
     window,
     within,
 )
-from ._errors import choose_range, GapError, mend_holes, RecordError, warn
+from ._log import choose_range, FEWEST, GapError, mend_holes, RecordError, warn
 from ._record import as_tuple, assemble, Record
 
 
@@ -40,13 +39,9 @@ _MOST = 50_000_000  # samples
 
 
 def resample(
-    channels: Sequence[Channel],
-    sample_rate: Number,
-    *,
-    start: Number | None = None,
-    stop: Number | None = None,
-    max_gap: Number | None = None,
-) -> tuple[Times, Channels]:
+    channels: Sequence[Channel], sample_rate: Number, *, start: Number | None = None,
+    stop: Number | None = None, max_gap: Number | None = None,
+) -> tuple[Times, Channels]:  # fmt: skip
     """Resample channels with different time stamps to one uniform grid.
 
     Where a channel is faster than the grid, every channel passes the same linear-phase filter,
@@ -232,14 +227,10 @@ def trim(record: Record, start: Number | None = None, stop: Number | None = None
     span = window(record.time, start, stop)
     time = record.time[span]
     return dataclasses.replace(
-        record,
-        time=time,
-        inputs=record.inputs[span],
-        outputs=record.outputs[span],
-        references=record.references[span],
-        time_unit="s",
+        record, time=time, inputs=record.inputs[span], outputs=record.outputs[span],
+        references=record.references[span], time_unit="s",
         repaired=within(record.repaired, time[0], time[-1]),
-    )
+    )  # fmt: skip
 
 
 def detrend(record: Record, *, order: Literal[0, 1] = 0) -> Record:
@@ -266,21 +257,15 @@ def detrend(record: Record, *, order: Literal[0, 1] = 0) -> Record:
         return level - order * slope * centred
 
     return dataclasses.replace(
-        record,
-        inputs=flatten(record.inputs),
-        outputs=flatten(record.outputs),
-        references=flatten(record.references),
-        time_unit="s",
-    )
+        record, inputs=flatten(record.inputs), outputs=flatten(record.outputs),
+        references=flatten(record.references), time_unit="s",
+    )  # fmt: skip
 
 
 def select(
-    record: Record,
-    *,
-    inputs: str | Sequence[str],
-    outputs: str | Sequence[str],
+    record: Record, *, inputs: str | Sequence[str], outputs: str | Sequence[str],
     references: str | Sequence[str] = (),
-) -> Record:
+) -> Record:  # fmt: skip
     """Assign new roles to channels, and drop the others.
 
     **Arguments:**
@@ -298,23 +283,15 @@ def select(
     roles = [as_tuple(names) for names in (inputs, outputs, references)]
     hold = record.hold if set(roles[0]) <= set(record.input_names) else None
     return assemble(
-        record.time,
-        roles,
-        record.channel,
-        record.unit,
-        source=record.source,
-        hold=hold,
+        record.time, roles, record.channel, record.unit, source=record.source, hold=hold,
         repaired=record.repaired,
-    )
+    )  # fmt: skip
 
 
 def mix(
-    record: Record,
-    name: str,
-    weights: Mapping[str, Number],
-    *,
+    record: Record, name: str, weights: Mapping[str, Number], *,
     role: Literal["input", "output", "reference"] = "input",
-) -> Record:
+) -> Record:  # fmt: skip
     """Add a channel that is a weighted sum of others, such as a roll command of four motors.
 
     **Arguments:**
@@ -347,14 +324,10 @@ def mix(
     roles[_ROLES.index(role)] += (name,)
     unknown_hold = role == "input" and not set(weights) <= set(record.input_names)
     return assemble(
-        record.time,
-        roles,
-        lambda channel: column if channel == name else record.channel(channel),
-        lambda channel: unit if channel == name else record.unit(channel),
-        source=record.source,
-        hold=None if unknown_hold else record.hold,
-        repaired=record.repaired,
-    )
+        record.time, roles, lambda channel: column if channel == name else record.channel(channel),
+        lambda channel: unit if channel == name else record.unit(channel), source=record.source,
+        hold=None if unknown_hold else record.hold, repaired=record.repaired,
+    )  # fmt: skip
 
 
 def combine(name: str, weights: Mapping[str, Number], values: Callable[[str], Times]) -> Times:

@@ -16,7 +16,7 @@ _OFFERED: dict[str, "str | FirmwareLog"] = {}  # by the `vehicle` of logs
 
 
 def offer(name: str, module: str) -> None:
-    """Let a module's `LOG` say what the logs of a firmware mean."""
+    """Let a module's constant, `PX4` of "px4", say what the logs of a firmware mean."""
     _OFFERED[name] = module
 
 
@@ -34,7 +34,7 @@ def firmware_log(name: str) -> "FirmwareLog | None":
     """What the logs of a firmware mean; None for others."""
     offered = _OFFERED.get(name)
     if isinstance(offered, str):
-        offered = _OFFERED[name] = importlib.import_module(offered).LOG
+        offered = _OFFERED[name] = getattr(importlib.import_module(offered), name.upper())
     return offered
 
 

@@ -11,15 +11,23 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from ._channel import FEWEST as FEWEST, native_rate, Number
-from ._errors import ReadError, RecordError
+from ._channel import native_rate, Number
 from ._firmwares import (
     axis_of_rate as axis_of_rate,
     firmware_log as firmware_log,
     firmware_names as firmware_names,
     register_log as register_log,
 )
-from ._log import flattened as flattened, Log as Log, Signal, Signals as Signals, Table as Table
+from ._log import (
+    FEWEST as FEWEST,
+    flattened as flattened,
+    Log as Log,
+    ReadError,
+    RecordError,
+    Signal,
+    Signals as Signals,
+    Table as Table,
+)
 from .formats import load_log, Reader as Reader
 
 
@@ -280,7 +288,9 @@ class FirmwareLog:
     remarks_on: Callable[[Log, Setup, Spans], tuple[str, ...]] = lambda log, setup, spans: ()
     numbers_chirps: bool = False  # whether a proposal lists all chirps with their numbers
     gyro_cutoffs: tuple[str, ...] = ()  # one of these is in each log that tells the gyro's filters
-    reader: Reader | None = None  # of its files, where no format of `jq.read` is theirs
+    # Of its files, where no format of `jq.read` is theirs. For firmwares that are registered: those
+    # of the package are not imported before a file is recognised, so theirs are in `formats`.
+    reader: Reader | None = None
 
 
 def hold_by_rate(log: Log, name: str) -> tuple[float | None, tuple[str, ...]]:

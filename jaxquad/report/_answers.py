@@ -7,7 +7,15 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxquad.excitation import three_two_one_one
-from jaxquad.identify import as_sampled, Fit, MISFIT, model_response, Verification, with_values
+from jaxquad.identify import (
+    as_sampled,
+    Fit,
+    GOOD_TIC,
+    MISFIT,
+    model_response,
+    Verification,
+    with_values,
+)
 from jaxquad.plot import COHERENT
 from jaxquad.records import Record
 from jaxquad.spectra import FrequencyResponse
@@ -16,7 +24,6 @@ from ._page import Section
 
 
 Grid = Float[np.ndarray, " frequencies"]
-GOOD_TIC = 0.25  # Theil inequality coefficient, below which agreement is good
 _LOOSE = 0.2  # half of a 95 % interval over the value: CIFER's Cramer-Rao guideline of 20 %
 _AIM = 0.8  # coherence that a flight is planned for
 _FAINT = 0.2  # coherence below which its estimate says nothing

@@ -11,20 +11,15 @@ import numpy as np
 
 import jaxquad.plot as plot
 from jaxquad._core import write_file
-from jaxquad.identify import Combination, Fit, KnownFilter, MISFIT, Verification
+from jaxquad.identify import Combination, Fit, GOOD_TIC, KnownFilter, MISFIT, Verification
 from jaxquad.models import Model
 from jaxquad.plot import COHERENT, short_names, unit_label
 from jaxquad.records import clock_start, Record, show_times
 from jaxquad.spectra import find_line, FrequencyResponse
 
-from ._answers import answer_section, GOOD_TIC
+from ._answers import answer_section
 from ._loop import LawLoop, loop_section, step_section
-from ._numbers import (
-    identifiability_section,
-    parameter_section,
-    tuned_section,
-    verdict_headlines,
-)
+from ._numbers import identifiability_section, parameter_section, tuned_section, verdict_headlines
 from ._page import Cell, embed_figure, Headline, Image, render_page, Section, Table
 from ._results import attempt, Provenance, provenance_section
 

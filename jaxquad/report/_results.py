@@ -88,6 +88,7 @@ def verification_content(check: "Verification") -> dict[str, object]:
         "band_rad_per_s": check.band,
         "output": check.output_name,
         "unit": check.output_unit,
+        "agreement": check.verdict.kind,
         "outputs": [{"name": x.name, "unit": x.unit} | measures(x) for x in check.outputs],
     }
 

@@ -1,6 +1,7 @@
 """Numbers of a flight, added up sample by sample while it runs or from its record."""
 
 import functools as ft
+import itertools
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
@@ -155,7 +156,8 @@ class FlightMetrics(eqx.Module):
 
     def begin(self, like: Float[Array, " axes *ensemble"]) -> Sums:
         """The sums before the first sample, shaped as `like`."""
-        needed = dict.fromkeys(name for wanted in self.wanted for name in _NEEDS[wanted])
+        needs = (_NEEDS.get(wanted, (wanted,)) for wanted in self.wanted)
+        needed = dict.fromkeys(itertools.chain.from_iterable(needs))
         begins = lambda name: _OPEN if name in _TIMES else 0.0
         sums = {name: jnp.full_like(like, begins(name)) for name in needed}
         if self.from_first is not None:
@@ -174,7 +176,8 @@ class FlightMetrics(eqx.Module):
 
     def finish(self, sums: Sums) -> dict[str, Array]:
         """The wanted numbers."""
-        return {name: _FINISHED[name](self, sums) for name in self.wanted}
+        finished = lambda name: _FINISHED[name](self, sums) if name in _FINISHED else sums[name]
+        return {name: finished(name) for name in self.wanted}
 
     def count(self, first: Array | int, like: Array) -> Array:
         """The samples from `first` to the end of the window."""
@@ -285,11 +288,8 @@ def _entered(at: _Moment, time: Array, band: float) -> Array:
     return jnp.where(jnp.abs(at.progress - 1) <= band, time, _OPEN)
 
 
-_TOTALS = (
-    "itae", "iae", "ise", "energy", "activity", "peak", "saturation_share", "rms",
-    "disturbance_rmse", "overshoot",
-)  # fmt: skip
-_NEEDS = {name: (name,) for name in _TOTALS} | {
+# A number is the sum of its name in `_UPDATES`, which starts at 0 (`_OPEN` for one of `_TIMES`).
+_NEEDS: dict[str, tuple[str, ...]] = {  # of numbers that need other sums
     "activity": ("activity", "command"),
     "rise_time": ("progress", "left", "arrived"),
     "settling_time": ("progress", "settled"),
@@ -353,9 +353,8 @@ def _rms(of: FlightMetrics, sums: Sums, name: str) -> Array:
     return _only(~jnp.isnan(mean), root)
 
 
+# What is made of the sums in the end; of others the sum is the number.
 _FINISHED: dict[str, Callable[[FlightMetrics, Sums], Array]] = {
-    name: lambda of, sums, name=name: sums[name] for name in _TOTALS[:6]
-} | {
     "saturation_share": lambda of, sums: (
         sums["saturation_share"] / of.count(of.window.first, sums["saturation_share"])
     ),

@@ -33,12 +33,6 @@ if TYPE_CHECKING:
     import xarray
 
 
-NUMBERS = (
-    "itae", "iae", "ise", "overshoot", "rise_time", "settling_time", "settling_time_5", "peak",
-    "rms", "disturbance_rmse", "activity", "energy", "saturation_share",
-)  # fmt: skip
-
-
 class Spread(NamedTuple):
     """One number over an ensemble; inf where it rests on members that never get there.
 
@@ -77,6 +71,9 @@ class Summary(eqx.Module):
     saturation_share: Spread
     diverged_share: Float[Array, ""]
     members: int = eqx.field(static=True)
+
+
+NUMBERS = tuple(name for name, kind in Summary.__annotations__.items() if kind is Spread)
 
 
 def spread_of(values: Float[Array, " axes *ensemble"]) -> Spread:

@@ -17,6 +17,8 @@ from ._feedback import (
     deembed as deembed,
     feedback_bias as feedback_bias,
     FeedbackBias as FeedbackBias,
+    spectral_density as spectral_density,
+    SpectralDensity as SpectralDensity,
 )
 from ._flown_loop import (
     BrokenLoop as BrokenLoop,
@@ -30,9 +32,4 @@ from ._frequency_response import (
     frequency_response as frequency_response,
     FrequencyResponse as FrequencyResponse,
 )
-from ._welch import (
-    find_line as find_line,
-    spectral_density as spectral_density,
-    SpectralDensity as SpectralDensity,
-    SpectralLine as SpectralLine,
-)
+from ._noise import find_line as find_line, SpectralLine as SpectralLine

@@ -1,4 +1,4 @@
-"""Responses, coherence and errors from windowed transforms of one or several window lengths."""
+"""Responses, coherence and errors by averages over windows: one length, or several (Composite)."""
 
 import functools as ft
 import itertools
@@ -6,14 +6,15 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Complex, Float
+from jaxtyping import ArrayLike, Complex, Float
 
-from jaxquad._core import one_blas_thread
+from jaxquad._core import Message, one_blas_thread, require_x64
 from jaxquad.records import Record
 
 from ._error_covariance import ErrorCovariance, place_windows, window_products
 from ._estimators import (
     adjoint,
+    check_band,
     check_excitation,
     Composite,
     diagonal,
@@ -26,10 +27,24 @@ from ._estimators import (
     Responses,
     Welch,
 )
-from ._fourier_sums import coefficients
+from ._fourier_sums import (
+    coefficients,
+    fourier_sums,
+    lattice_windows,
+    Layout,
+    segment_starts,
+    Taper,
+)
 from ._frequency_response import Estimate
-from ._noise import covariance_of_windows, noise_root, padded, Resolved, smoothed, without_leakage
-from ._welch import frequencies_for, transform_records
+from ._noise import (
+    covariance_of_windows,
+    noise_root,
+    padded,
+    Resolved,
+    shows_leakage,
+    smoothed,
+    without_leakage,
+)
 
 
 _ROUNDING = 1e-14  # of a Fourier sum, relative to the largest value summed
@@ -176,6 +191,117 @@ def combine(parts: Conditioned, scales: Counts, freedom: Counts, resolved: Resol
         np.minimum(r**2 / (a * b) * level, moved),
         np.moveaxis(share, 0, -1),
     )
+
+
+class Slopes(NamedTuple):
+    """Transforms behind the derivatives of the windows of one length."""
+
+    first: Complex[np.ndarray, "frequencies _ channels"]  # derivative: inputs, then outputs
+    second: Complex[np.ndarray, "frequencies _ inputs"]
+
+
+class Segments(NamedTuple):
+    """Transforms by `Record.names` for each length, in absolute phase; records have gaps."""
+
+    transforms: tuple[Complex[np.ndarray, "frequencies windows channels"], ...]
+    slopes: tuple[Slopes, ...]  # empty where they are not needed, or nothing follows from them
+    groups: Layout
+
+
+def transform_records(
+    records: Sequence[Record], omega: Grid, members: Sequence[Welch], *, derivatives: int = 0
+) -> Segments:
+    """Transform all channels of all records; no window spans two records.
+
+    With two `derivatives`, behind those of the windows too, from the first length on whose windows
+    can tell leakage from noise: the first on inputs and outputs, the second on inputs.
+    """
+    require_x64("a frequency response")
+    first, welch, dt = records[0], members[0], records[0].dt
+    # A single window keeps its length to the sample; several share blocks of samples.
+    lengths = tuple(member.length(records) for member in members)
+    samples = [record.samples - welch.integrators for record in records]
+    if len(members) == 1:
+        n, overlap = lengths[0], welch.overlap
+        layouts = [((n, segment_starts(count, n, overlap)),) for count in samples]
+    else:
+        options = welch.overlap, float(np.max(omega)) * dt
+        lengths = tuple(n for n, _ in lattice_windows(min(samples), lengths, *options))
+        layouts = [lattice_windows(count, lengths, *options) for count in samples]
+    inputs = len(first.input_names)
+    last = inputs + len(first.output_names)
+    counts = [sum(len(mine) for _, mine in groups) for groups in zip(*layouts, strict=True)]
+    enough = [shows_leakage(count, inputs) for count in counts]
+    start = enough.index(True) if any(enough) else len(counts)
+    shape = welch.shape
+    slopes = Taper(f"{shape}'", last, start), Taper(f"{shape}''", inputs, start)
+    tapers = Taper(shape, len(first.names)), *slopes[:derivatives]
+    n, late, angle = welch.integrators, int(round(welch.delay / dt)), omega * dt
+    factor = np.ones((omega.size, 1, len(first.names)), complex)
+    recolour = np.exp(-1j * (late + n // 2) * angle) / (1 - np.exp(-1j * angle)) ** n
+    factor[:, :, inputs:last] = recolour[:, None, None]
+    parts, starts, origin = [], [[] for _ in members], 0
+    for record, layout in zip(records, layouts, strict=True):
+        # The outputs differenced, and earlier by the delay.
+        outputs = np.diff(record.outputs, n, axis=0)
+        if late:
+            outputs = np.concatenate([outputs[late:], np.repeat(outputs[-1:], late, axis=0)])
+        # A difference delays by n/2 samples, and the window would act on it like on any delay.
+        centre = slice(n - n // 2, record.samples - n // 2)
+        columns = record.inputs[centre], outputs, record.references[centre]
+        options = {"detrend": welch.detrend, "origin": float(origin)}
+        transforms, *derived = fourier_sums(columns, angle, layout, tapers, **options)
+        if n or late:
+            transforms = [part * factor for part in transforms]
+        parts.append([transforms, *derived])
+        for mine, (_, local) in zip(starts, layout, strict=True):
+            mine += [origin + place for place in local]
+        origin += record.samples + max(length for length, _ in layout)
+    groups = tuple((n, tuple(mine)) for (n, _), mine in zip(layouts[0], starts, strict=True))
+
+    def side_by_side(part: Sequence[np.ndarray]) -> np.ndarray:
+        """The windows of all records, as neighbours in memory."""
+        rows = [np.swapaxes(x, 1, 2) for x in part]
+        return np.swapaxes(rows[0] if len(rows) == 1 else np.concatenate(rows, axis=2), 1, 2)
+
+    joined, *slopes = (
+        tuple(side_by_side(part) for part in zip(*lengths, strict=True))
+        for lengths in zip(*parts, strict=True)
+    )
+    none = Slopes(np.zeros((0, 0, 0), complex), np.zeros((0, 0, 0), complex))
+    derived = tuple(map(Slopes, *slopes)) if derivatives else ()
+    return Segments(joined, (none,) * (len(joined) - len(derived)) + derived, groups)
+
+
+def frequencies_for(
+    omega: Float[ArrayLike, " frequencies"] | float | int | None,
+    records: Sequence[Record],
+    welch: Welch,
+) -> Grid:
+    """`omega` or the default of `welch`, rad/s; `ValueError` where the window is too short."""
+    length, dt = welch.length(records), records[0].dt
+    seconds = length * dt
+    if omega is None:
+        # Below three cycles in a window, leakage exceeds the random error of a good record.
+        if length <= 30:
+            raise ValueError(
+                Message(
+                    f"a window of {length} samples is too short for frequencies up to a tenth of "
+                    "the sample rate: use a longer window («window_length=»)«, or give the "
+                    "frequencies (omega=)»"
+                )
+            )
+        return np.geomspace(6 * np.pi / seconds, 2 * np.pi / (10 * dt), 100)
+    omega = np.atleast_1d(np.asarray(omega, dtype=float))
+    check_band(omega, dt)
+    lowest = 2 * np.pi / seconds
+    if omega[0] < 0.999 * lowest:
+        raise ValueError(
+            f"{in_hertz(omega[:1])} is below the lowest frequency that the window of "
+            f"{seconds:.4g} s resolves, {lowest:.4g} rad/s (one cycle). Raise it, or use a window "
+            f"longer than {2 * np.pi / omega[0]:.4g} s"
+        )
+    return omega
 
 
 @one_blas_thread()

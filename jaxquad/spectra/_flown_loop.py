@@ -8,11 +8,7 @@ from jaxtyping import Bool, Complex, Float
 from jaxquad._core import Message
 from jaxquad.records import Record
 
-from ._estimators import (
-    COHERENT,
-    Grid,
-    Response,
-)
+from ._estimators import COHERENT, Grid, Response
 
 
 _LINES = 40  # frequencies, log-spaced

@@ -147,15 +147,14 @@ def fourier_sums(
         [np.empty((angle.size, taper.channels, len(s)), complex) for _, s in windows[taper.first :]]
         for taper in tapers
     ]
-    long = [group for group in windows if group[0] >= _SHORT]
-    blocks = _share_blocks(samples, angle, long) if long else None
-    placed = [_place_windows(blocks, *group) for group in long] if blocks else []
+    long = tuple(group for group in windows if group[0] >= _SHORT)
+    blocks = _share_blocks(samples, tuple(angle.tolist()), long) if long else None
     trends = _TRENDS.index(detrend)
-    running = [_Channel(row, blocks, placed, trends) for row in rows] if blocks else []
+    running = _Running(rows, blocks, long, trends) if blocks else None
     for number, (length, starts) in enumerate(windows):
         mine = [(t.shape, part[number - t.first]) for t, part in zip(tapers, sums, strict=True)
                 if t.first <= number]  # fmt: skip
-        if blocks is None or length < _SHORT:
+        if running is None or length < _SHORT:
             start = np.array(starts)
             segments = np.lib.stride_tricks.sliding_window_view(rows, length, axis=1)[:, start]
             if trends:
@@ -167,11 +166,8 @@ def fourier_sums(
             for shape, part in mine:
                 tapered = segments[: part.shape[1]] * window(shape, length)
                 part[...] = _from_middle(tapered, angle) * middle
-            continue
-        part = _place_windows(blocks, length, starts)
-        for c, channel in enumerate(running):
-            few = [(shape, sums[:, c]) for shape, sums in mine if c < sums.shape[1]]
-            channel.sum_windows(part, few)
+        else:
+            running.sum_windows(_place_windows(running.shared, length, starts), mine)
     if origin:
         turn = np.exp(-1j * origin * angle)[:, None, None]
         for part in (part for parts in sums for part in parts):
@@ -189,10 +185,11 @@ class _Blocks(NamedTuple):
     reach: float  # rad per sample, of the shifted frequencies
 
 
-def _share_blocks(samples: int, angle: Grid, windows: Sequence) -> _Blocks:
-    """Blocks of about 50 rad, at whose ends as many windows as possible begin and end."""
+@ft.lru_cache(maxsize=16)
+def _share_blocks(samples: int, angle: tuple[float, ...], windows: Layout) -> _Blocks:
+    """Blocks of about 130 rad, at whose ends as many windows as possible begin and end."""
     highest = float(np.max(np.abs(angle)))
-    ideal = int(np.clip(50 / max(highest, 1e-9), *_BLOCKS))
+    ideal = int(np.clip(130 / max(highest, 1e-9), *_BLOCKS))
     origin = windows[0][1][-1]
     steps = [[length, *np.array((*starts[1:], origin)) - origin] for length, starts in windows]
     common = int(np.gcd.reduce(np.concatenate(steps).astype(int)))
@@ -200,7 +197,7 @@ def _share_blocks(samples: int, angle: Grid, windows: Sequence) -> _Blocks:
     size = min(fitting, key=lambda n: abs(np.log(n / ideal)), default=ideal)
     lead = -origin % size if fitting else 0
     reach = highest + 2 * np.pi / min(length for length, _ in windows)
-    return _Blocks(size, lead, -(-(lead + samples) // size), tuple(angle.tolist()), reach)
+    return _Blocks(size, lead, -(-(lead + samples) // size), angle, reach)
 
 
 @ft.lru_cache(maxsize=8)
@@ -224,12 +221,14 @@ class _Waves(NamedTuple):
     phase: Complex[np.ndarray, "waves blocks"]  # at the blocks' middles
 
     def sums(
-        self, even: np.ndarray, odd: np.ndarray, blocks: slice | np.ndarray
-    ) -> Complex[np.ndarray, "waves blocks"]:
+        self, coefficients: Sequence[np.ndarray], blocks: slice | np.ndarray
+    ) -> Complex[np.ndarray, "waves channels blocks"]:
         """Fourier sums of blocks with these coefficients."""
-        sums = np.empty((len(self.even), even.shape[1]), complex)
-        sums.real, sums.imag = self.even @ even, self.odd @ odd
-        sums *= self.phase[:, blocks]
+        even, odd = (part.reshape(len(part), -1) for part in coefficients)
+        sums = np.empty((len(self.even), *coefficients[0].shape[1:]), complex)
+        sums.real = (self.even @ even).reshape(sums.shape)
+        sums.imag = (self.odd @ odd).reshape(sums.shape)
+        sums *= self.phase[:, None, blocks]
         return sums
 
 
@@ -276,78 +275,83 @@ def _place_windows(blocks: _Blocks, length: int, starts: tuple[int, ...]) -> _Wi
     return _Windows(length, start, shift, ends, turn, middle, place, part, inside, first, last)
 
 
-class _Channel:
-    """One channel's blocks, their coefficients, and its sums without a taper."""
+class _Running:
+    """The blocks of all channels, their coefficients, and their sums without a taper."""
 
-    def __init__(self, row: np.ndarray, blocks: _Blocks, windows: Sequence[_Windows], trends: int):
-        self.row, self.shared, self.trends = row, blocks, trends
-        padded = np.zeros(blocks.count * blocks.size)
-        padded[blocks.lead : blocks.lead + row.size] = row
-        self.blocks = padded.reshape(blocks.count, blocks.size)
-        functions = _block_functions(blocks.size, blocks.reach)
-        self.coefficients = [function.T @ self.blocks.T for function in functions]
-        self.edges = np.unique(np.concatenate([part.place for part in windows]))
-        self.still = self._running(_block_waves(blocks, 0.0), self.edges)
+    def __init__(self, rows: np.ndarray, blocks: _Blocks, windows: Layout, trends: int):
+        self.rows, self.shared, self.trends = rows, blocks, trends
+        padded = np.zeros((len(rows), blocks.count * blocks.size))
+        padded[:, blocks.lead : blocks.lead + rows.shape[1]] = rows
+        self.blocks = padded.reshape(len(rows), blocks.count, blocks.size)
+        self.coefficients = self._compress(self.blocks)
+        placed = [_place_windows(blocks, *group).place for group in windows]
+        self.edges = np.unique(np.concatenate(placed))
+        self.still = self._sums_to(self.edges, _block_waves(blocks, 0.0))
 
     def sum_windows(self, windows: _Windows, into: Sequence[tuple[str, np.ndarray]]) -> None:
-        """Fill in the sums behind each taper, by frequency and window."""
+        """Fill in the sums behind each taper, by frequency, channel and window."""
         still, below, above = self._plain(windows)
         below, above = below * windows.turn.conj(), above * windows.turn
         both, odd = below + above, 0.5j * (below - above)
         trends = self._trends(windows)
         for shape, sums in into:
             level, cosine, sine = waves(shape)
-            np.multiply(both, -cosine / 2, out=sums)
+            few = slice(sums.shape[1])
+            np.multiply(both[:, few], -cosine / 2, out=sums)
             if level:
-                sums += level * still
+                sums += level * still[:, few]
             if sine:
-                sums += sine * odd
+                sums += sine * odd[:, few]
             if self.trends:
                 angle = self.shared.angle
                 of_trends = _trend_sums(angle, windows.length, shape, self.trends)
-                sums -= of_trends @ trends * windows.middle
+                sums -= np.tensordot(of_trends, trends[:, few], 1) * windows.middle[:, None]
 
-    def _running(self, waves: _Waves, edges: np.ndarray) -> Complex[np.ndarray, "waves edges"]:
+    def _compress(self, blocks: np.ndarray) -> list[Float[np.ndarray, "rank channels blocks"]]:
+        flat = blocks.reshape(-1, self.shared.size).T
+        functions = _block_functions(self.shared.size, self.shared.reach)
+        return [(part.T @ flat).reshape(-1, *blocks.shape[:2]) for part in functions]
+
+    def _sums_to(
+        self, edges: np.ndarray, waves: _Waves
+    ) -> Complex[np.ndarray, "waves channels edges"]:
         """Sums from the first of these blocks to before each of them."""
-        running, count = np.zeros((len(waves.even), edges.size), complex), edges.size - 1
-        even, odd = self.coefficients
-        groups = min(-(-(edges[-1] - edges[0]) // _AT_ONCE), count)
+        channels, count = len(self.rows), edges.size - 1
+        running = np.zeros((len(waves.even), channels, edges.size), complex)
+        groups = min(-(-channels * (edges[-1] - edges[0]) // _AT_ONCE), count)
         for few in np.array_split(np.arange(count), groups) if count else ():
             used = slice(edges[few[0]], edges[few[-1] + 1])
-            sums = waves.sums(even[:, used], odd[:, used], used)
-            running[:, few + 1] = np.add.reduceat(sums, edges[few] - used.start, axis=1)
-        return np.cumsum(running, axis=1)
+            sums = waves.sums([part[:, :, used] for part in self.coefficients], used)
+            running[:, :, few + 1] = np.add.reduceat(sums, edges[few] - used.start, axis=2)
+        return np.cumsum(running, axis=2)
 
-    def _plain(self, windows: _Windows) -> Complex[np.ndarray, "3 frequencies windows"]:
+    def _plain(self, windows: _Windows) -> Complex[np.ndarray, "3 frequencies channels windows"]:
         """Sums without a taper: at all frequencies, and at these less and plus the shift."""
         still, shifted = (_block_waves(self.shared, d) for d in (0.0, windows.shift))
         edges, step = np.unique(windows.place, return_inverse=True)
-        moving = self._running(shifted, edges)[:, step]
-        running = np.concatenate(
-            [self.still[:, np.searchsorted(self.edges, windows.place)], moving]
-        )
+        at_rest = self.still[:, :, np.searchsorted(self.edges, windows.place)]
+        running = np.concatenate([at_rest, self._sums_to(edges, shifted)[:, :, step]])
         if windows.part.size:
             place = windows.place[windows.part]
-            samples = (self.blocks[place] * windows.inside).T
-            functions = _block_functions(self.shared.size, self.shared.reach)
-            even, odd = (function.T @ samples for function in functions)
-            parts = [wave.sums(even, odd, place) for wave in (still, shifted)]
-            running[:, windows.part] += np.concatenate(parts)
-        plain = running[:, windows.last] - running[:, windows.first]
-        return plain.reshape(3, -1, windows.start.size)
+            parts = self._compress(self.blocks[:, place] * windows.inside)
+            sums = [wave.sums(parts, place) for wave in (still, shifted)]
+            running[:, :, windows.part] += np.concatenate(sums)
+        plain = running[:, :, windows.last] - running[:, :, windows.first]
+        return plain.reshape(3, -1, *plain.shape[1:])
 
-    def _trends(self, windows: _Windows) -> Float[np.ndarray, "trends windows"]:
+    def _trends(self, windows: _Windows) -> Float[np.ndarray, "trends channels windows"]:
         """Mean and slope of each window."""
-        length, ends, row = windows.length, windows.ends, self.row[: windows.ends[-1]]
-        parts = []
+        length, ends, middle = windows.length, windows.ends, self.rows.shape[1] / 2
+        parts, moment = [], self.rows[:, : ends[-1]]
         for k in range(self.trends):
-            moment = row * (np.arange(row.size) - self.row.size / 2) if k else row
-            running = np.append(0.0, np.cumsum(np.add.reduceat(moment, ends[:-1])))
-            parts.append(running[windows.last] - running[windows.first])
+            moment = moment * (np.arange(ends[-1]) - middle) if k else moment
+            running = np.cumsum(np.add.reduceat(moment, ends[:-1], axis=1), axis=1)
+            running = np.pad(running, ((0, 0), (1, 0)))
+            parts.append(running[:, windows.last] - running[:, windows.first])
         if self.trends > 1:
-            middle = windows.start + (length - 1) / 2 - self.row.size / 2
-            parts[1] = (parts[1] - parts[0] * middle) * 12 / (length * (length**2 - 1.0))
-        return np.stack([parts[0] / length, *parts[1:]]) if parts else np.zeros((0, 1))
+            centre = windows.start + (length - 1) / 2 - middle
+            parts[1] = (parts[1] - parts[0] * centre) * 12 / (length * (length**2 - 1.0))
+        return np.stack([parts[0] / length, *parts[1:]]) if parts else np.zeros((0, 1, 1))
 
 
 @ft.lru_cache(maxsize=32)

@@ -14,16 +14,7 @@ from jaxquad._core import Message
 from jaxquad.records import Record
 
 from ._error_covariance import ErrorCovariance
-from ._estimators import (
-    adjoint,
-    Covariances,
-    diagonal,
-    Grid,
-    Levels,
-    Method,
-    Periodic,
-    Remark,
-)
+from ._estimators import adjoint, Covariances, diagonal, Grid, Levels, Method, Periodic, Remark
 from ._frequency_response import Distortion, Estimate
 from ._noise import smooth_noise, smoothed
 

@@ -77,8 +77,10 @@ class Quantity(NamedTuple):
         return f"{number:.4g}{' ' + self.unit if unit and self.unit else ''}"
 
 
-# To add one: an entry here, and a number of that name from what computes it, which is
-# `jaxquad.simulation.FlightMetrics` for a flight, `jaxquad.loops.LoopNumbers` for a linear loop.
+# To add one: an entry here, and a number of that name from what computes it. Of a flight: a sum in
+# `_UPDATES` of simulation/_flight_metrics.py, with a field, row and unit in simulation/_metrics.py.
+# Of a linear loop: in `numbers_of` and `NUMBERS` of loops/_analysis.py, with a field of
+# `LoopAnalysis` and of `LoopNumbers`.
 QUANTITIES = {
     "itae": Quantity("ITAE", "deg s^2", _DEGREE, si_unit="rad s^2", summed=True),
     "iae": Quantity("IAE", "deg s", _DEGREE, si_unit="rad s", summed=True),

@@ -17,8 +17,8 @@ from jaxquad.simulation import Scenario
 
 from ._certificate import Certificate
 from ._certify import certify
+from ._descent import LBFGS
 from ._design_result import DesignResult, summarise_design
-from ._lbfgs import LBFGS
 from ._objective import Limit, Objective, Penalty, QUANTITIES
 from ._problem import build_design, DeviceChoice
 from ._tuner import Tuner

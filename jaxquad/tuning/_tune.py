@@ -17,11 +17,20 @@ from jaxquad.simulation import Scenario
 
 from ._certificate import Certificate, lag_remark
 from ._certify import certify
-from ._cost import Evaluation, Listener, stack_copies
+from ._cost import (
+    ADDED,
+    Beyond,
+    Evaluation,
+    GUARDS,
+    Listener,
+    rank_beyond,
+    stack_copies,
+    Tail,
+    take_members,
+)
 from ._design_result import certified_members
 from ._objective import Limit, Objective, QUANTITIES
 from ._problem import Bound, build_design, DeviceChoice
-from ._tail import ADDED, Beyond, GUARDS, rank_beyond, Tail, take_members
 from ._tuner import Method, Tuner
 from ._verdict import covers, Verdict, with_further
 

@@ -12,7 +12,6 @@ import numpy as np
 from jaxquad._core import announce, marked_text, Message
 from jaxquad.autopilot import (
     ADRCAutopilot,
-    ADRCTargets,
     AutopilotProposal,
     AxesProposal,
     betaflight_adrc_loop,
@@ -243,13 +242,9 @@ def _tune_adrc(
             if again[doubted].kind == "not flown":
                 why = f"this log cannot tell: at {doubted:.2f} throttle {why}"
             return dataclasses.replace(result, verdict=why)
-        targets = ADRCTargets(
-            sensitivity=settings.sensitivity, resonance=settings.resonance, noise=settings.noise,
-            change=settings.change,
-        )  # fmt: skip
         design = propose_adrc(
             plant, flown, result.axis, hover=settings.hover, members=settings.members,
-            fresh=settings.fresh, seed=settings.seed, targets=targets,
+            fresh=settings.fresh, seed=settings.seed, targets=settings,
         )  # fmt: skip
     except UndeterminedError as error:
         return unsure(error)

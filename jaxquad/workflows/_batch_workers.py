@@ -17,6 +17,7 @@ import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from itertools import islice
+from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from pathlib import Path
@@ -24,6 +25,7 @@ from typing import Any, NamedTuple
 
 from jaxquad._core import is_ours, write_file
 
+from ._result_file import read_json
 from ._settings import IdentifySettings
 
 
@@ -121,7 +123,7 @@ def failure(error: str) -> Content:
 def stored_result(job: Job) -> Content | None:
     """The result of an earlier run, or None; one that cannot be read counts as none."""
     try:
-        content = json.loads(job.stored.read_text())
+        content = read_json(job.stored)
     except (OSError, ValueError):
         return None
     return content if isinstance(content, dict) and content.get("key") == job.key else None
@@ -164,6 +166,20 @@ _NARROW = {  # Each process has one core: more threads would only wait for each 
 }
 
 
+@contextlib.contextmanager
+def _without_interrupts() -> Iterator[None]:
+    """A process that starts within it never gets the interrupt that ends this one."""
+    if not hasattr(signal, "pthread_sigmask"):  # Windows
+        yield
+        return
+    resource_tracker.ensure_running()  # which would let interrupts in
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
 class _Worker:
     def __init__(self, work: Work, timeout: float | None):
         self.timeout, self.due = math.inf if timeout is None else timeout, math.inf
@@ -172,7 +188,8 @@ class _Worker:
         missing = {name: text for name, text in _NARROW.items() if name not in os.environ}
         os.environ.update(missing)  # what the user set stays
         try:
-            self.process.start()
+            with _without_interrupts():
+                self.process.start()
         finally:
             for name in missing:
                 os.environ.pop(name, None)

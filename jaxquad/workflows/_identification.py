@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxquad._core import announce, marked_text, Message
+from jaxquad._core import announce, marked_text, Message, staged_files
 from jaxquad.identify import (
     Bands,
     Combination,
@@ -46,6 +46,7 @@ if TYPE_CHECKING:
 
 
 Model = LaggedIntegrator | TransferFunction
+_FIGURES = ("record.png", "bode.png", "verification.png")
 HALVES, EXPLAINED = "Lower and upper half of the band", "What explains the misfit"
 
 
@@ -264,7 +265,6 @@ class Identification:
             numbers = vars(fit.model).items()
             plain = {k: v if isinstance(v, int) else np.asarray(v).tolist() for k, v in numbers}
             extra["model"] = {"kind": type(fit.model).__name__} | plain
-        path = write_results(folder, fit=fit, frf=self.frf, check=self.check, extra=extra)
         from jaxquad.report import write_report  # here: with it comes matplotlib
 
         def title(record: Record) -> str:
@@ -272,28 +272,32 @@ class Identification:
             span = f"t = {show_times(record.time[0], record.time[-1], start=start)}"
             return f"{Path(record.source).name}, {span}" if self.more else span
 
-        write_report(
-            folder / "report.html", fit=fit, frf=self.frf, others=self._other_responses,
-            record={title(record): record for record in self.records},
-            spectrum=self._record_with_throttle(),
-            checks={} if self.check is None else {Path(sources[-1]).name: self.check},
-            derived=self.combinations, provenance=origin, filters=self.filters,
-            law=self._law_if_any(), texts=self.supplements,
-            formula="; ".join(filter(None, (self.formula, self.filters_text))),
-        )  # fmt: skip
-        for earlier in (folder / "verification.png", *folder.glob("record_*.png")):
-            if earlier.name not in self.figure_names:
+        drawn = []
+        with staged_files(folder) as draft:
+            path = write_results(draft, fit=fit, frf=self.frf, check=self.check, extra=extra)
+            write_report(
+                draft / "report.html", fit=fit, frf=self.frf, others=self._other_responses,
+                record={title(record): record for record in self.records},
+                spectrum=self._record_with_throttle(),
+                checks={} if self.check is None else {Path(sources[-1]).name: self.check},
+                derived=self.combinations, provenance=origin, filters=self.filters,
+                law=self._law_if_any(), texts=self.supplements,
+                formula="; ".join(filter(None, (self.formula, self.filters_text))),
+            )  # fmt: skip
+            for name, draw in self.drawings().items():
+                try:
+                    draw().figure.savefig(draft / name, dpi=130)
+                    drawn.append(name)
+                except OSError:
+                    raise
+                except Exception as error:  # costs no other figure, and leaves no earlier one
+                    (draft / name).unlink(missing_ok=True)
+                    text = f"{name} could not be drawn: {reason_of(error).marked}"
+                    warnings.warn(text, PageWarning, stacklevel=2)
+        for earlier in (*folder.glob("record_*.png"), *map(folder.joinpath, _FIGURES)):
+            if earlier.name not in drawn:
                 earlier.unlink(missing_ok=True)
-        for name, draw in self.drawings().items():
-            try:
-                draw().figure.savefig(folder / name, dpi=130)
-            except OSError:
-                raise
-            except Exception as error:  # costs no other figure, and leaves no earlier one
-                (folder / name).unlink(missing_ok=True)
-                text = f"{name} could not be drawn: {reason_of(error).marked}"
-                warnings.warn(text, PageWarning, stacklevel=2)
-        return path
+        return folder / path.name
 
     def _content(self) -> dict[str, object]:
         spans = [[float(record.time[0]), float(record.time[-1])] for record in self.records]

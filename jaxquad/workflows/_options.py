@@ -109,7 +109,7 @@ class Settings:
             content = tomllib.loads(Path(path).read_text())
         except FileNotFoundError as error:
             raise SettingsError(f"{path}: there is no such file in {Path.cwd()}") from error
-        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
             raise SettingsError(f"{path}: not TOML: {error}") from error
         return cls.from_mapping(content, str(path))
 

@@ -1,6 +1,7 @@
 """Stored results as they are read again. Without JAX: a missing result is answered at once."""
 
 import json
+import os
 from collections.abc import Mapping, Sequence
 from itertools import chain, count
 from pathlib import Path
@@ -237,16 +238,29 @@ def load_tuning(path: str | Path) -> StoredTuning:
     path = Path(path)
     path = path / "tuned.json" if path.is_dir() else path
     try:
-        content = dict(json.loads(path.read_text()))
+        content = dict(read_json(path))
         settings = TuneSettings.from_mapping(content["settings"], f"{path}, settings")
         if not {"holds", "verdicts", "values", "controller"} <= content.keys():
             raise KeyError("gains or verdicts")
         return StoredTuning(path.parent, content, settings)
     except FileNotFoundError as error:
         raise ValueError(f"{path}: no such result: run jaxquad tune first") from error
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, RecursionError) as error:
         text = f"{path}: no result of this version of jaxquad tune: tune again"
         raise ValueError(text) from error
+
+
+def read_json(path: Path) -> Any:
+    """What a file holds. Raises OSError, and ValueError where that is no JSON."""
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except RecursionError as error:
+        raise ValueError("it is nested too deeply") from error
+
+
+def _file(name: str) -> Path:
+    """The file of a name in UTF-8, also where the system has other letters."""
+    return Path(os.fsdecode(name.encode("utf-8", "replace")))
 
 
 def _part(content: Mapping[str, object], key: str) -> Mapping[str, Any]:
@@ -274,7 +288,7 @@ def free_folder(
         if not path.exists():
             return True
         try:
-            content = json.loads(path.read_text())
+            content = read_json(path)
             hashes = [file["sha256"] for file in content["provenance"]["files"]]
         except (OSError, ValueError, KeyError, TypeError):
             return False
@@ -312,7 +326,7 @@ def load_result(path: str | Path) -> StoredResult:
         of_gains = path.name == "tuned" and not result.exists()
         path = path.parent / "result.json" if of_gains else result
     try:
-        content = json.loads(path.read_text())
+        content = read_json(path)
     except FileNotFoundError as error:
         raise ValueError(f"{path}: no such result: run jaxquad identify first") from error
     except ValueError as error:
@@ -327,12 +341,12 @@ def load_result(path: str | Path) -> StoredResult:
             folder=path.parent,
             content=content,
             settings=settings,
-            log=Path(content["record"]["file"]),
+            log=_file(content["record"]["file"]),
             hashes=tuple(file["sha256"] for file in files),
             band=(float(content["band_rad_per_s"][0]), float(content["band_rad_per_s"][1])),
-            more=tuple(map(Path, content["record"].get("more_files", ()))),
+            more=tuple(map(_file, content["record"].get("more_files", ()))),
         )
-    except (KeyError, IndexError, TypeError, ValueError) as error:
+    except (KeyError, IndexError, TypeError, ValueError, RecursionError) as error:
         raise ValueError(
             f"{path}: this is no result of this version of jaxquad: run jaxquad identify again"
         ) from error

@@ -7,7 +7,7 @@ import jax
 import numpy as np
 
 import jaxquad.tuning as tuning
-from jaxquad._core import announce, plain_content
+from jaxquad._core import announce, plain_content, staged_files
 from jaxquad.control import certainty_equivalence, LADRC, ScheduledLADRC
 from jaxquad.ensembles import Ensemble, LogUniform, Normal, Posterior
 from jaxquad.export import write_c_header
@@ -67,23 +67,24 @@ class Tuning:
         name = self.settings.name
         settings = {k: v for k, v in self.settings.content().items() if v is not None}
         origin = provenance(*axis.paths, settings=settings)
-        write_json(folder / "tuned.json", self.content() | {"provenance": origin.content()})
-        write_c_header(folder / f"{name}.h", tuned.controller, name=name, axes=1)
         flights = tuning.worst_flights(tuned, self.loop, self.ensemble, self.flight)
         from jaxquad.plot import certificate_figure, convergence_figure, flight, headless
         from jaxquad.report import write_report  # here: with them comes matplotlib
 
-        write_report(
-            folder / "report.html", fit=axis.fit, frf=axis.frf, record=axis.records[0],
-            tuned=tuned, flights=flights, provenance=origin, formula=axis.formula,
-        )  # fmt: skip
-        with headless():
-            figures = {"convergence.png": convergence_figure(tuned.history)}
-            if tuned.certificate is not None:
-                figures["certificate.png"] = certificate_figure(tuned.certificate)
-            figures["flight.png"] = flight(flights)
-        for file, panels in figures.items():
-            panels.figure.savefig(folder / file, dpi=130)
+        with staged_files(folder) as draft:
+            write_json(draft / "tuned.json", self.content() | {"provenance": origin.content()})
+            write_c_header(draft / f"{name}.h", tuned.controller, name=name, axes=1)
+            write_report(
+                draft / "report.html", fit=axis.fit, frf=axis.frf, record=axis.records[0],
+                tuned=tuned, flights=flights, provenance=origin, formula=axis.formula,
+            )  # fmt: skip
+            with headless():
+                figures = {"convergence.png": convergence_figure(tuned.history)}
+                if tuned.certificate is not None:
+                    figures["certificate.png"] = certificate_figure(tuned.certificate)
+                figures["flight.png"] = flight(flights)
+            for file, panels in figures.items():
+                panels.figure.savefig(draft / file, dpi=130)
         files = ("tuned.json", f"{name}.h", "report.html", *figures)
         return [folder / file for file in files]
 

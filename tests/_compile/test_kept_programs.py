@@ -62,6 +62,22 @@ def test_a_program_is_found_again_without_tracing(traced):
     assert first["wc"] == again["wc"] and np.array_equal(first["values"], again["values"])
 
 
+@pytest.mark.parametrize("folder", [True, False])
+def test_loaded_programs_are_bounded(folder, traced, monkeypatch):
+    if not folder:
+        monkeypatch.setattr(_programs, "_folder", lambda: None)
+    monkeypatch.setattr(_programs, "_MOST_LOADED", 3)
+    functions = [kept(traced), kept(traced)]
+    for length in (*range(2, 9), 2):
+        for function in functions:
+            result = function(ARGUMENTS[0], jnp.arange(float(length)))
+            np.testing.assert_array_equal(result["values"], 10 * np.arange(length) ** 2.0)
+    leaves, structure = jax.tree.flatten(ARGUMENTS)
+    _, others = _programs._arrays_and_others(leaves)
+    programs = [function.of(structure, others) for function in functions]
+    assert sum(len(x._compiled) + x.plain._cache_size() for x in programs) <= 3
+
+
 def filled(arrays):
     """ARGUMENTS with other arrays."""
     leaves, structure = jax.tree.flatten(ARGUMENTS)
@@ -141,7 +157,7 @@ def test_a_damaged_file_is_compiled_anew(traced, tmp_path):
     kept(traced)(*ARGUMENTS)
     [path] = tmp_path.iterdir()
     path.write_bytes(path.read_bytes()[:100])
-    with pytest.warns(UserWarning, match="compiled anew"):
+    with pytest.warns(UserWarning, match="compiled again"):
         assert kept(traced)(*ARGUMENTS)["wc"] == 10.0
     assert kept(traced)(*ARGUMENTS)["wc"] == 10.0
     assert len(traced) == 2

@@ -57,12 +57,3 @@ def test_a_failure_while_it_runs_is_told_in_its_own_words_and_once(caplog):
     with pytest.raises(eqx.EquinoxRuntimeError, match="x is below 0"):
         checked(-ONES)
     assert not caplog.records
-
-
-def test_programs_of_many_shapes_are_dropped_before_memory_maps_run_out(monkeypatch):
-    monkeypatch.setattr("jaxquad._compile._programs._MOST_SHAPES", 3)
-    traced = []
-    program = Jit(lambda x: (traced.append(len(x)), jnp.sin(x))[1])
-    for samples in (1, 2, 3, 3, 4, 4, 1):
-        np.testing.assert_allclose(program(jnp.ones(samples)), np.sin(np.ones(samples)))
-    assert traced == [1, 2, 3, 3, 4, 1]  # the first call after the third shape begins anew

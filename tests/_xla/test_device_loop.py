@@ -12,9 +12,9 @@ import pytest
 from cuda_on_host import for_cuda, run_on_host
 
 from jaxquad._xla import (
-    _kernel_memory,
+    _cuda,
     _loop,
-    _nvrtc,
+    _passes,
     _switch,
     scan_on_device,
 )
@@ -99,7 +99,7 @@ def test_values_and_gradients_are_those_of_the_plain_scan(memory, monkeypatch):
     if "registers" in memory:
         monkeypatch.setattr(_loop, "_HELD", 0)
         reverse = written(jax.grad(lambda *args: total(kernel, *args)[0], range(5)), *given())[1]
-        assert all(f"held[{k * _kernel_memory.BLOCK}]" in reverse for k in range(20))
+        assert all(f"held[{k * _passes.BLOCK}]" in reverse for k in range(20))
         assert ("again_float64 = " in reverse) == ("much" in memory)
     both = [jax.value_and_grad(ft.partial(total, scan), argnums=range(5), has_aux=True)
             for scan in (kernel, plain)]  # fmt: skip
@@ -140,7 +140,7 @@ def written(function, *args):
     """The texts of its kernels, in CUDA C."""
     texts = []
     with pytest.MonkeyPatch.context() as patch, _switch.device_kernels("forced"):
-        patch.setattr(_kernel_memory, "launch", ft.partial(_launched, texts))
+        patch.setattr(_passes, "launch", ft.partial(_launched, texts))
         jax.jit(function).lower(*args)
     return texts
 
@@ -354,9 +354,9 @@ def test_a_step_of_too_many_arrays_is_left_to_the_plain_scan_and_said():
 
 def test_what_nvrtc_does_not_compile_runs_as_a_plain_scan_with_a_warning(monkeypatch):
     def fails(*_):
-        raise _nvrtc.CannotCompile("line 7: error")
+        raise _cuda.CannotCompile("line 7: error")
 
-    monkeypatch.setattr(_kernel_memory, "launch", fails)
+    monkeypatch.setattr(_passes, "launch", fails)
     x = jnp.asarray(0.7)
     with pytest.warns(UserWarning, match="line 7"):
         found = compiled(jax.grad(ft.partial(squared, kernel)), x)
@@ -364,9 +364,9 @@ def test_what_nvrtc_does_not_compile_runs_as_a_plain_scan_with_a_warning(monkeyp
 
 
 def test_without_nvrtc_it_is_said_what_brings_it(monkeypatch):
-    monkeypatch.setattr(_nvrtc, "_places", lambda: iter(["no such library"]))
-    with pytest.raises(_nvrtc.CannotCompile, match="pip install"):
-        _nvrtc._library.__wrapped__()
+    monkeypatch.setattr(_cuda, "_places", lambda: iter(["no such library"]))
+    with pytest.raises(_cuda.CannotCompile, match="pip install"):
+        _cuda._library.__wrapped__()
 
 
 def test_without_a_gpu_no_loop_is_given_to_one():

@@ -6,16 +6,15 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from jaxquad.autopilot import ArduPilotRate, FilterChain, firmware_named
-from jaxquad.autopilot._parameters import gains_of
-from jaxquad.autopilot._rate_loops import (
-    cells_of,
+from jaxquad.autopilot import (
+    ArduPilotRate,
+    certify_angle,
     delay_margin,
+    FilterChain,
+    firmware_named,
     hold_plants,
-    law_paths,
     RateLoops,
 )
-from jaxquad.autopilot._stages import certify_angle
 
 
 DT, GAIN, LAG = 1 / 400, 80.0, 0.03
@@ -82,11 +81,8 @@ def test_the_angle_loop_is_stable_up_to_the_gain_at_which_a_simulated_one_is():
     )
     angle = firmware_named("ardupilot").angle_loop({"ATC_ANG_RLL_P": "4.5"}, 0, DT, levelled=False)
     assert angle is not None and angle.closed and angle.unit * angle.value == 4.5
-    back, ahead = law_paths(law, 0, OMEGA)
     plants = hold_plants(column(GAIN), column(LAG), column(0.0), OMEGA, DT)
-    ones = np.ones(OMEGA.size, complex)
-    loops = RateLoops(OMEGA, back, ahead, plants, cells_of(OMEGA), ones, angle=angle.path(OMEGA))
-    assert gains_of(law, 0).tolist() == GAINS.tolist()
+    loops = RateLoops.of(law, 0, plants, OMEGA, angle=angle)
     stable = lambda value: certify_angle(loops, GAINS, angle, value).stable == 1
     low, high = 1.0, 200.0
     assert stable(low) and not stable(high)

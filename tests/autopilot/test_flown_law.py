@@ -12,10 +12,12 @@ from sweep_logs import write_sweep
 from jaxquad._core import Message
 from jaxquad.autopilot import (
     best_filters,
+    BetaflightPID,
     Butterworth,
     FilterChain,
     FlightChannels,
     FlownLaw,
+    FlownLoop,
     loop_of_law,
     Notch,
     PT1,
@@ -146,19 +148,18 @@ def test_notches_that_follow_the_motors_are_divided_out_as_measured():
     for section in whole.sections():
         b0, b1, a1, b2, a2 = (0.0 if x is None else float(x) for x in section)
         rate = np.asarray(lfilter([b0, b1, b2], [1.0, a1, a2], rate))
-    names, hidden = (
-        ("gyroADC[0]", "gyroUnfilt[0]"),
-        (Message("3 RPM notches per motor on the gyro: x", "notch"),),
-    )
+    names = ("gyroADC[0]", "gyroUnfilt[0]")
+    law = BetaflightPID(p=45, i=80, d=30, gyro=known, dt=1e-3)
+    hidden = FlownLoop(law, (Message("3 RPM notches per motor on the gyro: x", "notch"),))
     flight = FlightChannels(
         (rate,), 1e-3, 0 * rate, unfiltered=(raw,), unfiltered_dt=1e-3, names=names
     )
-    [measured], text = best_filters((known,), hidden, flight, 0)
+    [measured], text = best_filters(hidden, flight, 0)
     assert text.startswith("the gyro's filters are divided out, measured: gyroADC[0] over gyroUnf")
     truth, at = np.asarray(whole.response(np.array([5.0, 10.0, 20.0]))), np.array([5.0, 10.0, 20.0])
     assert np.max(np.abs(np.asarray(measured.response(at)) / truth - 1)) < 0.01
-    same = best_filters((known,), (), flight, 0)
+    same = best_filters(FlownLoop(law), flight, 0)
     assert same[0] == (known,) and "pt1 250 Hz, are divided out" in same[1]
     still = dataclasses.replace(flight, unfiltered=(0 * raw,))
-    chains, text = best_filters((known,), hidden, still, 0)
+    chains, text = best_filters(hidden, still, 0)
     assert chains == (known,) and "3 RPM notches per motor on the gyro, which could not be" in text

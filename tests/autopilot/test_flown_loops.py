@@ -7,10 +7,10 @@ from jaxquad.autopilot import (
     ardupilot_loop,
     betaflight_loop,
     BetaflightPID,
-    change_filters,
     filter_choices,
     FilterChain,
     find_parameter,
+    firmware_named,
     flown_loop,
     predict_loop,
     px4_loop,
@@ -96,7 +96,7 @@ def test_every_option_of_a_filter_can_be_stored_and_gives_the_loop_it_describes(
             for name, value in option.parameters.items():
                 row = find_parameter(firmware, name)
                 assert row.low <= value <= row.high and (not row.integer or value == round(value))
-            changed = change_filters(firmware, values, option.parameters)
+            changed = firmware_named(firmware).change_filters(values, option.parameters)
             after = flown_loop(firmware, changed, version).law
             if choice.stage == "derivative" or option.filter is None:
                 continue

@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from jaxquad.autopilot._stages import judge
+from jaxquad.autopilot import judge
 from jaxquad.workflows import AutopilotSettings
 
 

@@ -93,7 +93,7 @@ class Kestrel(Firmware):
         p, i = (jnp.array([read.number(f"K{x}_{axis.upper()}") for axis in AXES]) for x in "PI")
         return FlownLoop(KestrelRate(p=p, i=i, d=jnp.zeros(3)))
 
-    def channels(self, prefix, axis):
+    def channels(self, prefix, axis, values):
         x = AXES[axis]
         return Channels(terms=[f"p_{x}", f"i_{x}"], output={f"u_{x}": 1.0})
 

@@ -85,7 +85,8 @@ def test_a_weak_model_is_called_so_before_its_agreement(demo, tmp_path, capsys):
     (tmp_path / "result.json").write_text(json.dumps(content))
     words = ["verify", str(tmp_path), str(demo / "demo.csv"), "--start", "5", "--stop", "40"]
     assert main([*words, "--band-rad", "4", "60"]) == 3
-    first, second, *_, last = capsys.readouterr().out.splitlines()
+    first, second, *_, last, verdict = capsys.readouterr().out.splitlines()
+    assert verdict.startswith("AGREES: ")
     assert first == "THE MODEL IS WEAK: not identifiable from this record: lag"
     assert "does not make up for that" in second
     assert last.startswith("verification on q, 4..60 rad/s (0.637..9.55 Hz): fit")

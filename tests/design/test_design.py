@@ -27,6 +27,7 @@ from jaxquad.design import (
     noise_covariance,
     optimal_multisine,
     optimal_powers,
+    PowerProblem,
     Powers,
     predict_accuracy,
 )
@@ -84,10 +85,11 @@ def plant_problem(models=1, limits=2):
 
 
 def solve(per_power, costs, criterion=D_OPTIMAL, lines=1):
-    problem = (jnp.asarray(per_power), jnp.asarray(costs))
-    options = (criterion, ("a", "b", "c"), jnp.asarray(1 / lines, dtype=float))
-    found = optimal_powers(*problem, *options)
-    proof = certify_powers(found, *problem, *options)
+    share = jnp.asarray(1 / lines, dtype=float)
+    options = (criterion, ("a", "b", "c"), share)
+    problem = PowerProblem(jnp.asarray(per_power), jnp.asarray(costs), *options)
+    found = optimal_powers(problem)
+    proof = certify_powers(found, problem)
     return np.asarray(found.power), np.asarray(proof.dispersion), float(proof.gap)
 
 
@@ -144,11 +146,12 @@ def test_the_certificate_bounds_bad_powers_too():
     per_power, costs = plant_problem(limits=1)
     best, _, _ = solve(per_power, costs)
     value = lambda p: np.linalg.slogdet(np.einsum("f,fpq->pq", p, per_power[0]))[1] / 3
-    options = (jnp.asarray(per_power), jnp.asarray(costs), DOptimal(), ("a", "b", "c"))
+    options = (DOptimal(), ("a", "b", "c"), jnp.asarray(1.0, dtype=float))
+    problem = PowerProblem(jnp.asarray(per_power), jnp.asarray(costs), *options)
     rng = np.random.default_rng(0)
     for other in rng.dirichlet(np.ones(best.size), size=5):
         bad = Powers(jnp.asarray(other), jnp.ones(1))
-        gap = float(certify_powers(bad, *options, jnp.asarray(1.0, dtype=float)).gap)
+        gap = float(certify_powers(bad, problem).gap)
         assert 0 < value(best) - value(other) < gap
 
 

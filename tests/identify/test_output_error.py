@@ -75,7 +75,7 @@ def test_a_refinement_that_stops_early_says_so_and_keeps_its_numbers_apart():
     short = refine(START, jq.Record(TIME, U, CLEAN + 0.05 * noise(1)), free=FREE, max_steps=1)
     assert fit.identifiable and not short.determined.any() and np.isfinite(short.values).all()
     assert "has not converged: the maximum of 1" in str(short)
-    assert short.verdict.remedies[0] == "take more steps (max_steps=)"
+    assert "max_steps=" in short.verdict.remedies[0]
 
 
 @pytest.mark.slow
@@ -138,7 +138,6 @@ def test_a_loop_that_may_be_closed_is_spoken_of():
     fit = refined(CLEAN + 0.05 * noise(3), references=U)
     assert any("output error is biased where feedback" in remark for remark in fit.remarks)
     assert fit.chi_squared == pytest.approx(1, abs=0.02)
-    assert any("is 1 for any model" in remark for remark in fit.remarks)
 
 
 @pytest.mark.slow

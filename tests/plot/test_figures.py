@@ -56,9 +56,9 @@ def lines(axis) -> dict[str, Any]:
 
 def test_a_bode_figure_names_its_axes_with_units(frf):
     magnitude, phase, coherence = bode(frf, {"truth": TRUTH})[:3]
-    assert magnitude.get_ylabel() == "|y0 / u0|, dB"
-    assert phase.get_ylabel() == "phase, deg"
-    assert coherence.get_xlabel() == "frequency, rad/s" and coherence.get_xscale() == "log"
+    assert "dB" in magnitude.get_ylabel()
+    assert "deg" in phase.get_ylabel()
+    assert "rad/s" in coherence.get_xlabel() and coherence.get_xscale() == "log"
 
 
 def test_the_band_is_the_95_per_cent_band_of_the_random_error(frf):

@@ -45,6 +45,28 @@ def test_mat_is_bounded_over_all_variables_and_after_widening(tmp_path):
     assert peak < 200e6
 
 
+def test_memory_is_bounded_by_what_a_record_can_use(tmp_path):
+    np.save(tmp_path / "long.npy", np.zeros(20_000_001, np.int8))
+    with pytest.raises(ReadError, match=r"long.npy: 'data' has 20000001 samples, .* cut the file"):
+        channels(tmp_path / "long.npy")
+
+
+def test_a_line_without_end_is_no_row_of_a_table(tmp_path):
+    (tmp_path / "log.csv").write_text(f"time,q\n0,1\n1,{'1' * 6_000_000}\n")
+    with pytest.raises(ReadError, match="line 3 has 6000003 bytes: the file is not a table"):
+        channels(tmp_path / "log.csv")
+
+
+def test_a_link_of_hdf5_to_another_file_is_said(tmp_path):
+    h5py = pytest.importorskip("h5py")
+    with h5py.File(tmp_path / "log.h5", "w") as file:
+        file["t"] = file["group/u"] = np.arange(10.0)
+        file["group/q"] = h5py.ExternalLink("other.h5", "/q")
+        file["again"] = h5py.SoftLink("/t")
+    with pytest.warns(RecordWarning, match=r"'group.q' lies in another file and was left out"):
+        assert {x.name for x in channels(tmp_path / "log.h5")} == {"group.u"}
+
+
 def test_mat_of_many_sound_variables_is_not_refused(tmp_path):
     mat_of_zeros(tmp_path / "log.mat", 100, 10_000)  # 8 MB
     assert len(channels(tmp_path / "log.mat")) == 100

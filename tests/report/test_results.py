@@ -86,7 +86,7 @@ def test_fits_stand_side_by_side_and_what_is_missing_says_so(fit):
         assert float(words[place - 1]) == pytest.approx(value, abs=0.06 * error)
         assert float(words[place + 1]) == pytest.approx(error, rel=0.06)
     assert direct.split() == ["direct", "not", "identifiable"]
-    assert note == "(+- one standard error)"
+    assert "one standard error" in note
 
 
 @pytest.mark.parametrize(

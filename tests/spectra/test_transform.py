@@ -3,6 +3,7 @@ import pytest
 
 from jaxquad.records import Record
 from jaxquad.spectra import Composite, Welch
+from jaxquad.spectra._average import transform_records
 from jaxquad.spectra._fourier_sums import (
     _block_functions,
     fourier_sums,
@@ -11,7 +12,6 @@ from jaxquad.spectra._fourier_sums import (
     Taper,
     window,
 )
-from jaxquad.spectra._welch import transform_records
 
 
 # Lengths of whole blocks and odd ones, short and very short; starts on and off blocks.

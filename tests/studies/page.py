@@ -22,6 +22,7 @@ ORDER = (
     "refined",
     "ringdown",
     "hold",
+    "feedthrough",
     "chirp",
     "nonlinearity",
     "coverage_short",

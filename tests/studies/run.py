@@ -18,6 +18,7 @@ STEPS = (
     ["ringdown.py", "--draws", "40"],
     ["nonlinearity.py", "--draws", "100"],
     ["hold.py", "--draws", "200"],
+    ["feedthrough.py", "--draws", "60"],
     ["model_error.py", "--draws", "40"],
     ["refine.py", "--draws", "200"],
     ["tuned.py"],

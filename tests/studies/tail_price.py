@@ -36,7 +36,6 @@ from tuning_case import (  # noqa: E402
 )
 
 import jaxquad as jq  # noqa: E402
-from jaxquad.tuning._tail import take_members  # noqa: E402
 
 
 PEAK, SLICE = 3.6, 2048
@@ -92,10 +91,11 @@ def solve(cost, z, bound: float, drawn, slices, others) -> np.ndarray:
 
 def put_into(others, drawn, places):
     """The members at the places (slice, member) instead of the first of the others."""
-    worst = take_members(drawn, places)
-    if worst is None:
-        return others
-    return others.replaced(np.arange(len(places)), linear_members(worst))
+    for s in sorted({s for s, _ in places}):
+        rows = [k for k, (number, _) in enumerate(places) if number == s]
+        worst = drawn[s].take([places[k][1] for k in rows])
+        others = others.replaced(np.array(rows), linear_members(worst))
+    return others
 
 
 def _minimise(cost, z, bound: float, known, loops) -> np.ndarray:

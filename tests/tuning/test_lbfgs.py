@@ -75,7 +75,7 @@ def test_a_trial_without_a_finite_cost_is_taken_back():
     assert np.all(np.isfinite(found.z)) and found.converged[0]
     assert found.value[0] <= reference.fun + 1e-6
     lost = minimise(together(lambda x: (np.nan, x))[0], z, ROUGH)
-    assert lost.reasons[0] == "the cost is not finite at the start" and lost.evaluations[0] == 1
+    assert "not finite" in lost.reasons[0] and lost.evaluations[0] == 1
 
 
 def test_no_parameter_moves_further_than_it_may_at_once():
@@ -88,7 +88,7 @@ def test_no_parameter_moves_further_than_it_may_at_once():
     found = minimise(together(steep)[0], np.zeros((1, 2)), LBFGS(evaluations=20))
     assert np.max(np.abs(np.diff(seen, axis=0))) <= 0.5 + 1e-12
     assert found.z[0, 0] > 2.5  # yet it goes on
-    assert not found.converged[0] and found.reasons[0] == "stopped after 20 evaluations"
+    assert not found.converged[0] and "20" in found.reasons[0]
 
 
 def test_what_is_off_stays_and_what_is_enough_stops():
@@ -97,8 +97,8 @@ def test_what_is_off_stays_and_what_is_enough_stops():
     enough = lambda problem, value: problem == 2 and value < 10.0
     found = minimise(evaluate, z, ROUGH, on=np.array([True, False, True]), enough=enough)
     np.testing.assert_array_equal(found.z[1], z[1])
-    assert calls[1] == 0 and found.reasons[1] == "not started"
-    assert found.reasons[2] == "good enough" and 1e-3 < found.value[2] < 10.0
+    assert calls[1] == 0 and found.evaluations[1] == 0 and not found.converged[1]
+    assert found.converged[2] and 1e-3 < found.value[2] < 10.0
     assert found.value[0] < 1e-6 or found.value[0] == pytest.approx(3.93, abs=0.01)
     # The same from the minimum itself: one evaluation tells.
     assert minimise(together(rosenbrock)[0], np.ones((1, 5)), ROUGH).evaluations[0] == 1

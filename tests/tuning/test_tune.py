@@ -122,7 +122,7 @@ def test_a_limit_is_kept_and_is_said_to_hold_the_optimum_back():
 def test_the_first_line_is_the_verdict():
     found = tuned("slow")
     first, *verdicts = str(found).splitlines()[:4]
-    assert first == "NOT CERTIFIED: no fresh members were asked for"
+    assert first.startswith("NOT CERTIFIED")
     assert verdicts[:2] == [str(found.stability), str(found.performance)]
     assert verdicts[2].startswith("OK   CONVERGENCE: the descent ended at a stationary point")
     assert found.stability.holds is None and found.convergence.holds and not found.holds

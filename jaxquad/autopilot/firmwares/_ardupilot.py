@@ -29,16 +29,13 @@ from .._law import (
     Advance,
     AngleLoop,
     bounded,
-    filter_gyro,
     FlownLoop,
-    gyro_rest,
-    low_pass_share,
     Memories,
     RateLoop,
     Signal,
     split_reference,
 )
-from ._ardupilot_log import LOG
+from ._logs import ARDUPILOT as LOG
 
 
 class ArduPilotRate(RateLoop):
@@ -88,19 +85,18 @@ class ArduPilotRate(RateLoop):
 
     def rest(self, zero: Signal) -> dict[str, PyTree]:
         signals = dict.fromkeys(("target", "error", "slope", "integral"), zero)
-        return {"gyro": gyro_rest(self.gyro, zero), **signals}
+        return {"gyro": self.gyro_rest(zero), **signals}
 
     def advance(
         self, memory: Memories, excess: Signal, reference: Reference, measurement: Signal
     ) -> Advance:
         at = lambda gain: broadcast_gain(gain, measurement)
-        share = lambda cutoff: low_pass_share(cutoff, self.dt, measurement)
         r, _ = split_reference(reference, measurement, self.dt)
-        gyro, (y, _) = filter_gyro(self.gyro, self.dt, memory["gyro"], measurement)
-        target = memory["target"] + share(self.target_hz) * (r - memory["target"])
-        error = memory["error"] + share(self.error_hz) * (target - y - memory["error"])
+        gyro, (y, _) = self.filter_gyro(memory["gyro"], measurement)
+        target = self.low_passed(self.target_hz, memory["target"], r)
+        error = self.low_passed(self.error_hz, memory["error"], target - y)
         raw = (error - memory["error"]) / self.dt
-        slope = memory["slope"] + share(self.derivative_hz) * (raw - memory["slope"])
+        slope = self.low_passed(self.derivative_hz, memory["slope"], raw)
         growth = at(self.i) * error * self.dt
         # A limited mixer lets the integral shrink only.
         growing = (jnp.abs(excess) > 1e-6) & (memory["integral"] * growth >= 0)
@@ -408,12 +404,19 @@ class ArduPilot(Firmware):
     def flown_loop(self, values, version, *, throttle, tracked_hz):
         return ardupilot_loop(values, throttle=throttle, tracked_hz=tracked_hz)
 
-    def channels(self, prefix: str, axis: int) -> Channels:
-        letter = "RPY"[axis]
+    def channels(self, prefix: str, axis: int, values: Mapping[str, str]) -> Channels:
+        letter, number = "RPY"[axis], Numbers(values).number
+        low, high = number("MOT_PWM_MIN", 1000.0), number("MOT_PWM_MAX", 2000.0)
+        ends = number("MOT_SPIN_MIN", 0.15), number("MOT_SPIN_MAX", 0.95)
         return Channels(
             terms=[f"PID{letter}.{x}" for x in ("P", "I", "D", "FF")],
-            motors=[f"RCOU.C{k}" for k in range(1, 5)], output={f"RATE.{letter}Out": 1.0},
-            slewed={f"PID{letter}.Dmod": 1.0},
+            motors=[f"RCOU.C{k}" for k in range(1, 5)],
+            motor_ends=(low + ends[0] * (high - low), low + ends[1] * (high - low)),
+            output={f"RATE.{letter}Out": 1.0}, slewed={f"PID{letter}.Dmod": 1.0},
+            tracked={
+                3: r"ESC(\[\d+\])?\.RPM", 2: r"RPM(\.rpm1|\[0\]\.RPM)",
+                5: r"RPM(\.rpm2|\[1\]\.RPM)",
+            },
         )  # fmt: skip
 
     def what_to_fly(self, axis: str) -> str:
@@ -443,18 +446,6 @@ class ArduPilot(Firmware):
         used = f"GYR[{imus[core] if core < len(imus) else 0}]"
         table = used if used in tables else min(tables)
         return [f"{table}.Gyr{letter}" for letter in "XYZ"]
-
-    def tracked_channels(self) -> Mapping[int, str]:
-        return {
-            3: r"ESC(\[\d+\])?\.RPM", 2: r"RPM(\.rpm1|\[0\]\.RPM)",
-            5: r"RPM(\.rpm2|\[1\]\.RPM)",
-        }  # fmt: skip
-
-    def motor_ends(self, values: Mapping[str, str]) -> tuple[float, float]:
-        number = Numbers(values).number
-        low, high = number("MOT_PWM_MIN", 1000.0), number("MOT_PWM_MAX", 2000.0)
-        ends = number("MOT_SPIN_MIN", 0.15), number("MOT_SPIN_MAX", 0.95)
-        return low + ends[0] * (high - low), low + ends[1] * (high - low)
 
     def angle_loop(self, values, axis, dt, *, levelled):
         return OuterLoop.of(values, f"ATC_ANG_{_SHORT[axis]}_P", 1.0, dt, closed=True)

@@ -37,7 +37,7 @@ from ._betaflight_law import (
     P_SCALE,
     tpa_factor,
 )
-from ._betaflight_log import LOG
+from ._betaflight_log import BETAFLIGHT as LOG
 
 
 Ends = tuple[float, float, float]  # of a dynamic cutoff: lowest and highest in Hz, expo
@@ -55,7 +55,7 @@ class FlownBetaflight(FlownLoop[BetaflightPID]):
         low-pass of gyro and D; None where it is static.
     - `tpa`: tpa_rate in percent and the breakpoint's throttle.
     - `tpa_on_p`: whether TPA acts on P too.
-    - `anti_gravity`: gain, cutoff in Hz and gain of P, see `surge`; None is off.
+    - `anti_gravity`: gain, cutoff in Hz and gain of P; None is off.
     - `windup`: of the mixer's range, above which the integral grows less; 1 is off.
     """
 
@@ -94,27 +94,29 @@ class FlownBetaflight(FlownLoop[BetaflightPID]):
         law = self.law.without_gyro_filters()
         return dataclasses.replace(self, law=law, gyro_dynamic=None)
 
-    def at_sample(self, throttle: Array, surge: Array, integral_share: Array) -> BetaflightPID:
+    def at_moment(self, *moment: Array) -> BetaflightPID:
+        throttle, surge, integral_share = moment
         return self.at(throttle, surge=surge, integral_share=integral_share)
 
-    def surge(self, throttle: Samples) -> Samples:
+    def moments(
+        self, throttle: Samples, before: Samples, mixer_range: Samples | None
+    ) -> tuple[Samples, ...]:
+        """Throttle, anti-gravity's measure of it times its gain, and of what the integral grows."""
         from scipy.signal import lfilter
 
-        if self.anti_gravity is None:
-            return np.zeros_like(throttle)
-        gain, cutoff, _ = self.anti_gravity
-        change = np.diff(throttle, prepend=throttle[:1])
-        moved = np.abs(change) / self.law.dt * (1 - throttle) ** 2
-        moved = np.where(change > 0, 0.5 * (1 - throttle), 1.0) * moved
-        for section in PT2(cutoff).sections(1 / self.law.dt):
-            pole = [1.0, float(np.asarray(section.a1))]
-            moved = lfilter([float(np.asarray(section.b0))], pole, moved)
-        return gain * np.asarray(moved)
-
-    def integral_share(self, mixer_range: Samples) -> Samples:
-        if self.windup >= 1:
-            return np.ones_like(mixer_range)
-        return np.clip((1 - mixer_range) / (1 - self.windup), 0.0, 1.0)
+        surge, share = np.zeros_like(before), np.ones_like(before)
+        if self.anti_gravity is not None:
+            gain, cutoff, _ = self.anti_gravity
+            change = np.diff(throttle, prepend=throttle[:1])
+            moved = np.abs(change) / self.law.dt * (1 - throttle) ** 2
+            moved = np.where(change > 0, 0.5 * (1 - throttle), 1.0) * moved
+            for section in PT2(cutoff).sections(1 / self.law.dt):
+                pole = [1.0, float(np.asarray(section.a1))]
+                moved = lfilter([float(np.asarray(section.b0))], pole, moved)
+            surge = np.concatenate([[0.0], gain * np.asarray(moved)[:-1]])
+        if mixer_range is not None and self.windup < 1:
+            share = np.clip((1 - mixer_range) / (1 - self.windup), 0.0, 1.0)
+        return before, surge, share
 
     def setpoint_speed(self, slope: Speeds, fed: Speeds) -> Speeds:
         """By the logged F where that has a gain: it is of the sticks, between their samples."""
@@ -330,17 +332,26 @@ class Betaflight(Firmware):
     notches = tuple((f"gyro_notch{k}_hz", f"gyro_notch{k}_cutoff") for k in (1, 2))
     words = True
     has_adrc = True
+    no_ladrc = "its proposed ADRC (pull request 15400) is of the rate, not of the angle"
 
     def flown_loop(self, values, version, *, throttle, tracked_hz):
         return betaflight_loop(values, version, throttle=throttle)
 
-    def channels(self, prefix: str, axis: int) -> Channels:
+    def channels(self, prefix: str, axis: int, values: Mapping[str, str]) -> Channels:
+        number = lambda name, usual: float(values.get(name, usual))
+        limit, usual = ("pidsum_limit_yaw", 400.0) if axis == 2 else ("pidsum_limit", 500.0)
+        low, high = (float(x) for x in values.get("motorOutput", "48,2047").split(",")[:2])
+        finer = number("blackbox_high_resolution", 0.0) > 0
+        # The throttle before its boost; a limit of the throttle is another one.
+        limited = number("throttle_limit_type", 0.0)
         return Channels(
             unfiltered=[f"{prefix}gyroUnfilt[{k}]" for k in range(3)],
             terms=[f"{prefix}axis{x}[{axis}]" for x in "PIDF"],
-            motors=[f"{prefix}motor[{k}]" for k in range(8)],
-            output={f"{prefix}axisSum[{axis}]": 1.0}, stick={f"{prefix}rcCommand[3]": 1.0},
+            motors=[f"{prefix}motor[{k}]" for k in range(8)], motor_ends=(low, high),
+            output={f"{prefix}axisSum[{axis}]": 1.0}, output_limit=number(limit, usual),
+            stick={} if limited else {f"{prefix}rcCommand[3]": 1.0}, stick_ends=(1000.0, 2000.0),
             mixed={f"{prefix}axisMixed[{axis}]": 1.0},
+            resolution=(float(np.radians(0.1 if finer else 1.0)), 1.0),
         )  # fmt: skip
 
     def what_to_fly(self, axis: str) -> str:
@@ -351,24 +362,6 @@ class Betaflight(Firmware):
             f"and quick {axis} stick in acro for 20 s"
         )
 
-    def motor_ends(self, values: Mapping[str, str]) -> tuple[float, float]:
-        low, high = (float(x) for x in values.get("motorOutput", "48,2047").split(",")[:2])
-        return low, high
-
-    def stick_throttle(self, command: Samples, values: Mapping[str, str]) -> Samples | None:
-        """The throttle before its boost; a limit of the throttle is another one."""
-        if float(values.get("throttle_limit_type", 0)):
-            return None
-        return np.clip((command - 1000) / 1000, 0.0, 1.0)
-
-    def output_limit(self, values: Mapping[str, str], axis: int) -> float:
-        name, usual = ("pidsum_limit_yaw", 400.0) if axis == 2 else ("pidsum_limit", 500.0)
-        return float(values.get(name, usual))
-
-    def resolution(self, values: Mapping[str, str]) -> tuple[float, float]:
-        finer = float(values.get("blackbox_high_resolution", 0)) > 0
-        return np.radians(0.1 if finer else 1.0), 1.0
-
     def with_hold(self, values: Mapping[str, str], hold: float | None) -> Mapping[str, str]:
         if hold is None or "looptime" not in values:
             return values
@@ -376,10 +369,6 @@ class Betaflight(Firmware):
         if abs(looptime / float(values["looptime"]) - 1) < _SAME_LOOP:
             return values
         return {**values, "looptime": f"{looptime:.6g}"}
-
-    def levelled(self, loop: FlownLoop) -> FlownLoop:
-        law = loop.law.levelled() if isinstance(loop.law, BetaflightPID) else loop.law
-        return dataclasses.replace(loop, law=law)
 
     def angle_loop(self, values, axis, dt, *, levelled):
         level = values.get("levelPID", "").split(",")[0]
@@ -444,9 +433,6 @@ class Betaflight(Firmware):
 
     def angle_parameters(self, axis: str, p: float) -> dict[str, float]:
         return {"angle_p_gain": 10 * p}
-
-    def no_ladrc(self) -> str:
-        return "its proposed ADRC (pull request 15400) is of the rate, not of the angle"
 
     def parameter_file(self, values, title, *, version, profile, raised, words):
         adrc = [row.name for row, *_ in values if row.name.startswith("adrc_")]

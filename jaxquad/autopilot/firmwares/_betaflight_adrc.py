@@ -1,10 +1,10 @@
-"""Betaflight's proposed ADRC (pull request 15400) of a log, and its loops with drawn plants.
+"""Betaflight's proposed ADRC (pull request 15400) of a log, its loops, and what designs give there.
 
 The observer's response is rational in exp(-j omega T), and b0 divides it.
 """
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 import equinox as eqx
@@ -12,14 +12,31 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from jaxquad._core import as_messages
-from jaxquad.identify import B0Law, B0Schedule, draw_models, filter_response, GainOverThrottle
+from jaxquad._core import as_messages, plain_content
+from jaxquad.identify import (
+    B0Law,
+    B0Schedule,
+    draw_models,
+    filter_response,
+    GainOverThrottle,
+    ScaledB0,
+)
 from jaxquad.records import AXES
 
 from .._filters import FilterChain, PT2
 from .._law import FlownLoop, law_responses
 from .._parameters import list_parameters
-from .._rate_loops import cells_of, Frequencies, hold_plants, LoopQualities, Paths, RateLoops
+from .._rate_loops import (
+    cells_of,
+    Frequencies,
+    hold_plants,
+    Kind,
+    Limits,
+    LoopQualities,
+    Paths,
+    RateLoops,
+    together,
+)
 from ._betaflight import betaflight_loop, flies_adrc, FlownBetaflight
 from ._betaflight_law import BetaflightADRC
 
@@ -39,7 +56,6 @@ class ADRCFrame(NamedTuple):
     forgetting: float = 0.3  # 1/s
 
     def parameters(self) -> dict[str, float]:
-        """By the firmware's names."""
         return {
             "adrc_gyro_lpf_hz": self.lowpass_hz, "adrc_td_hz": self.setpoint_hz,
             "adrc_hover_throttle": 100 * self.schedule.hover,
@@ -178,7 +194,6 @@ class ADRCLoops(RateLoops):
     frame: ADRCFrame
 
     def flown(self) -> LoopQualities:
-        """What flew gives."""
         return self._qualities(self.feedback, self.ahead)
 
     def closed(self, design: Design | None) -> Paths:
@@ -256,3 +271,207 @@ def draw_at(
     models = draw_models(plant.fit, jnp.asarray(scores))
     wide = lambda x: np.broadcast_to(np.asarray(x, float), (plants,))
     return wide(np.asarray(models.gain)[0]), wide(models.lag), wide(models.delay)
+
+
+_LAW: B0Law = "SQRT"  # of the firmware by default
+_WORTH = 0.95  # of the flown effect of torque, above which other numbers are not worth a change
+_RESERVE = 0.97  # of the limits, because fresh plants reach further than those that were tuned on
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ADRCTargets:
+    """What tuned ADRC parameters keep on every plant and at every throttle."""
+
+    sensitivity: float = 1.8  # greatest |S|
+    resonance: float = 1.4  # peak of the response from set-point to rate
+    noise: float = 1.5  # of the command by white noise before the gyro's filters, over what flew
+    change: float = 3.0  # factor from wc, wo and b0 that flew, where the ADRC flew
+
+    def __post_init__(self):
+        if not (self.sensitivity > 1 and self.resonance > 1 and self.noise > 0 and self.change > 1):
+            raise ValueError(
+                f"sensitivity {self.sensitivity:g}, resonance {self.resonance:g}, change "
+                f"{self.change:g} and noise {self.noise:g}: the first three must be above 1, the "
+                "last above 0"
+            )
+
+
+class ADRCStage(NamedTuple):
+    """What parameters give on fresh plants, over all throttles."""
+
+    wc: float  # as the firmware stores them; nan of a PID that flew
+    wo: float
+    b0: float
+    stable: float  # share of the loops
+    peak: float  # the greatest
+    resonance: float  # the greatest
+    crossover: float  # the median in rad/s
+    rejection: float  # relative to what flew, root mean square
+    noise: float  # likewise
+
+    def cells(self) -> list[str]:
+        """The numbers as both tables print them, the crossover in Hz."""
+        tuned = ["-" if np.isnan(x) else f"{x:.0f}" for x in self[:3]]
+        peaks, ends = ([f"{x:.2f}" for x in part] for part in (self[4:6], self[7:]))
+        hertz = self.crossover / (2 * np.pi)
+        return [*tuned, f"{100 * self.stable:.1f}", *peaks, f"{hertz:.1f}", *ends]
+
+
+@dataclasses.dataclass(frozen=True)
+class ADRCProposal:
+    """Parameters of Betaflight's proposed ADRC, certified; `str()` is a report."""
+
+    # "kept": the ADRC that flew is as good. "not to be flown": no parameters keep the targets.
+    kind: Kind
+    verdict: str  # the same in words
+    parameters: Mapping[str, float]  # of the firmware by name, empty where nothing is proposed
+    frame: ADRCFrame  # what was not tuned
+    throttle: tuple[float, ...]  # at which the loops were certified
+    # On fresh plants: "what flew", "proposed", "defaults", and "a third of the way" of an ADRC.
+    stages: Mapping[str, ADRCStage]
+    # b0 of the log and how far each law is from it; a log with one level of throttle has none.
+    scaled: ScaledB0 | None = None
+
+    @property
+    def stage(self) -> ADRCStage:
+        """Of the proposal."""
+        return self.stages["proposed"]
+
+    @property
+    def law(self) -> B0Law:
+        """adrc_b0_law."""
+        return self.frame.schedule.law
+
+    def content(self) -> dict[str, object]:
+        """All of it, for JSON."""
+        return plain_content({
+            "kind": self.kind, "verdict": self.verdict, "parameters": dict(self.parameters),
+            "schedule": self.frame.schedule._asdict(),
+            "throttle": self.throttle,
+            "stages": {name: stage._asdict() for name, stage in self.stages.items()},
+            "b0_of_the_log": None if (x := self.scaled) is None else {
+                "hover": x.hover, "b0": x.b0.value, "interval_95": x.b0.interval, "law": x.law,
+                "deviations": dict(x.deviations), "extrapolated": x.extrapolated,
+            },
+        })  # fmt: skip
+
+    def table(self) -> str:
+        """The stages as text."""
+        rows = [
+            f"{'on fresh plants':<18} {'wc':>4} {'wo':>4} {'b0':>6}   stable   worst Ms   resonance"
+            "   crossover   torque   noise"
+        ]
+        form = "{:<18} {:>4} {:>4} {:>6} {:>6} % {:>10} {:>11} {:>8} Hz {:>8} {:>7}"
+        rows += [form.format(name, *stage.cells()) for name, stage in self.stages.items()]
+        return "\n".join(rows)
+
+    def __str__(self) -> str:
+        sets = [f"set {name} = {value:g}" for name, value in self.parameters.items()]
+        sets += [f"set adrc_b0_law = {self.law}"] if sets else []
+        return "\n".join([self.table(), *sets, "", self.verdict])
+
+
+def third_of_the_way(before: Design, designs: Float[np.ndarray, "*designs 3"]) -> np.ndarray:
+    return before + 1 / 3 * (designs - before)
+
+
+def stages_of(
+    loops: Sequence[ADRCLoops], before: Design | None, best: Design, usual: Design
+) -> dict[str, ADRCStage]:
+    """What flew, a third of the way where that has a meaning, the proposal, and the defaults."""
+    flown = together([loop.flown() for loop in loops])
+    rms = lambda ratio: float(np.sqrt(np.mean(ratio**2)))
+
+    def stage(design: Design, x: LoopQualities) -> ADRCStage:
+        wc, wo, b0 = map(float, design)
+        return ADRCStage(
+            wc, wo, b0, float(np.mean(x.stable)), float(np.max(x.peak)),
+            float(np.max(x.resonance)), float(np.median(x.crossover)),
+            rms(x.rejection / flown.rejection), rms(x.noise / flown.noise),
+        )  # fmt: skip
+
+    of = lambda design: stage(design, together([loop.qualities(design[None]) for loop in loops]))
+    stages = {"what flew": stage(np.full(3, np.nan) if before is None else before, flown)}
+    if before is not None:
+        stages["a third of the way"] = of(np.rint(third_of_the_way(before, best)))
+    return stages | {"proposed": of(best), "defaults": of(usual)}
+
+
+def score_of(
+    loops: Sequence[ADRCLoops], targets: Limits, edge: float, before: Design | None
+) -> Callable[[Designs], Float[np.ndarray, " designs"]]:
+    """The effect of torque; designs beyond a target come after all that keep them."""
+    limit, flown = _RESERVE * targets.sensitivity, [loop.flown() for loop in loops]
+    last = lambda x, beyond: np.where(np.all(x.stable, axis=1), beyond, 1e6 * beyond)
+
+    def score(designs: Designs) -> Float[np.ndarray, " designs"]:
+        worst, rejected = designs[:, 0] / designs[:, 1], np.zeros(len(designs))  # wc at most wo
+        for loop, flew in zip(loops, flown, strict=True):
+            x = loop.qualities(designs)
+            beyond = np.stack([
+                np.max(x.peak, axis=1) / limit,
+                np.max(x.resonance, axis=1) / (_RESERVE * targets.resonance),
+                np.mean(x.noise / flew.noise, axis=1) / (_RESERVE * targets.noise),
+                np.max(x.crossover, axis=1) / edge,
+            ])  # fmt: skip
+            worst = np.maximum(worst, last(x, beyond.max(axis=0)))
+            if before is not None:  # Ms a third of the way, or that of what flew
+                third = loop.qualities(third_of_the_way(before, designs))
+                allowed = max(limit, float(np.max(flew.peak)))
+                worst = np.maximum(worst, last(third, np.max(third.peak, axis=1) / allowed))
+            rejected += np.mean((x.rejection / flew.rejection) ** 2, axis=1)
+        return np.where(worst <= 1, np.sqrt(rejected / len(loops)), 1e9 * worst)
+
+    parts = lambda designs: np.array_split(designs, max(1, len(designs) // 64))
+    return lambda designs: np.concatenate([score(part) for part in parts(designs)])
+
+
+def frame_of(
+    plant: GainOverThrottle, flown: Flown, hover: float | None
+) -> tuple[ADRCFrame, ScaledB0 | None, float]:
+    """What is not tuned, b0 of the log where it shows it, and b0 at the hover throttle."""
+    if hover is not None and not 0 < hover <= 1:
+        raise ValueError(f"hover is {hover}: give the throttle at hover, above 0 and up to 1")
+    if isinstance(flown, FlownADRC):
+        frame, flew = flown.frame, flown.schedule.hover
+        if hover is not None and abs(hover - flew) > 0.005:
+            raise ValueError(
+                f"hover is {hover:g}, but the ADRC that flew has an adrc_hover_throttle of "
+                f"{100 * flew:.0f} %, which stays: leave hover out"
+            )
+    else:
+        lowest = float(plant.throttle[0]) if hover is None else hover
+        frame = ADRCFrame(B0Schedule(_LAW, max(0.05, round(lowest, 2))))
+    schedule = frame.schedule
+    if plant.throttle.size == 1:
+        degrees = 1.0 if plant.output_unit == "deg/s" else 180 / np.pi
+        scale = float(schedule.scale(plant.throttle[0]))
+        return frame, None, degrees * plant.b0(0).value / scale
+    scaled = plant.adrc_b0(schedule.hover, largest=schedule.high)
+    if not isinstance(flown, FlownADRC):
+        frame = frame._replace(schedule=schedule._replace(law=scaled.law))
+    return frame, scaled, scaled.b0.value
+
+
+def judge_adrc(
+    stages: Mapping[str, ADRCStage], beyond: Sequence[str], targets: Limits, fresh: int,
+    grid: np.ndarray,
+) -> tuple[Kind, str]:  # fmt: skip
+    if beyond:
+        return "not to be flown", (
+            f"no parameters are proposed: {'; '.join(beyond)}. Allow more (`sensitivity`, "
+            "`resonance`, `noise`), or fly more excitation"
+        )
+    flown, best = stages["what flew"], stages["proposed"]
+    better = f"{best.rejection:.2f} of the effect of torque with what flew"
+    within = flown.peak <= targets.sensitivity and flown.resonance <= targets.resonance
+    if not np.isnan(flown.wc) and flown.stable == 1 and within and best.rejection > _WORTH:
+        return "kept", (
+            f"what flew is kept: within the limits the best parameters leave {better}. Its worst "
+            f"Ms on {fresh} fresh plants is {flown.peak:.2f}"
+        )
+    where = f"from {grid[0]:.2f} to {grid[-1]:.2f}" if len(grid) > 1 else f"at {grid[0]:.2f}"
+    return "proposed", (
+        f"proposed: stable on all {fresh} fresh plants {where} throttle, worst Ms {best.peak:.2f} "
+        f"of at most {targets.sensitivity:g}, {better}"
+    )

@@ -1,4 +1,7 @@
-"""What a Betaflight log says for its proposed ADRC: the report, and the files to load."""
+"""From the gain over the throttle to parameters of Betaflight's proposed ADRC, and their report.
+
+A design is a search over wc, wo and b0 on responses, as that of a PID is one over P, I and D.
+"""
 
 import dataclasses
 from collections.abc import Mapping
@@ -6,14 +9,15 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxquad._core import plain_content, write_file
-from jaxquad.identify import GainBand, GainOverThrottle
+from jaxquad._core import announce, plain_content, write_file
+from jaxquad.identify import GainBand, GainOverThrottle, UndeterminedError
 from jaxquad.plot import StepBand, ThrottleCurve
 from jaxquad.records import AXES
 from jaxquad.report import Headline, Provenance, Table
 
 from .._filters import FilterChain, PT2
 from .._flight_channels import FlightChannels
+from .._identified_log import StepGrid
 from .._page import (
     B0Section,
     Chains,
@@ -30,14 +34,140 @@ from .._parameters import (
     parameter_file,
     ParameterChange,
     propose_changes,
+    stage_texts,
+    store_parameters,
     WordChange,
 )
-from .._proposal import write_result
-from .._rate_loops import StepGrid
+from .._proposal import beyond_limits, write_result
+from .._rate_design import best_on_grid, stored_near
+from .._rate_loops import DesignSettings, Kind, Limits
 from .._replay import Reproduction
-from .._stages import DesignSettings, Kind
-from ._betaflight_adrc import adrc_loops, adrc_parameters, b0_law, Flown, FlownADRC
-from ._betaflight_adrc_design import ADRCProposal
+from ._betaflight_adrc import (
+    adrc_loops,
+    adrc_parameters,
+    ADRCProposal,
+    ADRCTargets,
+    b0_law,
+    draw_at,
+    Flown,
+    FlownADRC,
+    frame_of,
+    judge_adrc,
+    score_of,
+    stages_of,
+)
+
+
+_POINTS, _LEVELS, _ROUGH, _NARROWED = 5, 8, 5, 0.55  # the first levels on one plant each
+_CERTIFICATES, _WORST = 3, 8
+_SPREAD = 4.0  # factor on b0 to either side
+
+
+def propose_adrc(
+    plant: GainOverThrottle,
+    flown: Flown,
+    axis: str,
+    *,
+    hover: float | None = None,
+    targets: Limits | None = None,
+    bins: int = 5,
+    members: int = 32,
+    fresh: int = 256,
+    seed: int = 0,
+) -> ADRCProposal:
+    """Tune wc, wo and b0 of Betaflight's proposed ADRC on the plants that a log leaves possible.
+
+    Wanted is the least rate after a step of torque, with the targets kept on every plant at every
+    throttle that was flown, behind the filters of the gyro that flew and adrc_gyro_lpf_hz. The
+    whole numbers are certified on fresh plants; where that fails the worst of these join the
+    search, three times at most. Loops are taken as linear.
+
+    Where the PID flew, the law of b0 over the throttle is the one nearest to the measured gain, wo
+    is at least wc, and b0 within a factor of 4 of the identified one. Where the ADRC flew, its law,
+    hover throttle, low-passes and leak stay, and a third of the way keeps the limit on Ms, too, or
+    that of what flew. A log with one level of throttle does not show b0 over the throttle: the law
+    is then the firmware's default or what flew, and the certificate is of that throttle alone.
+    Source: docs/autopilots.md.
+
+    **Arguments:**
+
+    - `plant`: of `jq.identify.gain_over_throttle`, with the filters of the gyro divided out.
+    - `flown`: of `betaflight_loop` or `betaflight_adrc_loop`: its filters stay, and it is what
+        noise and torque are compared with.
+    - `axis`: "roll", "pitch" or "yaw".
+    - `hover`: adrc_hover_throttle, 0 to 1; by default that of the ADRC that flew, else the lowest
+        level of throttle, because b0 is scaled up from there alone.
+    - `bins`: throttles, evenly from the lowest to the highest flown.
+    - `members`, `fresh`: plants to tune on, and to certify on at each throttle.
+
+    **Raises:**
+
+    - `UndeterminedError`: the log does not tell the gain, the lag or the thrust curve; says what
+        to fly.
+    - `ValueError`: for another axis, a hover throttle beyond 0 to 1 or other than that of the ADRC
+        that flew, or units that are not known.
+
+    !!! example
+
+        ```python
+        flown = betaflight_loop(settings.values, settings.version)
+        chains = [flown.law.gyro, FilterChain(flown.law.filters, 1 / flown.law.dt)]
+        found = jq.identify.gain_over_throttle(record, throttle_range=(0, 1000), filters=chains)
+        print(jq.autopilot.propose_adrc(found, flown, "roll", hover=0.3))
+        ```
+    """
+    if axis not in AXES:
+        raise ValueError(f"axis is {axis!r}: give one of {', '.join(AXES)}")
+    targets, one, place = targets or ADRCTargets(), plant.throttle.size == 1, AXES.index(axis)
+    grid = plant.throttle if one else np.linspace(plant.low.min(), plant.high.max(), bins)
+    frame, scaled, b0 = frame_of(plant, flown, hover)
+    draw = lambda plants, seed: [
+        adrc_loops(plant, flown, place, float(x), frame, plants, seed) for x in grid
+    ]
+    if min(float(draw_at(plant, float(x), fresh, seed)[0].min()) for x in grid) <= 0:
+        raise UndeterminedError(
+            "the log does not tell the gain from the command to the rate: 0 is within what it "
+            "leaves possible. Fly a chirp of the rate set-point, or stronger and quicker stick"
+        )
+    edge = np.inf if plant.fit.origin is None else plant.fit.origin.band[1]
+    rows = [find_parameter("betaflight", f"adrc_{name}_{axis}") for name in ("wc", "wo", "b0")]
+    low, high, usual = (
+        np.array([getattr(row, name) for row in rows], float) for name in ("low", "high", "default")
+    )
+    before = flown.design(place) if isinstance(flown, FlownADRC) else None
+    if before is not None:
+        ways = before / targets.change, before * targets.change
+        low, high = (np.clip(x, low, high) for x in ways)
+    else:
+        low[2], high[2] = np.clip([b0 / _SPREAD, b0 * _SPREAD], low[2], high[2])
+    loops = draw(max(1, members // len(grid)), seed)
+    for attempt in range(1, _CERTIFICATES + 1):
+        announce(f"searching wc, wo and b0 at {len(grid)} throttles")
+        score = score_of(loops, targets, edge, before)
+        first = [dataclasses.replace(loop, plants=loop.plants[:1]) for loop in loops]
+        rough, ends = score_of(first, targets, edge, before), (np.log(low), np.log(high))
+        middle, half = np.log(low * high) / 2, np.log(high / low) / 2
+        for level in range(_LEVELS):
+            used = rough if level < _ROUGH else score
+            middle, half = best_on_grid(used, middle, half, ends, _POINTS), _NARROWED * half
+        near = stored_near(np.exp(middle), rows, (low, high))
+        best = near[np.argmin(score(near))]  # where none keep the targets: the nearest
+        announce(f"certifying the whole numbers on {fresh} new plants")
+        certified = draw(fresh, seed + attempt)
+        stages = stages_of(certified, before, best, usual)
+        third = stages.get("a third of the way", stages["proposed"])
+        beyond = beyond_limits(stages["what flew"], third, stages["proposed"], targets, edge)
+        if not beyond:
+            break
+        worst = [x.worst(best[None], _WORST).plants for x in certified]
+        loops = [
+            dataclasses.replace(x, plants=np.concatenate([x.plants, more]))
+            for x, more in zip(loops, worst, strict=True)
+        ]
+    kind, verdict = judge_adrc(stages, beyond, targets, fresh, grid)
+    values = {row.name: float(x) for row, x in zip(rows, best, strict=True)} | frame.parameters()
+    stored = store_parameters("betaflight", values if kind == "proposed" else {})
+    return ADRCProposal(kind, verdict, stored, frame, tuple(map(float, grid)), stages, scaled)
 
 
 _BUILD = (2026, 6)  # whose names a file of the ADRC has
@@ -46,30 +176,20 @@ _STEM = "proposal"
 
 @dataclasses.dataclass(frozen=True)
 class ADRCAutopilot:
-    """What `autopilot` found in a log, and what it proposes for the ADRC; `str()` is its report.
+    """What `autopilot` found in a log, and what it proposes for the ADRC; `str()` is its report."""
 
-    **Attributes:**
-
-    - `kind`, `verdict`: as of an `AutopilotProposal`.
-    - `path`: of the log; `version`: of its firmware; `values`: its header's lines.
-    - `flown`: the loop that flew, PID or ADRC.
-    - `plant`: its gain over the throttle; None where no level of throttle determines it.
-    - `reproductions`: the flown loop compared with the flight, by the throttle of each level.
-    - `proposal`: of `propose_adrc`; None where the log cannot tell.
-    - `flight`: the channels that were read.
-    """
-
-    kind: Kind
+    kind: Kind  # as of an `AutopilotProposal`
     verdict: str
     settings: DesignSettings
-    path: Path
+    path: Path  # of the log
     axis: str
-    version: tuple[int, ...]
-    values: Mapping[str, str]
-    flown: Flown
-    plant: GainOverThrottle | None = None
+    version: tuple[int, ...]  # of the firmware
+    values: Mapping[str, str]  # the header's lines
+    flown: Flown  # PID or ADRC
+    plant: GainOverThrottle | None = None  # None where no level of throttle determines it
+    # The flown loop compared with the flight, by the throttle of each level.
     reproductions: Mapping[float, Reproduction] = dataclasses.field(default_factory=dict)
-    proposal: ADRCProposal | None = None
+    proposal: ADRCProposal | None = None  # None where the log cannot tell
     flight: FlightChannels | None = None
 
     @property
@@ -89,12 +209,8 @@ class ADRCAutopilot:
         default = lambda name: float(find_parameter("betaflight", name).default)
         return {name: flown.get(name, default(name)) for name in self.new}
 
-    @property
-    def changes(self) -> tuple[ParameterChange, ...]:
+    def changes(self, share: float = 1.0) -> tuple[ParameterChange, ...]:
         """From what the firmware held to the proposal; where the PID flew all, changed or not."""
-        return self._changes(1.0)
-
-    def _changes(self, share: float) -> tuple[ParameterChange, ...]:
         old, new, reasons = self.old, self.new, {}
         if self.proposal is not None:
             after, before = self.proposal.stage, self.proposal.stages["what flew"]
@@ -116,7 +232,7 @@ class ADRCAutopilot:
         """What switches from the PID to the ADRC; empty where the ADRC flew."""
         if self.flew_adrc or self.proposal is None or not self.new:
             return ()
-        law = self.proposal.schedule.law
+        law = self.proposal.law
         off = {} if self.proposal.scaled is None else self.proposal.scaled.deviations
         why = (
             f"nearest to the gain over the throttle: off by {100 * off[law]:.0f} % at most"
@@ -179,7 +295,7 @@ class ADRCAutopilot:
         proposal, plant = self.proposal, self.plant
         if proposal is None or plant is None:
             return tuple(remarks)
-        schedule, scaled, throttle = proposal.schedule, proposal.scaled, proposal.throttle
+        schedule, scaled, throttle = proposal.frame.schedule, proposal.scaled, proposal.throttle
         most = float(schedule.scale(throttle[-1]))
         if scaled is None:
             remarks.append(
@@ -210,10 +326,9 @@ class ADRCAutopilot:
 
         **Returns:** their paths.
         """
-        path = Path(folder)
-        files = lambda: [write_file(path / name, text) for name, text in self._texts().items()]
+        files = lambda path: [write_file(path / name, x) for name, x in self._texts().items()]
         pages = lambda origin: [adrc_page(self, origin)]
-        return write_result(path, self.path, self.settings, self.content(), files, pages)
+        return write_result(Path(folder), self.path, self.settings, self.content(), files, pages)
 
     def _texts(self) -> dict[str, str]:
         """The parameter files, and the table of what changes; without a proposal what flew."""
@@ -228,18 +343,13 @@ class ADRCAutopilot:
                 raised=[axis for axis in AXES if f"d_max_{axis}" in flown],
             )  # fmt: skip
             return {f"{_STEM}_revert.txt": text}
-        texts, table = {}, []
-        file = lambda changes, title, revert=False: parameter_file(
+        file = lambda changes, title, revert: parameter_file(
             "betaflight", changes, revert=revert, version=_BUILD, profile=None, words=self.words,
             title="\n".join([title, *self.remarks]),
         )  # fmt: skip
-        for percent in (33, 100) if self.flew_adrc else (100,):
-            changes = self._changes(1.0 if percent == 100 else 1 / 3)
-            title = f"{percent} % of the way from what flew to the proposal"
-            texts[f"{_STEM}_{percent:03d}.txt"] = file(changes, title)
-            table.append(f"## {title}\n\n{change_table(changes, self.words)}")
-        texts[f"{_STEM}_revert.txt"] = file(self.changes, "what flew", True)
-        return texts | {f"{_STEM}.md": "\n".join(table)}
+        shares = {33: 1 / 3, 100: 1.0} if self.flew_adrc else {100: 1.0}
+        stages = {percent: self.changes(share) for percent, share in shares.items()}
+        return stage_texts(_STEM, "txt", stages, file, self.words)
 
     @property
     def shown_again(self) -> Mapping[float, Reproduction]:
@@ -266,7 +376,7 @@ class ADRCAutopilot:
         parts = (
             [] if self.plant is None else [str(self.plant)], again,
             [] if self.proposal is None else [self.proposal.table()],
-            [change_table(self.changes, self.words).rstrip()] if self.new else [],
+            [change_table(self.changes(), self.words).rstrip()] if self.new else [],
             [f"! {x}" for x in self.remarks],
         )  # fmt: skip
         for part in parts:
@@ -282,11 +392,10 @@ def doubted_throttle(again: Mapping[float, Reproduction]) -> float | None:
 
 
 _PLANTS, _SEED = 100, 77  # of the steps' bands
-_POINTS = 60  # of a curve over the throttle
+_CURVE = 60  # points over the throttle
 
 
 def adrc_page(result: ADRCAutopilot, origin: Provenance) -> PilotPage:
-    """All that the page shows."""
     version, proposal = ".".join(map(str, result.version)), result.proposal
     flown, flight, axis = result.flown, result.flight, AXES.index(result.axis)
     headlines = [Headline(*VERDICTS[result.kind], result.verdict)]
@@ -313,7 +422,7 @@ def adrc_page(result: ADRCAutopilot, origin: Provenance) -> PilotPage:
         terms={} if flight is None or not flight.terms else logged_terms(flight),
         motors=[] if flight is None else motor_rows(flight),
         stages=None if proposal is None else stage_table(proposal, result.settings.fresh),
-        changes=change_rows(result.changes, result.words) if result.new else None,
+        changes=change_rows(result.changes(), result.words) if result.new else None,
         text=str(result), provenance=origin,
     )  # fmt: skip
 
@@ -322,7 +431,7 @@ def _steps_and_b0(
     result: ADRCAutopilot, proposal: ADRCProposal
 ) -> tuple[dict[str, StepBand], B0Section | None]:
     """Steps at the middle one of the throttles that were certified, and b0 over all of them."""
-    flown, schedule, plant = result.flown, proposal.schedule, result.plant
+    flown, schedule, plant = result.flown, proposal.frame.schedule, result.plant
     if plant is None:
         return {}, None
     middle = proposal.throttle[len(proposal.throttle) // 2]
@@ -334,7 +443,7 @@ def _steps_and_b0(
     levels = [plant.b0(k) for k in range(plant.throttle.size)]
     low, high = np.array([level.interval for level in levels]).T
     measured = GainBand(plant.throttle, np.array([level.value for level in levels]), low, high)
-    throttle, taken = np.linspace(float(plant.low.min()), float(plant.high.max()), _POINTS), {}
+    throttle, taken = np.linspace(float(plant.low.min()), float(plant.high.max()), _CURVE), {}
     if isinstance(flown, FlownADRC):
         b0 = proposal.stages["what flew"].b0 * flown.schedule.scale(throttle)
         taken["b0 that flew"] = ThrottleCurve(throttle, b0)

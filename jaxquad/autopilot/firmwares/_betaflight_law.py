@@ -17,9 +17,6 @@ from .._law import (
     AngleLoop,
     bounded,
     DEGREES,
-    filter_gyro,
-    gyro_rest,
-    low_pass_share,
     Memories,
     RateLoop,
     Signal,
@@ -212,7 +209,7 @@ class BetaflightPID(BetaflightRate):
     def rest(self, zero: Signal) -> dict[str, PyTree]:
         filters, dterm = self._chains()
         memory = {
-            "gyro": gyro_rest(self.gyro, zero), "filters": filters.init(zero),
+            "gyro": self.gyro_rest(zero), "filters": filters.init(zero),
             "dterm": dterm.init(zero), "reference": zero, "p": zero, "integral": zero, "d": zero,
         }  # fmt: skip
         if self.relax is not None:
@@ -226,18 +223,16 @@ class BetaflightPID(BetaflightRate):
     ) -> Advance:
         at = lambda gain: broadcast_gain(gain, measurement)
         r, speed = split_reference(reference, memory["reference"], self.dt)
-        gyro, (smooth, _) = filter_gyro(self.gyro, self.dt, memory["gyro"], DEGREES * measurement)
+        gyro, (smooth, _) = self.filter_gyro(memory["gyro"], DEGREES * measurement)
         filters, dterm = self._chains()
         next = {"gyro": gyro, "reference": r}
         next["filters"], y = filters.step(memory["filters"], smooth)
         next["dterm"], next["d"] = dterm.step(memory["dterm"], y)
         pulled = P_SCALE * at(self.p) * at(self.tpa_p) * (DEGREES * r - y)
-        share = low_pass_share(self.p_lowpass_hz, self.dt, y)
-        next["p"] = memory["p"] + share * (pulled - memory["p"])
+        next["p"] = self.low_passed(self.p_lowpass_hz, memory["p"], pulled)
         error = DEGREES * r - y
         if self.relax is not None:
-            share = low_pass_share(self.relax.cutoff_hz, self.dt, y)
-            next["slow"] = memory["slow"] + share * (DEGREES * r - memory["slow"])
+            next["slow"] = self.low_passed(self.relax.cutoff_hz, memory["slow"], DEGREES * r)
             error = self.relax.error(next["slow"], DEGREES * r, y, memory["integral"])
         ki = I_SCALE * at(self.i) * at(self.integral_factor) + at(self.accelerator)
         grown = ki * self.dt * at(self.integral_share) * error
@@ -301,13 +296,12 @@ class BetaflightADRC(BetaflightRate):
         self._chain()  # refuses what lies beyond half of the loop's rate
 
     def _chain(self) -> FilterChain:
-        """All filters of the rate at the loop's rate."""
         lowpass = (PT2(150.0),) if self.lowpass is None else self.lowpass
         return FilterChain((*self.filters, *lowpass), 1 / self.dt)
 
     def rest(self, zero: Signal) -> dict[str, PyTree]:
         return {
-            "gyro": gyro_rest(self.gyro, zero), "filters": self._chain().init(zero),
+            "gyro": self.gyro_rest(zero), "filters": self._chain().init(zero),
             "reference": zero, "slow": zero, "z": (zero, zero, zero), "command": zero,
         }  # fmt: skip
 
@@ -316,10 +310,9 @@ class BetaflightADRC(BetaflightRate):
     ) -> Advance:
         at = lambda gain: broadcast_gain(gain, measurement)
         r, speed = split_reference(reference, memory["reference"], self.dt)
-        gyro, (smooth, _) = filter_gyro(self.gyro, self.dt, memory["gyro"], DEGREES * measurement)
+        gyro, (smooth, _) = self.filter_gyro(memory["gyro"], DEGREES * measurement)
         filters, y = self._chain().step(memory["filters"], smooth)
-        share = low_pass_share(self.setpoint_lowpass_hz, self.dt, r)
-        slow = memory["slow"] + share * (DEGREES * r - memory["slow"])
+        slow = self.low_passed(self.setpoint_lowpass_hz, memory["slow"], DEGREES * r)
         b, wc = at(self.b0) * at(self.b0_scale), at(self.wc)
         z, wo, dt = memory["z"], jnp.minimum(at(self.wo), 0.5 / self.dt), self.dt
         drive, error, most = b * (memory["command"] - excess), z[0] - y, at(self.limit) * b

@@ -1,5 +1,6 @@
 """The Crazyflie: its rate and attitude PID, parameters and files."""
 
+from collections.abc import Mapping
 from typing import ClassVar
 
 import equinox as eqx
@@ -25,8 +26,6 @@ from .._law import (
     AngleLoop,
     bounded,
     DEGREES,
-    filter_gyro,
-    gyro_rest,
     Memories,
     RateLoop,
     require_gains,
@@ -34,7 +33,7 @@ from .._law import (
     split_reference,
     sum_of,
 )
-from ._crazyflie_log import LOG
+from ._logs import CRAZYFLIE as LOG
 
 
 class CrazyflieRate(RateLoop):
@@ -82,19 +81,18 @@ class CrazyflieRate(RateLoop):
         self._slope()  # refuses what lies beyond half of the loop's rate
 
     def _slope(self) -> FilterChain:
-        """The low-pass of the derivative."""
         cutoff = self.derivative_hz
         return FilterChain(() if cutoff is None else (Butterworth(cutoff),), 1 / self.dt)
 
     def rest(self, zero: Signal) -> dict[str, PyTree]:
         slope = self._slope().init(zero)
-        return {"gyro": gyro_rest(self.gyro, zero), "slope": slope, "y": zero, "integral": zero}
+        return {"gyro": self.gyro_rest(zero), "slope": slope, "y": zero, "integral": zero}
 
     def advance(
         self, memory: Memories, excess: Signal, reference: Reference, measurement: Signal
     ) -> Advance:
         r, _ = split_reference(reference, measurement, self.dt)
-        gyro, (y, _) = filter_gyro(self.gyro, self.dt, memory["gyro"], DEGREES * measurement)
+        gyro, (y, _) = self.filter_gyro(memory["gyro"], DEGREES * measurement)
         error = DEGREES * r - y
         slope, falling = self._slope().step(memory["slope"], (memory["y"] - y) / self.dt)
         integral = bounded(memory["integral"] + error * self.dt, self.integral_limit)
@@ -173,7 +171,7 @@ class Crazyflie(Firmware):
     def flown_loop(self, values, version, *, throttle, tracked_hz):
         raise ValueError("logs of the Crazyflie hold no parameters, so they do not tell its loop")
 
-    def channels(self, prefix: str, axis: int) -> Channels:
+    def channels(self, prefix: str, axis: int, values: Mapping[str, str]) -> Channels:
         return Channels()
 
     def what_to_fly(self, axis: str) -> str:

@@ -29,17 +29,14 @@ from .._law import (
     Advance,
     AngleLoop,
     bounded,
-    filter_gyro,
     FlownLoop,
-    gyro_rest,
-    low_pass_share,
     Memories,
     RateLoop,
     Signal,
     split_reference,
     sum_of,
 )
-from ._px4_log import LOG
+from ._logs import PX4 as LOG
 
 
 _FADED = np.deg2rad(400.0)  # rad/s of error at which the integral no longer grows
@@ -95,24 +92,23 @@ class PX4Rate(RateLoop):
         return dataclasses.replace(self, gyro=open)
 
     @property
-    def _sections(self) -> tuple[FilterChain, tuple[Section, ...]]:
-        """The gyro's filters, and the difference at their rate with its low-pass."""
-        gyro = self.gyro if self.gyro.filters else FilterChain((), 1 / self.dt)
-        slope = jnp.full((), gyro.rate_hz, self.p.dtype)
+    def _derivative(self) -> tuple[Section, ...]:
+        """The difference at the gyro's rate, and its low-pass."""
+        rate_hz = self.gyro.rate_hz if self.gyro.filters else 1 / self.dt
+        slope = jnp.full((), rate_hz, self.p.dtype)
         difference = Section(slope, -slope, jnp.zeros_like(slope))
-        return gyro, (difference, *PT1(self.derivative_hz).sections(gyro.rate_hz))
+        return difference, *PT1(self.derivative_hz).sections(rate_hz)
 
     def rest(self, zero: Signal) -> dict[str, PyTree]:
-        gyro, derivative = self._sections
-        return {"gyro": gyro_rest(gyro, zero, *derivative), "integral": zero, "torque": zero}
+        gyro = self.gyro_rest(zero, *self._derivative)
+        return {"gyro": gyro, "integral": zero, "torque": zero}
 
     def advance(
         self, memory: Memories, excess: Signal, reference: Reference, measurement: Signal
     ) -> Advance:
         at = lambda gain: broadcast_gain(gain, measurement)
         r, _ = split_reference(reference, measurement, self.dt)
-        chain, derivative = self._sections
-        gyro, (y, slope) = filter_gyro(chain, self.dt, memory["gyro"], measurement, *derivative)
+        gyro, (y, slope) = self.filter_gyro(memory["gyro"], measurement, *self._derivative)
         error, k, integral = r - y, at(self.k), memory["integral"]
         terms = {
             "P": k * at(self.p) * error, "I": integral,
@@ -122,8 +118,7 @@ class PX4Rate(RateLoop):
         open = jnp.where(excess < -_UNALLOCATED, jnp.maximum(open, 0.0), open)
         fade = jnp.maximum(0.0, 1 - (open / _FADED) ** 2)
         grown = integral + fade * k * at(self.i) * open * self.dt
-        share = low_pass_share(self.torque_hz, self.dt, measurement)
-        torque = memory["torque"] + share * (sum_of(terms) - memory["torque"])
+        torque = self.low_passed(self.torque_hz, memory["torque"], sum_of(terms))
         integral = bounded(grown, self.integral_limit)
         return {"gyro": gyro, "integral": integral, "torque": torque}, torque, terms
 
@@ -205,9 +200,6 @@ def px4_loop(values: Mapping[str, str], *, gyro_rate_hz: float = 8000.0) -> Flow
 
 
 _ESTIMATE = 0.004  # s, from one attitude estimate to the next
-
-
-_ESTIMATE = 0.004  # s, from one attitude estimate to the next
 _ABOVE: Range = (0, np.inf)
 _ROWS = [
     *rows_of_axes(_of("P"), "", (0.15, 0.15, 0.2), ((0.01, 0.5), (0.01, 0.6), (0, 0.6)), "p"),
@@ -248,7 +240,7 @@ class PX4(Firmware):
     def flown_loop(self, values, version, *, throttle, tracked_hz):
         return px4_loop(values)
 
-    def channels(self, prefix: str, axis: int) -> Channels:
+    def channels(self, prefix: str, axis: int, values: Mapping[str, str]) -> Channels:
         return Channels(
             unfiltered=[f"sensor_combined.gyro_rad[{k}]" for k in range(3)],
             motors=[f"actuator_motors.control[{k}]" for k in range(4)],

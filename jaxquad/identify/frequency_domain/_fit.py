@@ -1,14 +1,28 @@
-"""Fits of models to frequency responses, by a weighted cost."""
+"""Fits of models to frequency responses, by a weighted cost, from one start or from many."""
 
 import contextlib
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import PyTree
+from jaxtyping import Float, PyTree
 
-from jaxquad._core import Message, one_blas_thread, require_x64
+from jaxquad._core import (
+    concrete_values,
+    CONVERGED,
+    decrement,
+    is_traced,
+    Message,
+    minimise,
+    one_blas_thread,
+    require_x64,
+    RUNNING,
+    STALLED,
+    TOLERANCE,
+)
 from jaxquad.models import LaggedIntegrator, with_arrays
 from jaxquad.spectra import FrequencyResponse
 
@@ -22,7 +36,7 @@ from ._cost import (
     describe_usable,
     least_coherence,
     MaximumLikelihood,
-    mixings_of,
+    mixing_of,
     Points,
     points_of,
     precise_points,
@@ -30,19 +44,41 @@ from ._cost import (
     Weights,
     widen_band,
 )
-from ._parameters import Condition, Free, Numbers, select_parameters, Tie
+from ._derivatives import Descent, Inputs, with_derivatives
+from ._feedthrough import (
+    find_samples,
+    free_delays,
+    limited,
+    remarks_on_samples,
+    sample_limits,
+    unsampled,
+)
+from ._parameters import Condition, Free, Numbers, Parameters, select_parameters, Tie
 from ._problem import (
     make_problem,
     Prior,
     Problem,
+    problem_normal,
     require_model,
     require_model_response,
     require_priors,
+    residuals,
 )
 from ._refits import Options, Origin
 from ._result import Fit
-from ._solve import Solution
-from ._starts import solve_from_many, spread_starts
+from ._solve import (
+    FLAT,
+    least_squares,
+    MINIMUM,
+    Minimum,
+    NOT_FINITE,
+    SADDLE,
+    Solution,
+    solution_at,
+    stopped_early,
+    UNFINISHED,
+    WALL,
+)
 
 
 _SMALL = 256  # frequencies, up to which a second thread of BLAS waits longer than it works
@@ -140,6 +176,9 @@ def fit(
     Source: docs/identification.md; Eq. (14) of the paper, as corrected in docs/equations.md.
     """
     require_x64("a fit")
+    inputs = Inputs(model, frf, conditions, priors)
+    if traced := is_traced(inputs):
+        model, frf, conditions, priors = concrete_values(inputs, "jq.fit")
     require_model("fit", model)
     frfs = require_responses(frf)
     if conditions is None:
@@ -148,23 +187,33 @@ def fit(
     options = Options(
         free, tied, cost, conditions, priors, band, min_coherence, starts, solver, max_steps
     )
-    return fit_with(model, frfs, options)
+    descents: list[Descent] = []
+    fit = fit_with(model, frfs, options, descents=descents)
+    return with_derivatives(fit, descents, inputs, cost) if traced else fit
 
 
 def fit_with(
-    model: PyTree, frfs: Sequence[FrequencyResponse], options: Options, *, rounds: int = 3
+    model: PyTree,
+    frfs: Sequence[FrequencyResponse],
+    options: Options,
+    *,
+    rounds: int = 3,
+    descents: list[Descent] | None = None,
 ) -> Fit:
-    """Fit as `jq.fit` does.
-
-    `rounds` is how often to solve again with what the model leaves unexplained as a floor on the
-    random error; 0 for estimates under the noise alone, whose costs compare structures.
-    """
+    """Fit as `jq.fit` does, and up to `rounds` times more with what the model leaves unexplained as
+    a floor on the random error; without, costs compare structures. `descents` gets all of them."""
     small = all(np.size(frf.omega) <= _SMALL for frf in frfs)
     with one_blas_thread() if small else contextlib.nullcontext():
-        return _fit(with_arrays(model), frfs, options, rounds)
+        return _fit(with_arrays(model), frfs, options, rounds, [] if descents is None else descents)
 
 
-def _fit(model: PyTree, frfs: Sequence[FrequencyResponse], options: Options, rounds: int) -> Fit:
+def _fit(
+    model: PyTree,
+    frfs: Sequence[FrequencyResponse],
+    options: Options,
+    rounds: int,
+    descents: list[Descent],
+) -> Fit:
     # The problem: points, parameters, priors.
     cost, band, solver, max_steps = options.cost, options.band, options.solver, options.max_steps
     parameters = select_parameters(model, options.free, options.tied)
@@ -195,7 +244,11 @@ def _fit(model: PyTree, frfs: Sequence[FrequencyResponse], options: Options, rou
         return unfitted(model, parameters, verdict, tuple(remarks))
     problem = make_problem(model, parameters, frfs, options.conditions, options.priors)
     pairs = zip(usable_points, problem.silences, strict=True)
-    points = points_of(frfs, [mask & ~silent for mask, silent in pairs])
+    masks = (mask & ~silent for mask, silent in pairs)
+    points = [points_of(*pair) for pair in zip(frfs, masks, strict=True)]
+    delays = free_delays(problem)
+    if delays:
+        problem = unsampled(problem, delays)
 
     def weigh(points: Sequence[Points], solution: Solution | None) -> list[Weights]:
         """By the ratio of model to measurement at a solution; 1 before there is one."""
@@ -207,7 +260,8 @@ def _fit(model: PyTree, frfs: Sequence[FrequencyResponse], options: Options, rou
 
     def weighted(points: Sequence[Points], weights: Sequence[Weights]) -> Problem:
         """Only a likelihood knows what it would mean that points share noise."""
-        return problem.weighted(weights, mixings_of(points, weights) if is_likelihood else None)
+        pairs = zip(points, weights, strict=True)
+        return problem.weighted(weights, [mixing_of(*x) for x in pairs] if is_likelihood else None)
 
     def are_close(old: Sequence[Numbers], new: Sequence[Weights], share: float) -> bool:
         both = zip(map(np.asarray, old), new, strict=True)
@@ -224,10 +278,15 @@ def _fit(model: PyTree, frfs: Sequence[FrequencyResponse], options: Options, rou
         starts = spread_starts(parameters, options.starts, fastest=fastest)
         solution, minima = solve_from_many(problem, starts, solver, max_steps)
         solution = solve_within_bounds(problem, solution, solver, max_steps)
+    solve_from = lambda problem, z: solve_within_bounds(problem, z, solver, max_steps)
+    if delays:
+        problem, solution = find_samples(problem, solution, delays, solve_from)
+    descents.append(Descent(problem, points, solution))
     again = weigh(points, solution)
     if not are_close(weights, again, 1e-4):
         problem = weighted(points, again)
         solution = solve_within_bounds(problem, solution.z, solver, max_steps)
+        descents.append(Descent(problem, points, solution))
     _check_finite(solution)
     check_priors(problem, solution)
     # Again with what the model leaves unexplained as a floor on the random error, where it does
@@ -241,12 +300,19 @@ def _fit(model: PyTree, frfs: Sequence[FrequencyResponse], options: Options, rou
             break
         problem, lifted = weighted(raised, weights), True
         solution = solve_within_bounds(problem, solution.z, solver, max_steps)
+        descents.append(Descent(problem, raised, solution))
         _check_finite(solution)
+        weighting = weighting_at(problem, points, solution)
+    limits, within = sample_limits(problem, solution, delays, solve_from)
+    if limits:
+        problem = limited(problem, limits)
+        descents.clear()  # what limits a delay to its sample has no derivative
+        solution = solve_from(problem, within.z)
         weighting = weighting_at(problem, points, solution)
     if lifted:
         weighting = weighting._replace(by_noise=weighted(points, weigh(points, solution)))
+    remarks = remarks_on_samples(problem, limits, frfs)
     # Responses that were measured, and that the model has none of.
-    remarks = []
     for frf, mask, pairs in zip(frfs, usable_points, problem.silent, strict=True):
         for o, i in pairs:
             error = np.asarray(frf.random_error)[mask[:, o, i], o, i]
@@ -321,3 +387,125 @@ def check_priors(problem: Problem, solution: Solution) -> None:
             f"prior {idle[0] + 1} is on a quantity that no free parameter changes: free its "
             f"parameter, or leave the prior out; free are {', '.join(problem.parameters.names)}"
         )
+
+
+def spread_starts(
+    parameters: Parameters, count: int, *, fastest: float, factor: float = 5.0, seed: int = 0
+) -> Float[np.ndarray, "starts parameters"]:
+    """Starting vectors `z`: the given start, then a Latin hypercube around it.
+
+    Parameters that keep their sign spread evenly in the logarithm, those that may cross zero over
+    twice their scale. A parameter whose name ends in `delay` stays below half a turn at the fastest
+    frequency, beyond which minima repeat with each turn.
+
+    **Arguments:**
+
+    - `fastest`: the highest frequency in rad/s.
+    - `factor`: how far to spread to both sides, above 1.
+
+    **Raises:** ValueError for no starts, or a factor that spreads nothing.
+    """
+    if count < 1:
+        raise ValueError(f"starts is {count}: give 1 for the given start alone, or more")
+    if not (1 < factor < np.inf and 0 < fastest < np.inf):
+        raise ValueError(
+            f"factor {factor} and fastest frequency {fastest} rad/s: give a finite factor above 1, "
+            "for instance 5, and a positive frequency"
+        )
+    n, rng = parameters.count, np.random.default_rng(seed)
+    start, scale = (np.asarray(x)[:n] for x in (parameters.start, parameters.scale))
+    cells = np.stack([rng.permutation(count - 1) for _ in range(n)], axis=1).reshape(count - 1, n)
+    unit = (cells + rng.uniform(size=cells.shape)) / max(count - 1, 1)
+    logarithmic = np.array(parameters.logarithmic[:n])
+    reach = np.where(logarithmic, np.log(factor), 2.0)
+    low, high = start - reach, start + reach
+    for k, name in enumerate(parameters.names):
+        if name.split(".")[-1].split("[")[0].endswith("delay") and logarithmic[k]:
+            most = max(np.log(np.pi / fastest / abs(scale[k])), start[k])
+            high[k] = min(high[k], most)
+    return np.concatenate([start[None], low + (high - low) * unit])
+
+
+def solve_from_many(
+    problem: Problem,
+    starts: Float[np.ndarray, "starts parameters"],
+    solver: eqx.Module | None,
+    max_steps: int,
+) -> tuple[Solution, tuple[Minimum, ...]]:
+    """Solve from every start in one call.
+
+    Starts of the default solver run side by side, those of an optimistix solver one by one, since
+    its LAPACK calls can hang under `vmap`.
+
+    **Returns:** the best solution, a minimum before a lower point that is none; and all distinct
+    points, sorted by cost.
+
+    **Raises:** ValueError where no start has a finite response.
+    """
+    stops = jax.tree.map(np.asarray, _solve_all(problem, np.asarray(starts), solver, max_steps))
+    z, status, steps, normal, left, bent = stops
+    costs, groups = normal.cost, list[list[int]]()
+
+    def same(one: int, other: int) -> bool:
+        """Those within a millionth of the cost are one."""
+        floor, difference = 1e-6 * (costs[one] + 1e-6), np.asarray(z[one] - z[other])
+        if abs(costs[other] - costs[one]) > floor:
+            return False
+        near = bool(np.max(np.abs(difference)) <= 1e-4)
+        return near or bool(0.5 * difference @ normal.hessian[one] @ difference <= floor)
+
+    for k in (int(k) for k in np.argsort(costs) if np.isfinite(costs[k])):
+        group = next((group for group in groups if same(group[0], k)), None)
+        groups.append([k]) if group is None else group.append(k)
+    if not groups:
+        raise ValueError(
+            f"the model's response is not finite at any of {len(starts)} starts: check the model "
+            "at its starting values with model.frequency_response(omega)"
+        )
+    minima = []
+    for k, *others in groups:
+        curvature, cost = -np.inf, float(costs[k])
+        if np.all(np.isfinite(bent[k])):
+            size = np.sqrt(np.maximum(np.abs(np.diagonal(bent[k])), 1e-300))
+            curvature = float(np.linalg.eigvalsh(bent[k] / np.outer(size, size))[0])
+        # Noise-free data leave a cost of rounding errors, of which no share means anything.
+        if left[k] > 1e-6 * cost + 1e-12:
+            kind = UNFINISHED if status[k] == RUNNING else WALL
+        elif curvature < -1e-6:
+            kind = SADDLE
+        else:
+            kind = MINIMUM if curvature > 1e-9 else FLAT
+        values, led = np.asarray(problem.parameters.values(z[k])), tuple(sorted([k, *others]))
+        minima.append(Minimum(2 * cost, z[k], values, led, float(left[k]), curvature, kind))
+    best = min(minima, key=lambda point: (not point.is_minimum, point.cost))
+    if lost := tuple(k for k in range(len(z)) if not np.isfinite(costs[k])):
+        values = np.asarray(problem.parameters.values(z[lost[0]]))
+        minima.append(Minimum(np.inf, z[lost[0]], values, lost, np.inf, -np.inf, NOT_FINITE))
+    reason, count = (int(part[best.starts[0]]) for part in (status, steps))
+    message = "" if best.is_minimum else best.kind
+    if message and reason in (RUNNING, STALLED):
+        message = stopped_early(reason, count)
+    return solution_at(problem, best.z, message, count), tuple(minima)
+
+
+@eqx.filter_jit
+def _solve_all(problem, starts, solver, max_steps) -> tuple:
+    """Of every start: `z`, status and steps of its stop; there the normal equations, the Newton
+    decrement, and second derivatives of half the cost."""
+
+    def normal_at(z):
+        return problem_normal(z, problem)
+
+    if solver is None:
+        side_by_side = jax.vmap(normal_at, in_axes=-1, out_axes=-1)
+        state = minimise(side_by_side, starts.T, max_steps, TOLERANCE)
+        z, status, steps = state.z.T, state.status, state.steps
+    else:
+        solve = lambda z0: least_squares(residuals, z0, problem, solver=solver, max_steps=max_steps)
+        stop = jax.lax.map(solve, starts)
+        z, steps = stop.z, stop.steps
+        status = jnp.where(stop.converged, CONVERGED, RUNNING)
+    normal = jax.vmap(normal_at)(z)
+    # Forward over forward: a model need not support reverse differentiation.
+    bent = jax.vmap(jax.jacfwd(lambda z: normal_at(z).gradient))(z)
+    return z, status, steps, normal, jax.vmap(decrement)(normal), bent

@@ -11,7 +11,14 @@ import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, PyTree
 
 from jaxquad._compile import evaluate_once, FEW, no_fuse
-from jaxquad._core import Message, Normal, normal_equations, on_host, pytree_node
+from jaxquad._core import (
+    is_traced,
+    Message,
+    Normal,
+    normal_equations,
+    on_host,
+    pytree_node,
+)
 from jaxquad.models import evaluate_response, LaggedIntegrator, StateSpace, TransferFunction
 from jaxquad.spectra import FrequencyResponse
 
@@ -46,10 +53,12 @@ class Prior(eqx.Module):
     """
 
     quantity: str | Callable[[PyTree], Float[Array, ""]] = eqx.field(static=True)
-    value: float = eqx.field(static=True)
-    standard_error: float = eqx.field(static=True)
+    value: float | Float[Numbers, ""]
+    standard_error: float | Float[Numbers, ""]
 
     def __check_init__(self):
+        if is_traced(self):  # by a derivative
+            return
         if not (0 < self.standard_error < np.inf and np.isfinite(self.value)):
             raise ValueError(
                 f"a prior of {self.value} with standard error {self.standard_error}: give a finite "
@@ -154,14 +163,8 @@ def make_problem(
 
 def on_device(model: PyTree) -> PyTree:
     """The model with JAX's arrays in the place of NumPy's."""
-    leaves, structure = jax.tree.flatten(model)
-    hosted = [k for k, leaf in enumerate(leaves) if isinstance(leaf, np.ndarray)]
-    if not hosted:
-        return model
-    # In one call: it takes as long as for a single array.
-    for k, array in zip(hosted, jax.device_put([leaves[k] for k in hosted]), strict=True):
-        leaves[k] = array
-    return jax.tree.unflatten(structure, leaves)
+    hosted, rest = eqx.partition(model, lambda leaf: isinstance(leaf, np.ndarray))
+    return eqx.combine(jax.device_put(hosted), rest)
 
 
 def _silent_pairs(
@@ -256,10 +259,8 @@ def weigh_parts(problem: Problem, k: int, magnitude: Part, phase: Part) -> tuple
 
 
 def misfits(z: Float[Array, " n"], problem: Problem) -> Float[Array, " residuals"]:
-    """The magnitudes and then the phases of one record after the other, then the priors.
-
-    Each is (outputs, inputs, frequencies), flattened.
-    """
+    """The magnitudes and then the phases of one record after the other, then the priors. Each is
+    (outputs, inputs, frequencies), flattened."""
     parts = [part.reshape(-1) for log in _log_ratios(z, problem) for part in log]
     return jnp.concatenate([*parts, prior_misfits(z, problem)])
 

@@ -40,11 +40,8 @@ class Options(NamedTuple):
 
 @pytree_node
 class Origin:
-    """The responses and options of a fit.
-
-    `run(model, responses, options, rounds=...)` fits as `jq.fit` does; 0 rounds leave out what the
-    model does not explain, so that costs compare structures.
-    """
+    """The responses and options of a fit. `run(model, responses, options, rounds=...)` fits as
+    `jq.fit` does; with 0 rounds, costs compare structures."""
 
     run: Callable[..., PyTree] = eqx.field(static=True)
     points: tuple[Points, ...]

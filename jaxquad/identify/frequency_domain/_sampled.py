@@ -1,16 +1,19 @@
 """What a sampled record shows of a model whose input is held: its response with all aliases."""
 
+import dataclasses
 from collections.abc import Sequence
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, PyTree
 
 from jaxquad._core import Message, pytree_node
-from jaxquad.models import evaluate_response, imaginary
+from jaxquad.models import evaluate_response, feedthrough, imaginary, StateSpace, TransferFunction
 from jaxquad.spectra import FrequencyResponse
 
+from ..output_error._simulated import HasStateSpace, HasTransferFunction, linear_model
 from ._parameters import namespace_of, Numbers
 
 
@@ -20,6 +23,8 @@ _TRIED = 32  # frequencies at which the two are chosen
 _TOLERANCE = 1e-8  # of the response, to which they are chosen
 _FLAT = 0.3  # of the sum, over which its window stays at 1
 _SECOND = 0.7  # length of a second window over that of the first
+_WHOLE = 1e-9  # samples; a delay this close to whole samples is whole, whatever the rounding
+_LEVEL = 0.5  # of a response over three octaves of aliases: it does not decay
 
 
 @pytree_node
@@ -29,7 +34,8 @@ class Aliases:
     Held for h seconds each, the samples u[k] give a plant G the sampled response
     T(w) = sum_k G(j(w + k ws)) H(j(w + k ws)) / h, H(s) = (1 - e^(-s h)) / s, ws = 2 pi / h.
     The numerator of H is common to all terms; what is left of those with k other than 0 is smooth
-    over the band, so that a few nodes carry it.
+    over the band, so that a few nodes carry it. What passes directly, D e^(-delay s), does not
+    decay: it is taken out of the sum and shows as D z^-n, n = ceil(delay / h).
     Source: Franklin, Powell and Workman, "Digital Control of Dynamic Systems", 3rd ed., ch. 5.
     """
 
@@ -38,6 +44,11 @@ class Aliases:
     upper: Float[Numbers, "nodes aliases"]  # rad/s
     lower: Float[Numbers, "nodes aliases"]  # rad/s, of the negative frequencies
     weights: Float[Numbers, " aliases"]  # of the sum
+    hold: Float[Numbers, ""]  # s
+    # n of the direct part, if there is one; delay / h + 1/2 where it is nan.
+    samples: Float[Numbers, "outputs inputs"] | None = None
+    # Whether the response stays level instead, and the model's kind does not tell its direct part.
+    is_level: bool = eqx.field(static=True, default=False)
 
     @property
     def omega(self) -> Float[Numbers, " others"]:
@@ -90,12 +101,45 @@ def _aliases_at(omega, hold: float, count: int, nodes: np.ndarray | None = None)
     place = np.arange(1, count + 1) / (count + 1)
     weights = (window(place) - _SECOND * window(place / _SECOND)) / (1 - _SECOND)
     spread = turn[:, None] * across.astype(turn.dtype)
-    return Aliases(turn / _imaginary(omega), spread, at + steps, steps - at, weights)
+    return Aliases(
+        turn / _imaginary(omega), spread, at + steps, steps - at, weights, np.asarray(hold)
+    )
+
+
+def direct_part(
+    model: PyTree,
+) -> tuple[Float[Array, "outputs inputs"], Float[Array, "outputs inputs"]] | None:
+    """The gain and the delay in s of what passes directly, as far as the model tells them."""
+    kinds = TransferFunction | StateSpace | HasStateSpace | HasTransferFunction
+    return feedthrough(linear_model(model)) if isinstance(model, kinds) else None
+
+
+def whole_samples(
+    delay: Float[Numbers, "outputs inputs"], hold: float | Float[Numbers, ""]
+) -> Float[Numbers, "outputs inputs"]:
+    """After how many samples a held input shows directly; where it jumps, the value just after."""
+    return namespace_of(delay).ceil(delay / hold - _WHOLE)
+
+
+def _split_direct(model: PyTree, omega: Float[Array, " frequencies"]):
+    """The response without its direct part, and that part."""
+    response, direct = evaluate_response(model, omega), direct_part(model)
+    if direct is None:
+        return response, None
+    return response - _late(*direct, omega), direct
+
+
+def _late(
+    gain: Float[Array, "outputs inputs"], delay: Float[Array, "outputs inputs"], omega: Array
+) -> Complex[Array, "frequencies outputs inputs"]:
+    """gain e^(-j omega delay)."""
+    turned = omega[:, None, None] * delay[None]
+    return jax.lax.complex(gain[None] * jnp.cos(turned), -gain[None] * jnp.sin(turned))
 
 
 @eqx.filter_jit
 def _evaluate(model, omega, others):
-    return evaluate_response(model, jnp.concatenate([omega, others]))
+    return _split_direct(model, jnp.concatenate([omega, others]))
 
 
 def plan_aliases(model: PyTree, frf: FrequencyResponse) -> Aliases:
@@ -103,7 +147,7 @@ def plan_aliases(model: PyTree, frf: FrequencyResponse) -> Aliases:
     hold, omega = hold_of(frf), np.asarray(frf.omega)
     tried = omega[np.unique(np.linspace(0, omega.size - 1, _TRIED).round().astype(int))]
     aliases = _aliases_at(tried, hold, _COUNTS[-1])
-    response = np.asarray(_evaluate(model, tried, aliases.omega))
+    response, passing = jax.tree.map(np.asarray, _evaluate(model, tried, aliases.omega))
     bad = ~np.isfinite(response).all(axis=tuple(range(1, response.ndim)))
     if bad.any():
         first = np.concatenate([tried, np.ravel(aliases.omega)])[int(np.argmax(bad))]
@@ -122,6 +166,9 @@ def plan_aliases(model: PyTree, frf: FrequencyResponse) -> Aliases:
         plan = _aliases_at(tried, hold, count, None if nodes is None else tried[nodes])
         return np.asarray(plan.total(direct, some.reshape(-1, *direct.shape[1:])))
 
+    samples = None if passing is None else np.asarray(whole_samples(passing[1], hold))
+    top, middle = (np.abs(others[0, 0, k - 1]) for k in (_COUNTS[-1], _COUNTS[-1] // 8))
+    is_level = passing is None and bool(np.any((top > _LEVEL * middle) & (middle > 0)))
     best = total(_COUNTS[-1], None)
     close = lambda *plan: bool(np.all(np.abs(total(*plan) - best) <= _TOLERANCE * abs(best)))
     count = next(count for count in _COUNTS if close(count, None))
@@ -133,8 +180,11 @@ def plan_aliases(model: PyTree, frf: FrequencyResponse) -> Aliases:
             left.remove(min(left, key=lambda k: abs(tried[k] - target)))
         nodes = np.setdiff1d(np.arange(tried.size), left)
         if close(count, nodes):
-            return _aliases_at(omega, hold, count, tried[nodes])
-    return _aliases_at(omega, hold, count)
+            plan = _aliases_at(omega, hold, count, tried[nodes])
+            break
+    else:
+        plan = _aliases_at(omega, hold, count)
+    return dataclasses.replace(plan, samples=samples, is_level=is_level)
 
 
 def evaluate_sampled(
@@ -144,8 +194,16 @@ def evaluate_sampled(
     omega = jnp.asarray(omega)
     if aliases is None:
         return evaluate_response(model, omega)
-    both = evaluate_response(model, jnp.concatenate([omega, aliases.omega]))
-    return jnp.asarray(aliases.total(both[: omega.size], both[omega.size :]))
+    everywhere = jnp.concatenate([omega, aliases.omega])
+    if aliases.samples is None:
+        both = evaluate_response(model, everywhere)
+        return jnp.asarray(aliases.total(both[: omega.size], both[omega.size :]))
+    both, direct = _split_direct(model, everywhere)
+    assert direct is not None
+    gain, late = direct
+    total = jnp.asarray(aliases.total(both[: omega.size], both[omega.size :]))
+    samples = jnp.where(jnp.isnan(aliases.samples), late / aliases.hold + 0.5, aliases.samples)
+    return total + _late(gain, jnp.asarray(aliases.hold * samples), omega)
 
 
 class SampledModel(eqx.Module):
@@ -158,8 +216,10 @@ class SampledModel(eqx.Module):
         self, omega: Float[Array, " frequencies"]
     ) -> Complex[Array, "frequencies outputs inputs"]:
         """At frequencies below half the sample rate."""
-        omega = jnp.asarray(omega)
-        return evaluate_sampled(self.model, omega, _aliases_at(omega, self.hold, _COUNTS[0]))
+        omega, direct = jnp.asarray(omega), direct_part(self.model)
+        samples = None if direct is None else whole_samples(direct[1], self.hold)
+        aliases = dataclasses.replace(_aliases_at(omega, self.hold, _COUNTS[0]), samples=samples)
+        return evaluate_sampled(self.model, omega, aliases)
 
 
 def as_sampled(model: PyTree, frf: FrequencyResponse) -> PyTree:

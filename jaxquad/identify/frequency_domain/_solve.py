@@ -41,10 +41,10 @@ Residual = Callable[[Float[Array, " parameters"], PyTree], Float[Array, " residu
 class Sensitivity(NamedTuple):
     """Misfits and their derivatives with respect to free and then fixed parameters."""
 
-    misfits: list[Float[np.ndarray, "frequencies outputs inputs 2"]]  # magnitude and phase
-    slopes: list[Float[np.ndarray, "frequencies outputs inputs 2 all"]]  # of the misfits
-    prior_misfits: Float[np.ndarray, " priors"]
-    prior_slopes: Float[np.ndarray, "priors all"]
+    misfits: list[Float[Numbers, "frequencies outputs inputs 2"]]  # magnitude and phase
+    slopes: list[Float[Numbers, "frequencies outputs inputs 2 all"]]  # of the misfits
+    prior_misfits: Float[Numbers, " priors"]
+    prior_slopes: Float[Numbers, "priors all"]
 
     def weighted(self, problem: Problem) -> Float[np.ndarray, " residuals"]:
         """The residuals of the points in use, and then of the priors."""
@@ -75,6 +75,31 @@ class Solution(NamedTuple):
         return not self.message
 
 
+MINIMUM = "minimum"
+FLAT = "flat: some change of parameters does not change the cost"
+SADDLE = "stationary, but no minimum: the cost falls to one side"
+WALL = "no minimum: no shorter step lowers the cost, yet its slope is not zero"
+UNFINISHED = "the maximum number of steps was reached"
+NOT_FINITE = "the model is not finite at the start"
+
+
+class Minimum(NamedTuple):
+    """A point at which the fits from some of the starts ended."""
+
+    cost: float  # sum of squares
+    z: Float[np.ndarray, " parameters"]
+    values: Float[np.ndarray, " parameters"]  # physical
+    starts: tuple[int, ...]  # which of them led here
+    decrement: float  # Newton decrement: half of what one more step would save of the cost
+    curvature: float  # smallest eigenvalue of the cost's Hessian, scaled to unit diagonal
+    kind: str  # "minimum", or what it is instead
+
+    @property
+    def is_minimum(self) -> bool:
+        """Whether slope and curvature are those of a minimum, isolated or flat."""
+        return self.kind in (MINIMUM, FLAT)
+
+
 class Frame(NamedTuple):
     """A problem without its arrays: what a program is compiled for."""
 
@@ -101,7 +126,8 @@ class _Unweighted:
 
     def __init__(self, problem: Problem):
         self.problem = problem
-        self.ids = tuple(map(id, (problem.model, problem.measured, problem.parameters)))
+        names = ("model", "measured", "parameters", "aliases", "prior")
+        self.ids = tuple(id(getattr(problem, name)) for name in names)
 
     def __hash__(self) -> int:
         return hash(self.ids)
@@ -124,11 +150,8 @@ def has_few_slopes(problem: Problem) -> bool:
 
 
 def evaluate(problem: Problem, *places: Vector) -> list[Sensitivity]:
-    """Misfits and slopes at values of the free parameters, at all places in parallel.
-
-    Records of equal shape share a program, whatever they are weighted by: compiling it takes longer
-    than a fit.
-    """
+    """Misfits and slopes at all places in parallel. Records of equal shape share a program,
+    whatever they are weighted by: compiling it takes longer than a fit."""
     programs, running = _parts(_Unweighted(problem)), []
     for z in places:
         z_all = np.array(problem.parameters.start)
@@ -140,11 +163,11 @@ def evaluate(problem: Problem, *places: Vector) -> list[Sensitivity]:
         if len(parts) != 1:  # all records, one after the other
             all_misfits, slopes = zip(none, *parts, strict=True)
             parts = [(np.concatenate(all_misfits), np.concatenate(slopes, axis=1))]
-        evaluations.append(_by_record(problem, *parts[0]))
+        evaluations.append(by_record(problem, *parts[0]))
     return evaluations
 
 
-def _by_record(problem: Problem, lined_up: np.ndarray, rows: np.ndarray) -> Sensitivity:
+def by_record(problem: Problem, lined_up: Numbers, rows: Numbers) -> Sensitivity:
     parts, slopes, start = [], [], 0
     for measured in problem.measured:
         shape, size = (2, *measured.shape[1:], len(measured)), 2 * measured.size
@@ -300,7 +323,7 @@ def solve(problem: Problem, z0: Vector, solver: eqx.Module | None, max_steps: in
             model = take_apart(problem.model)[0].filled(leaves)  # while the program runs
             message, steps = stop.message, int(np.asarray(stop.steps))
             z, values, slopes, *parts, aside = map(np.asarray, (stop.z, *rest))
-            parts = message, steps, _by_record(problem, *parts)
+            parts = message, steps, by_record(problem, *parts)
             return Solution(z, model, values, slopes, *parts, aside=aside)
     return solution_at(problem, np.asarray(stop.z), stop.message, int(np.asarray(stop.steps)))
 
@@ -363,9 +386,7 @@ def _program(frame: Frame, kind: str, *options: int) -> Callable[[list[Numbers]]
 
 def is_saddle(problem: Problem, solution: Solution, here: float, bread: np.ndarray) -> bool:
     """Whether the cost is lower than `here`, at the solution, a small step to either side of it.
-
-    `bread` is J'J of its weighted residuals.
-    """
+    `bread` is J'J of its weighted residuals."""
     costs = solution.aside
     if costs is None:
         sides = evaluate(problem, *_sides(solution.z, bread, np.asarray(here)))
@@ -404,12 +425,8 @@ def _sides(
 
 def same_responses(problem: Problem, solution: Solution, values: np.ndarray) -> bool:
     """Whether other values of the free parameters leave all responses as they are."""
-    parameters, count = problem.parameters, problem.parameters.count
-    ratio = values / np.asarray(parameters.scale)[:count]
-    logarithmic = np.array(parameters.logarithmic[:count])
-    if np.any(logarithmic & (ratio < 0)):
+    if (z := problem.parameters.coordinates(values)) is None:
         return False
-    z = np.where(logarithmic, np.log(np.where(logarithmic, np.maximum(ratio, 1e-300), 1.0)), ratio)
     moved = solution_at(problem, z).sensitivity.misfits
     pairs = zip(moved, solution.sensitivity.misfits, strict=True)
     return all(np.allclose(*pair, atol=1e-6, rtol=0, equal_nan=True) for pair in pairs)

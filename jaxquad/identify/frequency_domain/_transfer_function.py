@@ -298,9 +298,7 @@ class _Orders(NamedTuple):
 
     def free(self, start: TransferFunction, omega: Float[np.ndarray, " frequencies"]) -> list[Real]:
         """All coefficients but the leading 1 and the integrators' zeros; a delay unless it is 0.
-
-        Each with its size, or what would double the response somewhere if it is near 0.
-        """
+        Each with its size, or what would double the response somewhere if it is near 0."""
         sizes = []
         for coefficients in map(np.asarray, (start.numerator, start.denominator)):
             terms = omega[:, None] ** np.arange(coefficients.size - 1, -1, -1.0)
@@ -367,7 +365,7 @@ def _usable_pair(
             f"{describe_usable([pair], count, least)}, and {orders.unknowns} coefficients "
             f"need at least {needed}"
         )
-    return points_of([pair], [used])[0], reason
+    return points_of(pair, used), reason
 
 
 def _no_numbers(orders: _Orders, reason: str, remarks: tuple[str, ...]) -> Fit:

@@ -104,14 +104,12 @@ def descend(
             "frequency domain with jq.fit"
         )
     options = {"max_steps": max_steps, "tolerance": tolerance}
-    if isinstance(start, FilteredPoint):
-        end, status, steps = minimise_on_host(start, FilteredPoint.moved, **options)
-        precise = end.is_precise
-        stop = Point(problem, end.z, end.evaluation) if precise else Point.at(problem, end.z)
-    else:
-        precise, stop, status, steps = False, start, RUNNING, 0
-    if not precise:
-        stop, status, steps = minimise_on_host(stop, Point.moved, **options)
+    move = lambda point, change: point.moved(change)
+    stop, status, steps = minimise_on_host(start, move, **options)
+    if isinstance(stop, FilteredPoint) and stop.is_precise:
+        stop = Point(problem, stop.z, stop.evaluation)
+    elif isinstance(stop, FilteredPoint):
+        stop, status, steps = minimise_on_host(Point.at(problem, stop.z), move, **options)
     message = ""
     if status == RUNNING:
         message = f"the maximum of {steps} steps was reached"
@@ -301,10 +299,8 @@ def _residuals(plain: Evaluation, models: Models) -> Residuals:
 
 
 def with_fixed_slopes(descent: Descent) -> Evaluation:
-    """The misfits' slopes by the free parameters, then the fixed, then the initial states.
-
-    Central differences: they serve for names alone, and compile nothing anew.
-    """
+    """The misfits' slopes by the free parameters, then the fixed, then the initial states. Central
+    differences: they serve for names alone, and compile nothing anew."""
     problem, step = descent.problem, _STEP_FIXED_SLOPES
     parameters, values = problem.base.parameters, np.asarray(descent.solution.values)
     count, fixed = parameters.count, []

@@ -26,7 +26,6 @@ from jaxquad.models import sample_rational, TransferFunction
 
 from ..frequency_domain._parameters import Numbers
 from ..frequency_domain._solve import evaluate, Frame, take_apart
-from ._noise import row_products
 from ._problem import Evaluation, insert_parameters, OutputError, RecordTerm
 from ._simulated import band_filter, linear_model
 
@@ -35,12 +34,9 @@ _MOST = 4  # poles, beyond which the coefficients of A may say too little of the
 _DIGITS = 1e6  # rounding of the output, in units of the last bit of its largest value
 _RIDGE = 1e-10  # of the squared length of a column, and taken out again by refinement
 _REFINEMENTS = 3
-_CLOSE = 1e-8  # a step, relative to 1 + |z|, whose square is rounding
-_GONE = 1e-20  # of the states, relative to their start
 
 Samples = Float[np.ndarray, " samples"]
 Values = Float[np.ndarray, " parameters"]  # in the coordinates of the descent
-Moving = Float[np.ndarray, "motions moving"]
 Rows = Float[np.ndarray, "rows samples"]
 
 
@@ -56,28 +52,13 @@ class Sampled(NamedTuple):
 
 
 class Columns(NamedTuple):
-    """What start and trim do to a record: a unit shift, then the free motions.
+    """What start and trim do to a record: a unit shift, then the free motions, which are biases and
+    initial values."""
 
-    These are biases and initial values, up to the sample at which nothing is left of them.
-    """
-
-    shift: Samples  # within the band
-    free: Moving
-    filtered: Moving  # within the band, in which they last longer
+    free: Rows  # motions
+    rows: Rows  # shift and motions, within the band
     scale: Float[np.ndarray, " rows"]  # that brings shift and motions to unit length
     normal: Float[np.ndarray, "rows rows"]  # their products at unit length, with a ridge
-
-    def products(self, x: Float[np.ndarray, "*series samples"]) -> Float[np.ndarray, "rows ..."]:
-        """Shift and motions times one series, or times each of several."""
-        moving = self.filtered.shape[1]
-        return np.concatenate([(x @ self.shift)[None], self.filtered @ x[..., :moving].T])
-
-    @property
-    def rows(self) -> Rows:
-        """Shift and motions within the band, over all samples."""
-        rows = np.zeros((len(self.scale), self.shift.size))
-        rows[0], rows[1:, : self.filtered.shape[1]] = self.shift, self.filtered
-        return rows
 
 
 class Simulated(NamedTuple):
@@ -114,7 +95,6 @@ class FilteredPoint:
     records: list[Simulated]
     prior_misfits: Float[np.ndarray, " priors"]
     prior_slopes: Float[np.ndarray, "priors parameters"]
-    next_to: "FilteredPoint | None" = None  # a point so near that it has the same slopes
 
     @property
     def cost(self) -> float:
@@ -126,15 +106,11 @@ class FilteredPoint:
     @ft.cached_property
     def behind(self) -> list[Samples]:
         """y / A of each record."""
-        if self.next_to is not None:
-            return self.next_to.behind
         return [_over(one.sampled.below, one.output) for one in self.records]
 
     @ft.cached_property
     def rows(self) -> list[Rows]:
         """The slopes of each record's misfit, up to what start and trim can do."""
-        if self.next_to is not None:
-            return self.next_to.rows
         rows = []
         for term, one, behind in zip(self.problem.terms, self.records, self.behind, strict=True):
             model, driven = one.sampled, -one.driven
@@ -155,8 +131,8 @@ class FilteredPoint:
             gradient = gradient + rows @ one.misfit
             # Products of the rows' parts orthogonal to the columns.
             columns = one.columns
-            shared = columns.scale[:, None] * columns.products(rows)
-            products = row_products(rows) - shared.T @ np.linalg.solve(columns.normal, shared)
+            shared = columns.scale[:, None] * (columns.rows @ rows.T)
+            products = _row_products(rows) - shared.T @ np.linalg.solve(columns.normal, shared)
             hessian = hessian + products
         return gradient, hessian
 
@@ -164,20 +140,6 @@ class FilteredPoint:
         return self.normal
 
     def moved(self, change: Values) -> "FilteredPoint":
-        if np.max(np.abs(change) / (1 + np.abs(self.z))) <= _CLOSE and self.next_to is None:
-            gradient, hessian = self.normal
-            # After a step of Gauss and Newton the misfit is known by its slopes. A step that
-            # damping has shortened is none of these, and its cost has to be seen.
-            if np.allclose(hessian @ change, -gradient, rtol=0.1, atol=0.0):
-                pairs = [*zip(self.records, self.rows, strict=True)]
-                left = [_project_out(x.misfit + change @ rows, x.columns)[0] for x, rows in pairs]
-                return dataclasses.replace(
-                    self,
-                    z=self.z + change,
-                    records=[x._replace(misfit=y) for x, y in zip(self.records, left, strict=True)],
-                    prior_misfits=self.prior_misfits + self.prior_slopes @ change,
-                    next_to=self,
-                )
         return FilteredPoint.at(self.problem, self.programs, self.z + change)
 
     @staticmethod
@@ -266,7 +228,7 @@ def _simulated(term: RecordTerm, sampled: Sampled) -> Simulated:
         left = np.asarray(term.y)[:, 0] - _in_band(term, forced)
         misfit, unknowns = _project_out(left, columns)
         # A shift stays what it is, whatever A does.
-        forced[: columns.free.shape[1]] += unknowns[1:] @ columns.free
+        forced += unknowns[1:] @ columns.free
     return Simulated(sampled, driven, forced, columns, float(term.weights[0]) * misfit)
 
 
@@ -282,8 +244,8 @@ def _in_band(term: RecordTerm, x: Float[np.ndarray, "*rows samples"]) -> np.ndar
     return x if term.gain is None else np.asarray(band_filter(x.T, np.asarray(term.gain))).T
 
 
-def _free_motions(term: RecordTerm, sampled: Sampled, samples: int) -> Moving:
-    """Biases on the slow motions and initial values of the fast ones, as far as any is left."""
+def _free_motions(term: RecordTerm, sampled: Sampled, samples: int) -> Rows:
+    """Biases on the slow motions and initial values of the fast ones."""
     assert term.motions is not None
     slow, fast = map(np.asarray, term.motions)
     states = len(slow)
@@ -296,36 +258,35 @@ def _free_motions(term: RecordTerm, sampled: Sampled, samples: int) -> Moving:
     # `row` step^k for each sample k.
     motion = np.empty((len(row), samples))
     motion[:, 0], done, power = row, 1, step.T
-    while done < samples and np.max(np.abs(power)) > _GONE:
+    while done < samples:
         more = min(done, samples - done)
         np.matmul(power, motion[:, :more], out=motion[:, done : done + more])
         power, done = power @ power, done + more
-    return ways @ motion[:, :done]
+    return ways @ motion
 
 
-def _columns(term: RecordTerm, free: Moving) -> Columns:
-    samples = len(term.y)
-    shift, filtered = _in_band(term, np.ones(samples)), free
-    if term.gain is not None:
-        filtered = _in_band(term, np.pad(free, ((0, 0), (0, samples - free.shape[1]))))
-    normal = np.empty((len(filtered) + 1,) * 2)
-    normal[0, 0], normal[1:, 1:] = shift @ shift, row_products(filtered)
-    normal[0, 1:] = normal[1:, 0] = filtered @ shift[: filtered.shape[1]]
+def _columns(term: RecordTerm, free: Rows) -> Columns:
+    rows = _in_band(term, np.vstack([np.ones(len(term.y)), free]))
+    normal = _row_products(rows)
     square = np.diagonal(normal)
     scale = 1 / np.sqrt(np.where(square > 1e-20 * np.max(square), square, 1.0))
     ridged = normal * np.outer(scale, scale) + _RIDGE * np.eye(len(normal))
-    return Columns(shift, free, filtered, scale, ridged)
+    return Columns(free, rows, scale, ridged)
 
 
 def _project_out(misfit: Samples, columns: Columns) -> tuple[Samples, Float[np.ndarray, " rows"]]:
     """The misfit that no start, trim or shift explains, and how much of each does explain."""
-    aim, unknowns = columns.scale * columns.products(misfit), np.zeros(len(columns.scale))
+    aim, unknowns = columns.scale * (columns.rows @ misfit), np.zeros(len(columns.scale))
     if not np.all(np.isfinite(aim)):
         return np.full_like(misfit, np.nan), unknowns
     plain = columns.normal - _RIDGE * np.eye(len(aim))
     for _ in range(_REFINEMENTS):
         unknowns = unknowns + np.linalg.solve(columns.normal, aim - plain @ unknowns)
     unknowns = columns.scale * unknowns
-    left = misfit - unknowns[0] * columns.shift
-    left[: columns.filtered.shape[1]] -= unknowns[1:] @ columns.filtered
-    return left, unknowns
+    return misfit - unknowns @ columns.rows, unknowns
+
+
+def _row_products(rows: Float[np.ndarray, "rows samples"]) -> Float[np.ndarray, "rows rows"]:
+    """Products of each two of a few long rows. By a copy: BLAS's own way for a matrix and its
+    transpose takes two to four times as long here."""
+    return rows @ rows.copy(order="K").T

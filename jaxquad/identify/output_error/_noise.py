@@ -88,10 +88,8 @@ def shock_slopes(v: Series, model: NoiseModel) -> Float[np.ndarray, "samples coe
 
 
 def estimate_noise(v: Series, noise: Noise) -> NoiseModel:
-    """The model of the wanted kind that leaves the least mean square of shocks.
-
-    "auto" is that of lowest Akaike criterion of autoregressive ones and of a few with zeros.
-    """
+    """The model of the wanted kind that leaves the least mean square of shocks. "auto" is that of
+    lowest Akaike criterion of autoregressive ones and of a few with zeros."""
     if isinstance(noise, ARMA):
         return _with_zeros(v, noise.poles, noise.zeros)
     if isinstance(noise, AutoRegressive):
@@ -139,10 +137,8 @@ def _with_deviation(v: Series, numerator: np.ndarray, denominator: np.ndarray) -
 
 
 def _with_zeros(v: Series, poles: int, zeros: int) -> NoiseModel:
-    """Gauss-Newton from Hannan and Rissanen's start.
-
-    Source: Brockwell & Davis, Time Series: Theory and Methods, sec. 8.4 and 8.11.
-    """
+    """Gauss-Newton from Hannan and Rissanen's start. Source: Brockwell & Davis, Time Series: Theory
+    and Methods, sec. 8.4 and 8.11."""
     if not zeros:
         return _autoregressive(v, poles)
     # Least squares on past samples and on the shocks of a long autoregression.
@@ -219,7 +215,6 @@ def make_whitener(models: Sequence[NoiseModel], samples: int) -> Whitener:
 _LEAST = 4  # of the record's own frequencies on either side that are averaged into one
 _SHARE = 0.1  # of the frequency, as far as the average reaches above that
 _FLOOR = 0.05  # of a frequency that the fit leaves to the noise, at least
-_WELL = 1e-3  # smallest eigenvalue of the products of columns of unit length for two rounds
 
 
 def projected_noise(
@@ -239,18 +234,15 @@ def projected_noise(
 
     samples, outputs = residual.shape
     length = int(next_fast_len(2 * samples, real=True) or 2 * samples)
-    # Two series at once share the vectors of the processor; more of them only take memory.
     turn = lambda series: np.asarray(rfft(series, length))
     rest, driven, smooth, left = [], [], [], []
     windows = _windows(length // 2 + 1, length / samples)
     for o in range(outputs):
         driven.append(turn(columns[:, o].T))
-        others = np.vstack([residual[:, o], nuisance[:, o].T])
-        pairs = (turn(others[k : k + 2]) for k in range(0, len(others), 2))
-        first = next(pairs)
-        rest.append(first[0])
-        taken = _power(driven[o][:count]) + _power(first[1:]) + sum(map(_power, pairs))
-        smooth.append(_averaged(_power(first[:1]) / samples, windows))
+        others = turn(np.vstack([residual[:, o], nuisance[:, o].T]))
+        rest.append(others[0])
+        taken = _power(driven[o][:count]) + _power(others[1:])
+        smooth.append(_averaged(_power(others[:1]) / samples, windows))
         left.append(np.sqrt(np.maximum(1 - _averaged(taken / samples, windows), _FLOOR)))
     twice = np.full(length // 2 + 1, 2.0 / length)
     twice[0] = 1.0 / length
@@ -282,41 +274,7 @@ def orthonormal(
     shows = scale > 1e-12 * np.max(scale, initial=0.0)
     if not np.all(shows):
         flat = flat / np.where(shows, scale, np.inf)
-    return orthogonal_factors(flat)[0].reshape(columns.shape)
-
-
-def row_products(rows: Float[np.ndarray, "rows samples"]) -> Float[np.ndarray, "rows rows"]:
-    """Products of each two of a few long rows.
-
-    By a copy: BLAS's own way for a matrix and its transpose takes two to four times as long here.
-    """
-    return rows @ rows.copy(order="K").T
-
-
-def orthogonal_factors(
-    columns: Float[np.ndarray, "rows columns"],
-) -> tuple[Float[np.ndarray, "rows columns"], Float[np.ndarray, "columns columns"]]:
-    """Orthonormal columns and the triangle that makes these ones of them.
-
-    By their products, twice, where they are far from dependent: for tall matrices that takes a
-    third of the time of reflections, and is as orthogonal.
-    Source: Yamamoto et al. (2015), Roundoff error analysis of the CholeskyQR2 algorithm.
-    """
-    basis = columns.T
-    products = row_products(basis)
-    scale = np.sqrt(np.diagonal(products))
-    if not np.all(scale > 0) or not np.all(np.isfinite(scale)):
-        return np.linalg.qr(columns)
-    triangle = np.eye(scale.size)
-    for last in (False, True):
-        unit = products / np.outer(scale, scale)
-        if len(columns) < scale.size or np.linalg.eigvalsh(unit)[0] < _WELL:
-            return np.linalg.qr(columns)
-        upper = np.linalg.cholesky(unit).T * scale
-        basis, triangle = np.linalg.inv(upper).T @ basis, upper @ triangle
-        if not last:
-            products, scale = row_products(basis), np.ones(scale.size)
-    return basis.T, triangle
+    return np.linalg.qr(flat)[0].reshape(columns.shape)
 
 
 @ft.lru_cache(maxsize=8)

@@ -130,9 +130,7 @@ def convolve(
 
 def invert_series(a: Series) -> Series:
     """The series b with a * b = 1, 0, 0, ..., by Newton's method: each step doubles what is right.
-
-    Source: Knuth, The Art of Computer Programming, vol. 2, sec. 4.7.
-    """
+    Source: Knuth, The Art of Computer Programming, vol. 2, sec. 4.7."""
     count = min(_FIRST, len(a))
     late = jnp.arange(count)[:, None] - jnp.arange(count)[None, :]
     matrix = jnp.where(late >= 0, a[jnp.abs(late)], 0.0)

@@ -41,7 +41,7 @@ from ..uncertainty._error_budget import (
 )
 from ..uncertainty._verdict import identifiability_of, Information, NO_MINIMUM, Verdict
 from ._descent import descend_by_turns, descend_with_noise, Descent, with_fixed_slopes
-from ._noise import ARMA, AutoRegressive, Noise, orthogonal_factors, orthonormal, projected_noise
+from ._noise import ARMA, AutoRegressive, Noise, orthonormal, projected_noise
 from ._problem import (
     evaluate_misfits,
     Evaluation,
@@ -83,12 +83,13 @@ def refine(
 
     Outputs are weighted by the variance of their residuals, which is estimated in turn with the
     parameters; `Fit.cost` is in units of it. Standard errors hold for coloured residuals. Each
-    record has its own initial state, trim and noise level. With a `noise` model, the errors of
-    predicting each sample from those before it take the place of the residuals: an efficient
-    estimate in coloured noise, and a consistent one where feedback returns noise to the input, as
-    far as the noise model is right. With the controller of the `loop` the residuals are those of
-    the closed loop, S (y - G u): what its references do not explain. That is consistent whatever
-    the noise, and a noise model makes it efficient.
+    record has its own initial state, trim and noise level, which is that of its residuals: misfit /
+    random error is 1 for any model, `jq.verify` on another record checks it. With a `noise` model,
+    the errors of predicting each sample from those before it take the place of the residuals: an
+    efficient estimate in coloured noise, and a consistent one where feedback returns noise to the
+    input, as far as the noise model is right. With the controller of the `loop` the residuals are
+    those of the closed loop, S (y - G u): what its references do not explain. That is consistent
+    whatever the noise, and a noise model makes it efficient.
 
     **Arguments:**
 
@@ -331,11 +332,8 @@ def assess_output_error(descent: Descent, records: Sequence[Record]) -> Fit:
 
 
 def _reduce(descent: Descent, evaluation: Evaluation, scale: Vector) -> Reduced:
-    """Slopes by relative changes, orthogonal to what else is fitted to each record.
-
-    That is its initial state, its trim and its noise model: the errors are those of a joint
-    estimate, in a closed loop too, where the input depends on the noise.
-    """
+    """Slopes by relative changes, orthogonal to initial state, trim and noise model of each record:
+    errors are those of a joint estimate, in a closed loop too."""
     projected, at, every = [], scale.size, scale.size
     noises = [noise.slopes for noise in descent.noise] or [None] * len(evaluation.misfits)
     terms, count = descent.problem.terms, descent.problem.base.parameters.count
@@ -352,7 +350,7 @@ def _reduce(descent: Descent, evaluation: Evaluation, scale: Vector) -> Reduced:
         at += states
     stacked = [one.slopes.reshape(-1, every).T for one in projected]
     stacked = np.concatenate([*stacked, np.zeros((every, every))], axis=1)
-    basis, root = orthogonal_factors(stacked.T)
+    basis, root = np.linalg.qr(stacked.T)
     aim, output, noise, at = np.zeros(every), np.zeros(every), np.zeros((every, every)), 0
     for one, term in zip(projected, terms, strict=True):
         flat = basis[at : at + one.misfit.size]
@@ -402,14 +400,10 @@ def _verdict(
 
 def _same_outputs(descent: Descent, values: Float[np.ndarray, " parameters"]) -> bool:
     """Whether other values of the free parameters leave all simulated outputs as they are."""
-    problem, parameters = descent.problem, descent.problem.base.parameters
-    count = parameters.count
-    ratio = values / np.asarray(parameters.scale)[:count]
-    logarithmic = np.array(parameters.logarithmic[:count])
-    if np.any(logarithmic & (ratio <= 0)):
+    problem = descent.problem
+    if (z := problem.base.parameters.coordinates(values)) is None:
         return False
-    z = np.where(logarithmic, np.log(np.where(logarithmic, ratio, 1.0)), ratio)
-    other = evaluate_misfits(np.concatenate([np.asarray(z), descent.z[count:]]), problem).misfits
+    other = evaluate_misfits(np.concatenate([z, descent.z[z.size :]]), problem).misfits
     for new, old, term in zip(other, descent.evaluation.misfits, problem.terms, strict=True):
         size = np.std(np.asarray(term.y), axis=0) * np.asarray(term.weights)
         if not np.all(np.abs(np.asarray(new) - np.asarray(old)) < 1e-6 * size):
@@ -453,11 +447,7 @@ def _remarks_on_output_error(
             "«joint estimate|, jq.frequency_response(..., estimator=jq.spectra.JointInputOutput())»"
         )
         remarks.append(Message(text, "feedback"))
-    text = (
-        "the noise level is estimated from the residuals, so misfit / random error is 1 for any "
-        "model: check the model by «jq.verify» on another record"
-    )
-    return [*remarks, Message(text, "noise level")]
+    return remarks
 
 
 def _remarks_on_colour(descent: Descent, bread: Matrix, covariance: Matrix) -> list[Message]:

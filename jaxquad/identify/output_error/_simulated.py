@@ -30,9 +30,7 @@ def band_gain(
     band: tuple[float, float] | None, record: Record
 ) -> Float[np.ndarray, " bins"] | None:
     """|H|^2 of a third-order Butterworth band-pass, forwards and backwards; None without a band.
-
-    Raises ValueError for a band (rad/s) that does not rise or leaves the record's range.
-    """
+    Raises ValueError for a band (rad/s) that does not rise or leaves the record's range."""
     if band is None:
         return None
     nyquist = np.pi / record.dt
@@ -72,11 +70,8 @@ def band_filter(
 def inputs_between_samples(
     record: Record, hold: str | None
 ) -> tuple[Float[np.ndarray, "samples inputs"], str]:
-    """The inputs, and how they run between their samples: "zero" (held) or "first" (straight).
-
-    Where `hold` does not say, the record does: held where they keep each value for a sample,
-    straight where nobody knows. What is held for less is straight, and half its hold late.
-    """
+    """The inputs, and how they run between samples: "zero" (held) or "first" (straight, unless the
+    record says otherwise). What is held for less is straight, half its hold late."""
     u = np.asarray(record.inputs)
     if hold not in ("first", "zero", None):
         raise ValueError(

@@ -44,6 +44,12 @@ class Agreement(eqx.Module):
         ).rstrip()
 
 
+AGREES, WEAK, CONTRADICTS = "agrees", "weak", "contradicts"  # kinds of `Verification.verdict`
+GOOD_TIC = 0.25  # below which agreement is good
+_WORSE = -5.0  # fit in % from which a model is worse than none, and no chance
+_SHARE, _FACTOR = 0.5, 2.0  # of the output's variance that the model's shape explains; of its size
+
+
 class Verification(eqx.Module):
     """A model's simulated outputs beside the measured ones (CIFER's VERIFY).
 
@@ -77,6 +83,31 @@ class Verification(eqx.Module):
         """The unit of the outputs, empty where they have several."""
         units = {one.unit for one in self.outputs}
         return units.pop() if len(units) == 1 else ""
+
+    @property
+    def verdict(self) -> Message:
+        """Whether the record "agrees", "contradicts", or is "weak" evidence, as its `kind` says.
+
+        It agrees with a TIC below 0.25. It contradicts where the model is worse than the mean of
+        the output (fit below -5 %), or has its shape but less than half or more than twice of it.
+        """
+        if not np.isfinite(self.tic):
+            return Message("CONTRADICTS: the simulation diverges", CONTRADICTS)
+        if self.tic < GOOD_TIC:
+            return Message(f"AGREES: TIC {self.tic:.3f} is below {GOOD_TIC}", AGREES)
+        spread = np.std(self.measured, axis=0)
+        y, x = ((z - np.mean(z, axis=0)) / spread for z in (self.measured, self.simulated))
+        both, energy = np.sum(y * x), np.sum(x * x)
+        factor, share = both / max(energy, 1e-300), both**2 / max(energy * y.size, 1e-300)
+        check = "check that both logs have the same vehicle, axis, channels and units"
+        if share > _SHARE and not 1 / _FACTOR < factor < _FACTOR:
+            text = f"the output is {factor:.3g} times what the model predicts: {check}"
+            return Message(f"CONTRADICTS: {text}", CONTRADICTS)
+        if self.fit_percent < _WORSE:
+            text = f"the model is worse than the mean of the output (fit {self.fit_percent:.0f} %)"
+            return Message(f"CONTRADICTS: {text}: {check}", CONTRADICTS)
+        text = f"TIC {self.tic:.3f} is above {GOOD_TIC}, so more than the input moves the output"
+        return Message(f"WEAK: {text}: excite more, in calm air", WEAK)
 
     def __str__(self) -> str:
         where = "whole band"
@@ -224,10 +255,8 @@ def verify(
 def _significant_unknowns(
     rest: Outputs, columns: Float[np.ndarray, "samples outputs unknowns"], motions: Motions
 ) -> Float[np.ndarray, " significant"]:
-    """Least squares without the fast transients that do not stand out, the fastest first.
-
-    They stand out where they are beyond their errors, in noise like what is left.
-    """
+    """Least squares without the fast transients that do not stand out, the fastest first. They
+    stand out where they are beyond their errors, in noise like what is left."""
     groups = list(motions.groups)
     while True:
         flat = columns.reshape(rest.size, -1)

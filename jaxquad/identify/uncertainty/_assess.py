@@ -11,13 +11,19 @@ from jaxquad._core import as_messages, Message
 from jaxquad.models import LaggedIntegrator, StateSpace, TransferFunction
 
 from ..frequency_domain._cost import widen_band
+from ..frequency_domain._feedthrough import DirectDelay
 from ..frequency_domain._parameters import Parameters
 from ..frequency_domain._problem import on_device, Problem
 from ..frequency_domain._refits import Origin
 from ..frequency_domain._result import Fit
 from ..frequency_domain._sampled import remarks_on_hold
-from ..frequency_domain._solve import is_saddle, same_responses, Solution, solution_at
-from ..frequency_domain._starts import Minimum
+from ..frequency_domain._solve import (
+    is_saddle,
+    Minimum,
+    same_responses,
+    Solution,
+    solution_at,
+)
 from ..output_error._noise import NoiseModel
 from ..output_error._simulated import HasStateSpace, HasTransferFunction, linear_model
 from ._error_budget import (
@@ -68,10 +74,8 @@ def assess(
     further: Sequence[str] = (),
     origin: Origin | None = None,
 ) -> Fit:
-    """Costs, bounds, calibrated covariance and identifiability at the solution.
-
-    The fit gets the `further` remarks and its `origin`.
-    """
+    """Costs, bounds, calibrated covariance and identifiability at the solution. The fit gets the
+    `further` remarks and its `origin`."""
     parameters, budget, bounds = problem.parameters, weighting.budget, ()
     names, count, start = parameters.names, parameters.count, units_of(solution)
     bread, gradient, units = budget.bread, budget.gradient, start  # by slopes at the solution
@@ -216,7 +220,10 @@ def assess(
                 f"costs {rivals[0].cost:.4g} at {', '.join(names)} = {values}: record more, or "
                 "over a wider band, to know which is right",
             )
-        remarks += remarks_on_priors(budget.prior.misfit, verdict, by_data, chi_squared=doubted)
+        by_user = sum(not isinstance(q, DirectDelay) for q in problem.quantities)
+        if by_user:
+            pulls = budget.prior.misfit[:by_user]
+            remarks += remarks_on_priors(pulls, verdict, by_data, chi_squared=doubted)
         if _LARGE < amplitude <= _NO_MODEL:
             remark(
                 "discrepancy",
@@ -247,10 +254,8 @@ def assess(
 
 
 def is_unfinished(solution: Solution, step: Vector, covariance: Matrix) -> bool:
-    """Whether the solver stopped early, where the next `step` still moves an estimate.
-
-    Step and covariance, that of the noise, are those of relative changes.
-    """
+    """Whether the solver stopped early, where the next `step` still moves an estimate. Step and
+    covariance, that of the noise, are those of relative changes."""
     limit = _STILL * np.sqrt(np.maximum(np.diagonal(covariance), 0.0)) + _ROUNDING
     return not solution.converged and bool(np.any(np.abs(step) > limit))
 
@@ -258,10 +263,8 @@ def is_unfinished(solution: Solution, step: Vector, covariance: Matrix) -> bool:
 def no_minimum(
     names: tuple[str, ...], decrement: float, cost: float, *remedies: str, message: str = ""
 ) -> Verdict:
-    """The verdict on a stop from which a step would still lower the cost.
-
-    The `message` says why the solver stopped early, and is empty where it did not.
-    """
+    """The verdict on a stop from which a step would still lower the cost. The `message` says why
+    the solver stopped early, and is empty where it did not."""
     reason = f"one more Gauss-Newton step would lower the cost, {cost:.4g}, by {2 * decrement:.3g}"
     if message:
         reason = f"the fit has not converged: {message[:1].lower()}{message[1:]}; {reason}"
@@ -383,9 +386,7 @@ def make_fit(
     origin: Origin | None = None,
 ) -> Fit:
     """A result in physical units; both covariances are those of changes relative to `units`.
-
-    `freedom` is that of the noise estimate, infinite without.
-    """
+    `freedom` is that of the noise estimate, infinite without."""
     names, values = problem.parameters.names, np.asarray(solution.values)[: units.size]
     freedom = np.full(units.size, np.inf) if freedom is None else freedom
     pooled = pooled_freedom(freedom, np.ones(units.size))

@@ -253,10 +253,8 @@ class Information(NamedTuple):
 def identifiability_of(
     information: Information, prior: PriorRows, bounds: tuple[Bound, ...] = ()
 ) -> tuple[Verdict, Verdict]:
-    """What data and priors determine together, and what the data determine alone.
-
-    Parameters with a bound are determined by it, and take part in no direction.
-    """
+    """What data and priors determine together, and what the data determine alone. Parameters with a
+    bound are determined by it, and take part in no direction."""
     by_data = _determine(information, bounds)
     if not len(prior.misfit):
         return by_data, by_data
@@ -364,11 +362,8 @@ def _echelon(rows: Directions) -> Directions:
 def _analyse_groups(
     null: Directions, exact: Directions, information: Information
 ) -> tuple[list[Combination], list[Vector], list[str]]:
-    """Of each group of parameters that share null directions: what of them is determined.
-
-    Combinations of the kind, product or sum, that holds over a finite change; the values to which
-    that change leads; and names of parameters of which neither kind holds.
-    """
+    """Of each group of parameters in null directions: combinations of the kind, product or sum,
+    that holds over a finite change, values there, and names of which neither holds."""
     combinations, alternatives, curved = [], [], []
     if not len(null):
         return combinations, alternatives, curved

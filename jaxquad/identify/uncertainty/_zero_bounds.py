@@ -24,6 +24,7 @@ from ._verdict import Bound, LIMIT
 _NEAR = 1e-2  # of the change that shows: a parameter below it is at zero
 _AT_ZERO = 1e-6  # likewise, where its slopes are evaluated
 _ROUNDS = 4  # of releasing parameters that do not belong at zero
+_POLISHES = 3  # steps
 _SMALLEST = 60.0  # in ln, below the start: 1e-26 of it
 _RISE = 2.71  # of the cost, at the end of a one-sided 95 % interval
 _EVALUATIONS = 12  # of the profile
@@ -64,9 +65,7 @@ def solve_within_bounds(
     problem: Problem, start: Vector | Solution, solver: eqx.Module | None, max_steps: int
 ) -> Solution:
     """Solve from `z`, or go on from a solution, until all that belongs at zero is marked as there.
-
-    It is so wherever the path to it ended; what does not belong there is released.
-    """
+    It is so wherever the path to it ended; what does not belong there is released."""
     is_solved = isinstance(start, Solution)
     solution = start if is_solved else solve(problem, start, solver, max_steps)
     logarithmic = np.array(problem.parameters.logarithmic[: solution.z.size])
@@ -115,13 +114,13 @@ def solve_within_bounds(
 
 
 def polish(
-    problem: Problem, z: Vector, fixed: Sequence[int], start: Solution, rounds: int = 3
+    problem: Problem, z: Vector, fixed: Sequence[int], start: Solution
 ) -> tuple[Solution, Linearised]:
     """The optimum over the other parameters, from near it, by undamped Gauss-Newton steps."""
     free = np.setdiff1d(np.arange(z.size), fixed)
     solution = solution_at(problem, z, steps=start.steps)
     local = linearise(problem, solution)
-    for _ in range(rounds):
+    for _ in range(_POLISHES):
         if not (np.isfinite(local.cost) and np.all(np.isfinite(local.jacobian))):
             break  # so far out that the model has no numbers
         step = np.linalg.lstsq(local.jacobian[:, free], -local.residual, rcond=1e-10)[0]
@@ -230,11 +229,8 @@ def one_sided_limits(
 def bounds_among(
     near: Sequence[NearZero], budget: ErrorBudget, solution: Solution, units: Units
 ) -> tuple[tuple[Bound, ...], Units]:
-    """Those that a limit determines; and units in which those mixed up with others count.
-
-    That is where another one would change by too much if this one had a value up to its limit: it
-    then counts as much as that other one.
-    """
+    """Those that a limit determines; and units in which those count that are mixed up with others:
+    another one would change by too much on the way to the limit."""
     bounds, mixed, covariance = [], {}, budget.covariance
     slight = [one.k for one in near if one.slight]
     for one in near:
@@ -258,11 +254,8 @@ def bounds_among(
 def without_bounds(
     covariance: Matrix, budget: ErrorBudget, zeros: Sequence[int]
 ) -> tuple[Matrix, dict[int, float]]:
-    """The covariance without bounds, and where the parameters at zero would go without them.
-
-    One by one, while the others stay there: two lags at zero do the same to a response, so that
-    without their bounds one could grow without limit as the other becomes negative.
-    """
+    """The covariance without bounds, and where parameters at zero would go without them, one by
+    one: of two lags, one could grow without limit as the other becomes negative."""
     bread = budget.bread
     if len(zeros) < 2:
         step = -scaled_inverse(bread) @ budget.gradient
@@ -288,11 +281,8 @@ def _sandwich(bread: Matrix, meat: Matrix, some: np.ndarray) -> tuple[np.ndarray
 
 
 def one_sided(covariance: Matrix, k: int, optimum: float) -> Matrix:
-    """The covariance where parameter `k` is at zero, from that of an unconstrained fit.
-
-    What is left of its normal distribution above zero has this second moment about zero, and what
-    the other parameters make of it. `optimum` is where it would be without the bound.
-    """
+    """The covariance where parameter `k` is at zero: what is left of its normal distribution has
+    this second moment about zero. `optimum` is where it would be without the bound."""
     from scipy.special import log_ndtr
 
     variance = covariance[k, k]

@@ -20,17 +20,26 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .._errors import located, printable, ReadError, warn
 from .._firmwares import registered_logs
-from .._log import allowance, check_size, flattened, Log as Log, Signals, Table as Table
+from .._log import (
+    allowance,
+    check_size,
+    flattened,
+    located,
+    Log as Log,
+    printable,
+    ReadError,
+    Signals,
+    Table as Table,
+    warn,
+)
 from . import (
-    _arrays,
     _betaflight,
     _betaflight_columns,
     _by_library,
     _crazyflie,
-    _csv,
     _dataflash,
+    _tables,
     _ulog,
 )
 
@@ -111,9 +120,9 @@ class Reader(NamedTuple):
 
 READERS: Mapping[str, Reader] = {
     "npz": Reader(
-        "a NumPy archive", _arrays.sniff_numpy, _arrays.load_numpy, (".npz", ".npy")
+        "a NumPy archive", _tables.sniff_numpy, _tables.load_numpy, (".npz", ".npy")
     ),
-    "mat": Reader("a MATLAB file", _arrays.sniff_matlab, _arrays.load_matlab, (".mat",)),
+    "mat": Reader("a MATLAB file", _tables.sniff_matlab, _tables.load_matlab, (".mat",)),
     "dataflash": Reader(
         "an ArduPilot DataFlash log", _dataflash.sniff, _dataflash.load, (".bin",)
     ),
@@ -140,7 +149,7 @@ READERS: Mapping[str, Reader] = {
         "a ROS 2 bag", _by_library.sniff_bag, ft.partial(_in_child, "rosbag", 2.0),
         (".mcap", ".db3"),
     ),
-    "csv": Reader("a text table", _csv.sniff, _csv.load, (".csv", ".tsv", ".txt")),
+    "csv": Reader("a text table", _tables.sniff_text, _tables.load_text, (".csv", ".tsv", ".txt")),
 }  # fmt: skip
 
 
@@ -151,7 +160,11 @@ def load_signals(path: str | Path) -> Signals:
             f"{type(path).__name__} is no path of a file: a table in memory is read by "
             "jq.records.from_dataframe, arrays by jq.Record(time, inputs, outputs)"
         )
-    signals = flattened(load_log(path))
+    log = load_log(path)
+    try:
+        signals = flattened(log)
+    except ReadError as error:
+        raise located(error, path) from error
     if not signals.arrays:
         raise ReadError(
             f"{path}: the file holds no numeric array of one or two dimensions. Objects of MATLAB "
@@ -175,10 +188,11 @@ def load_log(path: str | Path) -> Log:
         readers = [*(log.reader for log in registered_logs() if log.reader), *READERS.values()]
         by_content = (reader for reader in readers if reader.sniff(head, path))
         by_name = (reader for reader in readers if suffix in reader.suffixes)
-        reader = next(by_content, None) or next(by_name, None)
+        reader = next(by_content, None)
+        if reader is None and path.is_dir():
+            raise ReadError(f"{path} is a folder, and no bag of ROS 2: name the file in it.")
+        reader = reader or next(by_name, None)
         if reader is None:
-            if path.is_dir():
-                raise ReadError(f"{path} is a folder, and no bag of ROS 2: name the file in it.")
             suffixes = ", ".join(ending for x in READERS.values() for ending in x.suffixes)
             ending = f"ending {suffix!r}" if suffix else "name, which has no ending,"
             raise ReadError(

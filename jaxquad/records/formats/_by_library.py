@@ -42,20 +42,25 @@ def _hdf5_tables(path: str, check: Check) -> Content:
     By the lower layer of h5py: its upper one takes five times as long for many small datasets.
     """
     import h5py
-    from h5py import h5o  # pyright: ignore[reportAttributeAccessIssue]  # h5py has no stubs of it
+    from h5py import h5l, h5o  # pyright: ignore[reportAttributeAccessIssue]  # h5py has no stubs
 
-    names: list[bytes] = []  # soft and external links are not followed
+    names: list[bytes] = []  # links by name are not followed
+    columns: dict[str, tuple[np.ndarray, str]] = {}
+    remarks: list[str] = []
 
     def visit(name: bytes) -> None:
         if len(names) >= _MOST_OBJECTS:
             raise ValueError(f"more than {_MOST_OBJECTS} objects")
         names.append(name)
 
-    columns: dict[str, tuple[np.ndarray, str]] = {}
-    remarks: list[str] = []
+    def visit_link(name: bytes, link: Any) -> None:
+        if link.type == h5l.TYPE_EXTERNAL:
+            remarks.append(_elsewhere(name.decode("utf-8", "replace").replace("/", ".")))
+
     size = 0
     with h5py.File(path, "r") as file:
         h5o.visit(file.id, visit)
+        file.id.links.visit(visit_link, info=True)
         for raw in names:
             item = h5o.open(file.id, raw)
             if not isinstance(item, h5py.h5d.DatasetID) or raw.startswith(b"#"):
@@ -74,7 +79,7 @@ def _hdf5_tables(path: str, check: Check) -> Content:
             layout = item.get_create_plist()
             stored = layout.get_layout()
             if layout.get_external_count() or stored == h5py.h5d.VIRTUAL:
-                remarks.append(f"{name!r} lies in another file and was left out")
+                remarks.append(_elsewhere(name))
                 continue
             size += math.prod(shape) * dtype.itemsize
             check("the file", size)
@@ -94,6 +99,10 @@ def _hdf5_tables(path: str, check: Check) -> Content:
                     remarks.append(f"two datasets are called {full!r}: the later one is used")
                 columns[full] = values, unit
     return {"": columns}, remarks
+
+
+def _elsewhere(name: str) -> str:
+    return f"{name!r} lies in another file and was left out"
 
 
 def _text(value: object) -> str:

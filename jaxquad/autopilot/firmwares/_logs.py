@@ -1,10 +1,4 @@
-"""ArduPilot: RATE holds set-points, rates and outputs, SIDD and SIDS the injected chirp.
-
-In each loop the rate controller and the motors' output come first, then the flight mode, which
-computes the next set-point and the next value of the chirp, then the logging. So of one stamp,
-RATE.x and RATE.xOut belong together, while RATE.xDes and SIDD.Targ act in the next loop; and
-RATE.xOut contains the chirp that is added at the mixer (docs/autopilots.md).
-"""
+"""What the channels of PX4, ArduPilot and the Crazyflie mean: command, rate, reference, chirps."""
 
 import numpy as np
 
@@ -19,6 +13,7 @@ from jaxquad.records.firmware import (
     Injection,
     Log,
     most_active_axis,
+    moves,
     number_of,
     NumberedChirp,
     Point,
@@ -27,6 +22,86 @@ from jaxquad.records.firmware import (
     values_of,
     with_injections,
 )
+
+
+_STATES = {2: "roll", 4: "pitch", 6: "yaw"}  # of autotune
+_BREAK = 1.0  # s without it: another run
+_ACRO = 10  # of vehicle_status.nav_state
+_RATE_SETPOINT = "vehicle_rates_setpoint"
+_AUTOTUNE = "autotune_attitude_control_status"
+_STICKS = {
+    "roll": ("manual_control_setpoint.roll", "manual_control_setpoint.y"),
+    "pitch": ("manual_control_setpoint.pitch", "manual_control_setpoint.x"),
+    "yaw": ("manual_control_setpoint.yaw", "manual_control_setpoint.r"),
+}
+
+
+def px4_setup(log: Log, wanted: Selection) -> Setup:
+    """The set-up for autotune's excitation; without it, with the set-point if flown in acro."""
+    signals, axis = flattened(log), wanted.axis
+    names = ("vehicle_angular_velocity.xyz", "sensor_combined.gyro_rad")
+    rates = {
+        x: first_logged(signals, [f"{name}[{i}]" for name in names]) for i, x in enumerate(AXES)
+    }
+    if not any(rates.values()):
+        raise RecordError(
+            "the log has no vehicle_angular_velocity. Choose a logging profile that has it."
+        )
+    tuned: dict[str, list[Injection]] = {}  # of each axis, all runs of it
+    table = log.tables.get(_AUTOTUNE)
+    if table is not None and table.time is not None and {"state", "rate_sp"} <= set(table.columns):
+        state = table.columns["state"]
+        for number, x in _STATES.items() if state.ndim == 1 else ():
+            rows = np.flatnonzero(state == number)
+            cuts = np.flatnonzero((np.diff(rows) > 1) & (np.diff(table.time[rows]) > _BREAK)) + 1
+            parts = [part for part in np.split(rows, cuts) if part.size > 1]
+            if parts and axis in (None, x):
+                ends = (table.time[part[[0, -1]]].tolist() for part in parts)
+                tuned[x] = [Injection(start, stop) for start, stop in ends]
+    if tuned:
+        axis = max(tuned, key=lambda x: max(run.stop - run.start for run in tuned[x]))
+    axis = axis or most_active_axis(signals, rates)
+    i = AXES.index(axis)
+    command = first_logged(
+        signals, [f"vehicle_torque_setpoint.xyz[{i}]", f"actuator_controls_0.control[{i}]"]
+    )
+    if not command or not rates[axis]:
+        raise RecordError(
+            f"the log has no torque set-point (vehicle_torque_setpoint) or no rate for {axis}."
+        )
+    if axis in tuned:
+        reference = f"{_AUTOTUNE}.rate_sp[{i}]"
+        setup = Setup(axis, {command: 1.0}, rates[axis], reference, injected_at="rate")
+        return with_injections(setup, tuned[axis], "autotune's steps on the rate set-point")
+    setpoint, status = f"{_RATE_SETPOINT}.{axis}", log.tables.get("vehicle_status")
+    states = None if status is None else status.columns.get("nav_state")
+    always_acro = states is not None and states.size > 0 and bool((states == _ACRO).all())
+    if always_acro and moves(signals, setpoint):
+        remark = "flown in acro throughout, where the rate set-point comes from the pilot only"
+        return Setup(axis, {command: 1.0}, rates[axis], setpoint, remarks=(remark,))
+    remarks = [
+        f"{setpoint} is computed by the attitude loop: it contains feedback and cannot be the "
+        f"external reference",
+        "for an external reference, run autotune, or inject a sweep and log it",
+    ]
+    stick = first_logged(signals, _STICKS[axis])
+    if stick and moves(signals, stick):
+        remarks.append(
+            f"in manual flight the stick is not affected by feedback: use --reference {stick} if "
+            f"it moved enough"
+        )
+    return Setup(axis, {command: 1.0}, rates[axis], remarks=tuple(remarks))
+
+
+PX4 = FirmwareLog(
+    name="px4", title="PX4", setup=px4_setup,
+    rates=[f"vehicle_angular_velocity.xyz[{i}]" for i in range(3)],
+    setpoints=[f"{_RATE_SETPOINT}.{x}" for x in AXES],
+    throttle=(("vehicle_thrust_setpoint.xyz[2]", -1.0), ("actuator_controls_0.control[3]", 1.0)),
+    hold=lambda log: hold_by_rate(log, "IMU_GYRO_RATEMAX"),
+    of_loop=("MC_", "IMU_GYRO_", "IMU_DGYRO_", "THR_MDL_FAC", "CA_", "PWM_", "DSHOT_"),
+    release="ver_sw_release", gyro_cutoffs=("IMU_GYRO_CUTOFF",),
+)  # fmt: skip
 
 
 _LETTERS: dict[str, str] = dict(zip(AXES, "RPY", strict=True))
@@ -46,13 +121,18 @@ _WHERE: tuple[tuple[tuple[int, ...], str, Point], ...] = (  # three are roll, pi
 _PLACES: dict[int, tuple[str, Point]] = {  # by SID_AXIS: what the chirp is added to
     axis: (f"{words} (SID_AXIS {axis})", point) for axes, words, point in _WHERE for axis in axes
 }
-_BREAK = 1.0  # s without SIDD: another run
 _SHORTEST = 2.0  # s
 _FLY = "fly the SystemID mode with SID_AXIS 10 (roll), 11 (pitch) or 12 (yaw)"
 
 
 def ardupilot_setup(log: Log, wanted: Selection) -> Setup:
-    """The set-up for the chirps that are wanted; else for the loop without one."""
+    """The set-up for the chirps that are wanted; else for the loop without one.
+
+    In each loop the rate controller and the motors' output come first, then the flight mode, which
+    computes the next set-point and the next value of the chirp, then the logging. So of one stamp,
+    RATE.x and RATE.xOut belong together, while RATE.xDes and SIDD.Targ act in the next loop; and
+    RATE.xOut contains the chirp that is added at the mixer (docs/autopilots.md).
+    """
     signals = flattened(log)
     rates = {x: first_logged(signals, [f"RATE.{_LETTERS[x]}"]) for x in AXES}
     name = log.firmware.partition(" ")[0].removeprefix("APM:")
@@ -134,7 +214,6 @@ def _chirps(log: Log) -> list[NumberedChirp]:
 
 
 def _number(value: object) -> float:
-    """0 for what is no finite number."""
     try:
         return number if np.isfinite(number := float(str(value))) else 0.0
     except ValueError:
@@ -176,7 +255,7 @@ def _chirped(log: Log, chirps: list[NumberedChirp]) -> Setup:
     return with_injections(setup, logged, f"SystemID chirp into {place}")
 
 
-LOG = FirmwareLog(
+ARDUPILOT = FirmwareLog(
     name="ardupilot", title="ArduPilot", setup=ardupilot_setup,
     rates=[f"RATE.{x}" for x in "RPY"], setpoints=[f"RATE.{x}Des" for x in "RPY"],
     throttle=(("RATE.AOut", 1.0), ("CTUN.ThO", 1.0)),
@@ -186,4 +265,74 @@ LOG = FirmwareLog(
     ),
     learned=("MOT_THST_HOVER",),  # in flight, and stored at the end of it: the hover's throttle
     numbers_chirps=True, gyro_cutoffs=("INS_GYRO_FILTER",),
+)  # fmt: skip
+
+
+_MOTORS = {"roll": (-1, -1, 1, 1), "pitch": (-1, 1, 1, -1), "yaw": (-1, 1, -1, 1)}
+_SLOW_STAMPS = 85 / 84  # by which rates of the micro-SD deck's stamps are too high
+_NOMINAL = (50, 100, 125, 200, 250, 333.333, 400, 500, 800, 1000)  # Hz
+_NEAR = 0.004  # events come late or are lost
+
+
+def crazyflie_setup(log: Log, wanted: Selection) -> Setup:
+    """Of a Crazyflie, for the axis that moves most; its firmware has no chirp and no reference."""
+    signals = flattened(log)
+    prefixes = [f"{name}." if name else "" for name in log.tables]
+    rates = {
+        x: first_logged(
+            signals, [f"{p}{name}" for p in prefixes for name in (f"gyro.{k}", f"controller.r_{x}")]
+        )
+        for x, k in zip(AXES, "xyz", strict=True)
+    }
+    if not any(rates.values()):
+        raise RecordError("the log has no gyro.x, gyro.y, gyro.z or controller.r_roll, ...")
+    axis = wanted.axis or most_active_axis(signals, rates)
+    command: dict[str, float] = {}
+    for prefix in prefixes:
+        motors = [f"{prefix}motor.m{i}" for i in range(1, 5)]
+        if moves(signals, name := f"{prefix}controller.cmd_{axis}"):
+            command = {name: 1.0}
+        elif all(moves(signals, motor) for motor in motors):
+            command = dict(zip(motors, map(float, _MOTORS[axis]), strict=True))
+        if command:
+            break
+    if not rates[axis] or not command:
+        raise RecordError(
+            f"the log has no command (controller.cmd_{axis}, or motor.m1 .. m4) or no rate for "
+            f"{axis}."
+        )
+    remarks = [
+        "no channel of the stock firmware can be the external reference: the rate set-points are "
+        "computed by the attitude loop and contain feedback",
+        "for an external reference, log a signal that your own code injects, and name it with "
+        "--reference",
+    ]
+    hertz = channel_rate(signals, rates[axis])
+    nominal = next((x for x in _NOMINAL if abs(hertz / x / _SLOW_STAMPS - 1) < _NEAR), None)
+    if nominal is not None:
+        remarks.append(
+            f"the time stamps say {hertz:.5g} Hz, 85/84 of {nominal:.6g} Hz: firmware before "
+            f"August 2026 wrote them that much slow, so that the gain to a rate is 1.2 % too high, "
+            f"lag and delay 1.2 % too short. Where the log is of such firmware, --time-factor "
+            f"1.0119 corrects it"
+        )
+    targets = (f"{prefix}ctrltarget.{axis}" for prefix in prefixes)
+    if target := next((x for x in targets if moves(signals, x)), ""):
+        remarks.append(
+            f"in manual flight the pilot's {target} is not affected by feedback: use --reference "
+            f"{target}"
+        )
+    if len(command) > 1:
+        remarks.append(
+            "the motor commands are not linear in thrust: where the thrust curve is known, use "
+            "powers (--input 'NAME=0.1*a^2')"
+        )
+    return Setup(axis, command, rates[axis], remarks=tuple(remarks))
+
+
+CRAZYFLIE = FirmwareLog(
+    name="crazyflie", title="Crazyflie", setup=crazyflie_setup,
+    rates=[f"gyro.{x}" for x in "xyz"],
+    throttle=(("controller.cmd_thrust", 1 / 65535), ("stabilizer.thrust", 1 / 65535)),
+    settings=False,
 )  # fmt: skip
