@@ -288,9 +288,7 @@ def peers(plant: Plant, *, pid: PyTree | None = None, dt: float = 0.002) -> dict
     return designs if pid is None else designs | {"tuned PID": pid}
 
 
-def _nominal_numbers(
-    plant: Plant,
-) -> tuple[Float[np.ndarray, " axes"], Float[np.ndarray, " axes"]]:
+def _nominal_numbers(plant: Plant) -> tuple[Float[np.ndarray, " axes"], ...]:
     """KT in N m per unit of command and J in kg m^2, in NumPy: nothing is compiled."""
     if not isinstance(plant, DecoupledAxes | Multirotor):
         raise ValueError(
@@ -303,8 +301,7 @@ def _nominal_numbers(
             f"the plant is an ensemble of {axes.shape[1:]}: give the nominal one, for whose "
             "gain the designs are made"
         )
-    KT, J = np.broadcast_arrays(np.asarray(axes.torque_gain, float), np.asarray(axes.inertia))
-    return KT, J
+    return np.broadcast_arrays(np.asarray(axes.torque_gain, float), np.asarray(axes.inertia))
 
 
 def worst_flights(
