@@ -205,8 +205,11 @@ def _remarks(
 def _beyond_band(controller: PyTree, band: tuple[float, float] | None) -> Iterator[tuple[str, str]]:
     """The bandwidths of a LADRC that no data support, and what to do."""
     ladrc = find_ladrc(controller)
-    for name in () if ladrc is None or band is None else ("wc", "wo"):
-        value, (low, high) = float(np.max(np.asarray(vars(ladrc)[name]))), band
+    if ladrc is None or band is None:
+        return
+    low, high = band
+    for name in ("wc", "wo"):
+        value = float(np.max(np.asarray(vars(ladrc)[name])))
         if value > _ROUNDED * high:
             yield (
                 f"{name} = {value:.4g} rad/s lies beyond the identified band of {low:.3g} to "
