@@ -243,7 +243,15 @@ def check_ranges(valid: Valid, channels: Iterable[str]) -> None:
 
 def as_float64(label: str, values: ArrayLike, *, copy: bool = True) -> np.ndarray:
     """In float64, NaN where masked; a `copy`, or a view. Raises RecordError for no numbers."""
-    array = np.ma.asanyarray(values)
+    try:
+        array = np.ma.asanyarray(values)
+    except TypeError as error:
+        if type(error).__name__ != "TracerArrayConversionError":
+            raise
+        raise RecordError(
+            f"{label} is traced by JAX, but records and frequency responses are made by NumPy and "
+            "have no derivatives: take them by the numbers of the response, which jq.fit has."
+        ) from error
     if array.dtype.names:
         raise RecordError(
             f"{label} is a structured array with the fields {', '.join(array.dtype.names)}: stack "
