@@ -23,7 +23,8 @@ class Notched(jq.LaggedIntegrator):
     """What the model of the fits does not explain."""
 
     def frequency_response(self, omega):
-        s = jax.lax.complex(jnp.zeros(len(omega)), jnp.asarray(omega))
+        omega = jnp.asarray(omega)
+        s = jax.lax.complex(jnp.zeros_like(omega), omega)
         notch = (s**2 + 3 * s + 900) / (s**2 + 12 * s + 900)
         return super().frequency_response(omega) * notch[:, None, None]
 
