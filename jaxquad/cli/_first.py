@@ -8,9 +8,8 @@ import jaxquad.workflows as workflows
 from jaxquad.workflows import AutopilotSettings
 
 from . import _options as shell
-from ._logs import finish_identification
+from ._logs import finish_identification, run_autopilot
 from ._options import command, Run
-from ._tune import run_autopilot
 
 
 _NEXT = """

@@ -17,9 +17,8 @@ from jaxquad.report import PageWarning
 from jaxquad.workflows import in_options
 
 from ._first import demo, design
-from ._logs import batch, channels, identify, NOT_IDENTIFIABLE, report, verify
+from ._logs import autopilot, batch, channels, identify, NOT_IDENTIFIABLE, report, tune, verify
 from ._options import check_out, shown_stages
-from ._tune import autopilot, tune
 
 
 # In order of use.

@@ -61,17 +61,10 @@ _C1, _C2 = 4.0, 0.0187
 
 
 def sweep(
-    omega_min: Number,
-    omega_max: Number,
-    *,
-    duration: Number,
-    sample_rate: Number,
-    amplitude: Number,
-    lead_in_cycles: int = 2,
-    fade_in: Number | None = None,
-    fade_out: Number | None = None,
-    trim: Number = 3.0,
-) -> Excitation:
+    omega_min: Number, omega_max: Number, *, duration: Number, sample_rate: Number,
+    amplitude: Number, lead_in_cycles: int = 2, fade_in: Number | None = None,
+    fade_out: Number | None = None, trim: Number = 3.0,
+) -> Excitation:  # fmt: skip
     """Make an exponential sine sweep.
 
     The frequency is omega_min + K (omega_max - omega_min), K = C2 (exp(C1 t/T) - 1), C1 = 4.0,
@@ -170,13 +163,9 @@ def _ramp(clock: Samples, width: Number) -> Samples:
 
 
 def harmonics(
-    omega_min: Number,
-    omega_max: Number,
-    *,
-    period: Number,
-    lines: int | None = None,
+    omega_min: Number, omega_max: Number, *, period: Number, lines: int | None = None,
     spacing: Literal["log", "linear"] = "log",
-) -> Lines:
+) -> Lines:  # fmt: skip
     """Choose harmonics of a period for a multisine.
 
     **Arguments:**
@@ -217,13 +206,9 @@ def harmonics(
 
 
 def multisine(
-    omega: Lines | Sequence[Number],
-    *,
-    period: Number,
-    periods: int,
-    sample_rate: Number,
+    omega: Lines | Sequence[Number], *, period: Number, periods: int, sample_rate: Number,
     amplitude: Number,
-) -> Excitation:
+) -> Excitation:  # fmt: skip
     """Make a multisine, a periodic sum of sines of equal amplitude with a low crest factor.
 
     The phases are those of Schroeder (1970), generalised to any spacing of the lines and improved
@@ -319,14 +304,9 @@ def three_two_one_one(
 
 
 def _pulses(
-    kind: Kind,
-    steps: Sequence[int],
-    width: Number,
-    amplitude: Number,
-    sample_rate: Number,
-    lead: Number,
-    tail: Number,
-) -> Excitation:
+    kind: Kind, steps: Sequence[int], width: Number, amplitude: Number, sample_rate: Number,
+    lead: Number, tail: Number,
+) -> Excitation:  # fmt: skip
     require_all_positive(width=width, amplitude=amplitude, sample_rate=sample_rate)
     before = whole_samples("lead", lead, sample_rate, fewest=0)
     after = whole_samples("tail", tail, sample_rate, fewest=0)
@@ -372,11 +352,9 @@ class Guidelines(tuple[Guideline, ...]):
 
 
 def check_guidelines(
-    excitation: Excitation,
-    *,
-    omega_bandwidth: Number | None = None,
+    excitation: Excitation, *, omega_bandwidth: Number | None = None,
     omega_180: Number | None = None,
-) -> Guidelines:
+) -> Guidelines:  # fmt: skip
     """Check an excitation against the guidelines for identification from frequency sweeps.
 
     Source: Tischler and Remple, "Aircraft and Rotorcraft System Identification", ch. 5.

@@ -40,6 +40,14 @@ def adjoint(matrix: Complex[np.ndarray, "*batch rows columns"]) -> np.ndarray:
     return np.conj(np.swapaxes(matrix, -2, -1))
 
 
+def sums_between(
+    x: Float[np.ndarray, "..."], first: Int[np.ndarray, " some"], last: Int[np.ndarray, " some"]
+) -> Float[np.ndarray, "..."]:
+    """Sums of the rows from each of `first` to before each of `last`."""
+    running = np.concatenate([np.zeros((1, *x.shape[1:])), np.cumsum(x, axis=0)])
+    return running[last] - running[first]
+
+
 def power_of(x: Complex[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
     """The square of the absolute value, which itself takes a library as long as ten products."""
     return np.real(x) ** 2 + np.imag(x) ** 2
@@ -52,8 +60,9 @@ def in_hertz(omega: Grid) -> str:
     return f"{rad} rad/s ({hertz} Hz)"
 
 
-def check_compatible(records: Sequence[Record]) -> None:
-    """Raise `ValueError` unless the records have the same channels, sample rate and hold."""
+def compatible(record: Record | Sequence[Record]) -> list[Record]:
+    """As a list; `ValueError` unless all have the same channels, sample rate and hold."""
+    records = [record] if isinstance(record, Record) else list(record)
     if not records:
         raise ValueError("no record is given: pass one jq.Record or a list of them")
     odd = [type(one).__name__ for one in records if not isinstance(one, Record)]
@@ -81,6 +90,7 @@ def check_compatible(records: Sequence[Record]) -> None:
                     "all records of one response the same hold («hold=»)"
                 )
             )
+    return records
 
 
 def check_distinct(records: Sequence[Record]) -> None:

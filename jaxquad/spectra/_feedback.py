@@ -22,9 +22,9 @@ from jaxquad.records import Record
 from ._average import frequencies_for, transform_records
 from ._estimators import (
     adjoint,
-    check_compatible,
     check_references,
     COHERENT,
+    compatible,
     DOMINATED,
     EARLY,
     Grid,
@@ -380,8 +380,7 @@ def spectral_density(
     - `ValueError`: for frequencies that the window does not resolve, and records that differ.
     - `PrecisionError`, a `ValueError`: JAX runs in 32 bits; call `jq.enable_x64()` first.
     """
-    records = [record] if isinstance(record, Record) else list(record)
-    check_compatible(records)
+    records = compatible(record)
     welch = Welch() if welch is None else welch
     omega = frequencies_for(omega, records, welch)
     segments = transform_records(records, omega, [welch])
@@ -450,8 +449,7 @@ def feedback_bias(
 
     **Raises:** ValueError for other channels, and for frequencies that the window does not resolve.
     """
-    records = [record] if isinstance(record, Record) else list(record)
-    check_compatible(records)
+    records = compatible(record)
     check_references(records)
     first = records[0]
     if len(first.input_names) != 1 or len(first.output_names) != 1:

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
 
 from ._error_covariance import ErrorCovariance
-from ._estimators import diagonal, Grid
+from ._estimators import diagonal, Grid, sums_between
 from ._local_fit import Bins, left_power, LocalFit, window_slices
 from ._noise import Noise
 from ._rational_fit import (
@@ -220,10 +220,8 @@ def running_power(omega: Levels, values: Complex[np.ndarray, " bins"], freedom: 
     last = np.searchsorted(omega, omega * np.exp(_BANDWIDTH), "right")
     first = np.maximum(np.minimum(first, place - _NEIGHBOURS), 0)
     last = np.minimum(np.maximum(last, place + _NEIGHBOURS + 1), omega.size)
-    power, count = (
-        np.concatenate([[0.0], np.cumsum(part)]) for part in (np.abs(values) ** 2, freedom)
-    )
-    return (power[last] - power[first]) / np.maximum(count[last] - count[first], 1.0)
+    power, count = (sums_between(part, first, last) for part in (np.abs(values) ** 2, freedom))
+    return power / np.maximum(count, 1.0)
 
 
 class Rest(NamedTuple):
@@ -315,9 +313,8 @@ def response_left(
 ) -> Float[np.ndarray, " moved"]:
     """The most that a model leaves in any window, to what `fit` leaves: noise is 1 to 6; or 0."""
     first, last = window_slices(omega, half_width, rest.bins)
-    running = np.cumsum(np.abs(rest.bins.values[:, rest.moved]) ** 2, axis=0)
-    running = np.concatenate([np.zeros((1, running.shape[1])), running])
-    power = (running[last] - running[first]) / np.maximum(last - first, 1)[:, None]
+    power = sums_between(np.abs(rest.bins.values[:, rest.moved]) ** 2, first, last)
+    power /= np.maximum(last - first, 1)[:, None]
     noise = diagonal(fit.scatter)
     modelled = (fit.freedom > 0)[:, None] & (noise > 0)
     modelled = modelled & np.array([model is not None for model in rest.models])

@@ -17,7 +17,7 @@ from jaxtyping import Complex, Float, Int, Real
 
 from jaxquad.records import Record
 
-from ._estimators import COHERENT, Grid, in_hertz, Method, Remark, Response
+from ._estimators import COHERENT, Grid, in_hertz, Method, Remark, Response, sums_between
 from ._frequency_response import Estimate
 
 
@@ -350,9 +350,7 @@ def _say_harmonics(
         # Less parabolas through the bins around each (Savitzky, Golay 1964); at the ends the last.
         half = _TRANSIENT // 2
         powers = np.linspace(-1, 1, _TRANSIENT)[:, None] ** np.arange(3)
-        fitted = powers @ np.linalg.pinv(
-            powers
-        )  # from the values in a window to those of its parabola
+        fitted = powers @ np.linalg.pinv(powers)  # from a window's values to its parabola's
         windows = np.lib.stride_tricks.sliding_window_view(columns, _TRANSIENT, axis=1)
         first, last = windows[:, 0] @ fitted[:half].T, windows[:, -1] @ fitted[half + 1 :].T
         sharp = columns - np.concatenate([first, windows @ fitted[half], last], axis=1)
@@ -460,5 +458,4 @@ def local_mean(power: Bins, first: int) -> Bins:
     place = np.arange(power.size)
     reach = np.maximum(_NEAREST, (_NEAR * (first + place)).astype(int))
     low, high = np.maximum(place - reach, 0), np.minimum(place + reach + 1, power.size)
-    total = np.concatenate([[0.0], np.cumsum(power)])
-    return (total[high] - total[low]) / (high - low)
+    return sums_between(power, low, high) / (high - low)

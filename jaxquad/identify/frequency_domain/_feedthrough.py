@@ -20,7 +20,7 @@ from jaxtyping import Array, Float, PyTree
 from jaxquad._core import Message
 from jaxquad.spectra import FrequencyResponse
 
-from ..uncertainty._error_budget import ErrorBudget, scaled_inverse
+from ..uncertainty._error_budget import scaled_inverse
 from ..uncertainty._zero_bounds import linearise
 from ._parameters import Condition, Numbers
 from ._problem import Problem
@@ -34,6 +34,11 @@ _DIGITS = 9  # of slopes: delays that change alike
 _SEEN, _MOVED = 0.95, 0.05
 _REACH = 8.0  # standard errors, beyond which a density is nothing
 _PLACES = 401  # at which it is integrated
+_NOTHING = 1e-3  # of the precision of a sample
+_STEPS = 12  # of Newton's method, to the middles of samples
+_FIRST = 0.1  # samples, of a delay that is next to none
+
+Vector = Float[np.ndarray, " free"]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -114,11 +119,25 @@ def unsampled(problem: Problem, groups: Sequence[Sequence[DirectDelay]]) -> Prob
     return with_samples(problem, groups, [[np.nan] * len(group) for group in groups])
 
 
+def _to_middles(problem: Problem, z: Vector, groups: Sequence[Sequence[DirectDelay]]) -> Vector:
+    """The parameters with each delay in the middle of its sample, as near as they allow."""
+    for _ in range(_STEPS):
+        _, delays, slopes = jax.tree.map(np.asarray, _delays(z, problem))
+        rows, missing = [], []
+        for one, *_ in groups:
+            aliases, at = _aliases(problem, one), (one.output, one.input)
+            samples = max(float(np.asarray(aliases.samples)[at]) - 0.5, _FIRST)
+            missing.append(samples * float(aliases.hold) - delays[one.record][at])
+            rows.append(slopes[one.record][at])
+        z = z + np.clip(np.linalg.pinv(np.array(rows)) @ np.array(missing), -1.0, 1.0)
+    return z
+
+
 def find_samples(
     problem: Problem,
     solution: Solution,
     groups: Sequence[Sequence[DirectDelay]],
-    solve: Callable[[Problem, Solution], Solution],
+    solve: Callable[[Problem, Vector], Solution],
 ) -> tuple[Problem, Solution]:
     """The problem with direct parts of whole samples, and its solution, from the even one's.
 
@@ -135,8 +154,8 @@ def find_samples(
 
     def attempt(counts: Sequence[Sequence[float]], start: Solution) -> tuple[Problem, Solution]:
         tried = with_samples(problem, groups, counts)
-        # From the place itself: the misfits of the start are those of other samples.
-        return tried, solve(tried, start)
+        # From within the samples: beyond their ends there may be minima that are none.
+        return tried, solve(tried, _to_middles(tried, start.z, groups))
 
     cost = lambda pair: linearise(*pair).cost
     best, improved = attempt(counts, solution), True
@@ -165,47 +184,63 @@ class SampleLimit(NamedTuple):
 
 def sample_limits(
     problem: Problem,
-    budget: ErrorBudget,
     solution: Solution,
     groups: Sequence[Sequence[DirectDelay]],
-) -> list[SampleLimit]:
-    """For delays of which the rest of the response tells less than the sample does."""
-    _, delays, slopes = jax.tree.map(np.asarray, _delays(solution.z, problem))
-    rows, places = [], []
+    solve: Callable[[Problem, Vector], Solution],
+) -> tuple[list[SampleLimit], Solution]:
+    """For delays of which the rest of the response tells less than the sample does.
+
+    With the solution under the limits of all samples.
+    """
+    if not groups:
+        return [], solution
+    slopes = _delays(solution.z, problem)[2]
+    rows, limits = [], []
     for one, *_ in groups:
-        at = (one.output, one.input)
-        aliases = _aliases(problem, one)
-        count = float(np.asarray(aliases.samples)[at])
-        row = slopes[one.record][at]
-        independent = np.linalg.matrix_rank(np.array([*rows, row])) > len(rows)
-        if count > 0 and independent:
+        aliases, at = _aliases(problem, one), (one.output, one.input)
+        row, hold = np.asarray(slopes[one.record])[at], float(aliases.hold)
+        high = float(np.asarray(aliases.samples)[at]) * hold
+        # A delay of no sample is none, and sums of others say nothing new.
+        if high > 0 and np.linalg.matrix_rank(np.array([*rows, row])) > len(rows):
             rows.append(row)
-            places.append((one, float(delays[one.record][at]), count, float(aliases.hold)))
-    if not rows:
-        return []
-    # With the variance of all samples the normal equations have an inverse; without its own that
-    # of each delay is what all else tells of it.
-    jacobian, holds = np.array(rows), np.array([hold for *_, hold in places])
-    bread = budget.bread + (jacobian.T * (12 / holds**2)) @ jacobian
-    spread = np.diagonal(jacobian @ scaled_inverse(bread) @ jacobian.T)
-    limits = []
-    for (one, late, count, hold), variance in zip(places, spread, strict=True):
-        low, high = (count - 1) * hold, count * hold
-        free = np.sqrt(1 / max(1 / variance - 12 / hold**2, 1e-6 / hold**2))
-        nearest = min(max(late, low), high)
+            middle, error = high - hold / 2, hold / np.sqrt(12)
+            limits.append(SampleLimit(one, high - hold, high, middle, error))
+    if not limits:
+        return [], solution
+    # With the mean and variance of each sample, which keeps the delays where slopes of the rest
+    # hold; without its own, that of a delay is what all else tells of it.
+    within = limited(problem, limits)
+    solution = solve(within, _to_middles(problem, solution.z, groups))
+    _, late, slopes = _delays(solution.z, problem)
+    jacobian = np.array(
+        [np.asarray(slopes[one.record])[one.output, one.input] for one, *_ in limits]
+    )
+    by_all = linearise(within, solution).jacobian
+    spread = np.diagonal(jacobian @ scaled_inverse(by_all.T @ by_all) @ jacobian.T)
+    needed = []
+    for limit, variance in zip(limits, spread, strict=True):
+        one, low, high, middle, error = limit
+        mean = float(np.asarray(late[one.record])[one.output, one.input])
+        precision = 1 / variance - 1 / error**2
+        if precision < _NOTHING / error**2:
+            needed.append(limit)
+            continue
+        aim = (mean / variance - middle / error**2) / precision
+        free = precision**-0.5
+        nearest = min(max(aim, low), high)
         low_end, high_end = nearest - _REACH * free, nearest + _REACH * free
         x = np.linspace(max(low, low_end), min(high, high_end), _PLACES)
-        density = -0.5 * ((x - late) / free) ** 2
+        density = -0.5 * ((x - aim) / free) ** 2
         density = np.exp(density - density.max())
         density /= density.sum()
         mean = float(density @ x)
-        error = float(np.sqrt(density @ (x - mean) ** 2))
-        if error > _SEEN * free and abs(mean - late) < _MOVED * free:
+        variance = float(density @ (x - mean) ** 2)
+        if variance > _SEEN**2 / precision and abs(mean - aim) < _MOVED * free:
             continue
-        precision = 1 / error**2 - 1 / free**2
-        value = (mean / error**2 - late / free**2) / precision
-        limits.append(SampleLimit(one, low, high, float(value), float(precision**-0.5)))
-    return limits
+        more = 1 / variance - precision
+        value = (mean / variance - aim * precision) / more
+        needed.append(limit._replace(value=value, standard_error=more**-0.5))
+    return needed, solution
 
 
 def limited(problem: Problem, limits: Sequence[SampleLimit]) -> Problem:
