@@ -161,7 +161,7 @@ def descend_within_samples(
     With what the sample tells of a delay of which the rest of the record tells less.
     """
     base, count = problem.base, problem.base.parameters.count
-    held = dataclasses.replace(base, conditions=(UNCHANGED,) * len(problem.terms), aliases=())
+    sampled = dataclasses.replace(base, conditions=(UNCHANGED,) * len(problem.terms), aliases=())
     linear = all(term.motions is not None for term in problem.terms)
     if linear and eqx.filter_eval_shape(direct_part, base.model) is not None:
         direct = direct_part(base.model)
@@ -171,26 +171,26 @@ def descend_within_samples(
             Aliases.of_direct(term.dt, np.asarray(n)) if term.hold == "zero" else None
             for term, n in zip(problem.terms, samples, strict=True)
         ]
-        held = dataclasses.replace(held, aliases=tuple(parts))
-    delays = free_delays(held)
+        sampled = dataclasses.replace(sampled, aliases=tuple(parts))
+    delays = free_delays(sampled)
 
     def descend_from(
-        held: Problem, z: Vector | None, noise: Noise | None, near: bool = True
+        sampled: Problem, z: Vector | None, noise: Noise | None, near: bool = True
     ) -> Descent:
         these = problem
         if delays:
             terms = [
                 term if part is None else dataclasses.replace(term, direct_samples=part.samples)
-                for term, part in zip(problem.terms, held.aliases, strict=True)
+                for term, part in zip(problem.terms, sampled.aliases, strict=True)
             ]
-            limited = dataclasses.replace(base, quantities=held.quantities, prior=held.prior)
+            limited = dataclasses.replace(base, quantities=sampled.quantities, prior=sampled.prior)
             these = dataclasses.replace(problem, base=limited, terms=tuple(terms))
         if noise is None:
             return descend_by_turns(these, max_steps, z)
         return descend_with_noise(these, noise, max_steps, z, near=near)
 
-    def solve(held: Problem, z: Vector, noise: Noise | None = noise) -> Solved:
-        end = descend_from(held, z, noise)
+    def solve(sampled: Problem, z: Vector, noise: Noise | None = noise) -> Solved:
+        end = descend_from(sampled, z, noise)
         rows = [np.asarray(part)[..., :count].reshape(-1, count) for part in end.evaluation.slopes]
         rows.append(np.asarray(end.solution.sensitivity.prior_slopes)[:, :count])
         misfit = sum(float(np.sum(np.asarray(part) ** 2)) for part in end.evaluation.misfits)
@@ -200,12 +200,12 @@ def descend_within_samples(
         return Solved(end, np.asarray(end.z)[:count], misfit - 2 * level, information)
 
     if not delays:
-        return descend_from(held, None, noise, near), []
+        return descend_from(sampled, None, noise, near), []
     # Which sample it is shows without a noise model.
-    by_level = lambda held, z: solve(held, z, None)
-    held, sampled = find_samples(held, _start_of(problem)[:count], delays, by_level)
-    limits, z = sample_limits(held, sampled.z, delays, solve)
-    return descend_from(limited(held, limits) if limits else held, z, noise), limits
+    by_level = lambda sampled, z: solve(sampled, z, None)
+    sampled, solved = find_samples(sampled, _start_of(problem)[:count], delays, by_level)
+    limits, z = sample_limits(sampled, solved.z, delays, solve)
+    return descend_from(limited(sampled, limits) if limits else sampled, z, noise), limits
 
 
 def _start_of(problem: OutputError) -> Vector:
