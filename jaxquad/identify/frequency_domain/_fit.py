@@ -160,10 +160,15 @@ def fit(
     A `jq.identify.Fit`. Its `verdict` says what the record determines; where too few frequencies
     are usable to fit anything, the result holds the starting values.
 
+    Within `jax.grad`, `jvp`, `jacrev`, `jacfwd` and `hessian` its model and values have derivatives
+    by responses, their random errors and coherences, fixed parameters, priors and conditions: those
+    of fitting again, by the implicit function theorem with the cost's whole Hessian. Frequencies
+    and the correlation of errors count as constant, and so does which points are in use.
+
     **Raises:**
 
     - `ValueError`: for names that the model does not have, options that make no sense, and a
-        solver that diverged.
+        solver that diverged; within `jax.jit` and `vmap`, and for derivatives without a minimum.
     - `PrecisionError`, a `ValueError`: JAX runs in 32 bits; call `jq.enable_x64()` first.
 
     !!! example

@@ -19,7 +19,7 @@ from typing import NamedTuple
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Complex, Float
+from jaxtyping import Complex, Float
 
 from jaxquad._core import pytree_node
 from jaxquad.spectra import FrequencyResponse
@@ -62,8 +62,8 @@ def rescale(solution: Solution, units: Units) -> Units:
 class PriorRows(NamedTuple):
     """Prior knowledge, in standard errors, by relative changes."""
 
-    misfit: Float[Numbers, " priors"]
-    slopes: Float[Numbers, "priors all"]
+    misfit: Float[np.ndarray, " priors"]
+    slopes: Float[np.ndarray, "priors all"]
 
 
 def prior_rows(solution: Solution, units: Units) -> PriorRows:
@@ -175,7 +175,7 @@ class Mixture(NamedTuple):
     """A posterior mean of squared amplitudes by length, and the probability of none."""
 
     powers: Float[Numbers, " lengths"]
-    none: float | Float[Array, ""]
+    none: float
 
     @property
     def amplitude(self) -> float:
