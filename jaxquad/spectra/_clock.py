@@ -36,10 +36,10 @@ def remarks_on_clock(records: Sequence[Record], estimate: Estimate) -> tuple[Rem
         return ()
     rate, clear = _clock_drift(records, omega)
     error = np.where(usable, estimate.random_error, np.inf)
-    known = np.sum((estimate.omega[:, None, None] / error) ** 2, axis=0)  # inverse variances
+    precision = np.sum((estimate.omega[:, None, None] / error) ** 2, axis=0)  # inverse variances
     seconds = max(record.samples for record in records) * records[0].dt
     late = rate * seconds
-    if not (clear > _CLEAR and abs(rate) < _MOST and (0.5 * late) ** 2 * np.max(known) > 1):
+    if not (clear > _CLEAR and abs(rate) < _MOST and (0.5 * late) ** 2 * np.max(precision) > 1):
         return ()
     text = (
         f"the output's time stamps drift against the input's by {1e6 * rate:+.2g} ppm, "
@@ -75,7 +75,7 @@ def _compare(record: Record, low: float, high: float) -> list[tuple[np.ndarray, 
     first, last = np.searchsorted(grid, [low, high])
     band, y = slice(max(int(first), 1), int(last)), record.outputs[:count]
     time = np.linspace(-0.5, 0.5, count)[:, None] * count  # in samples
-    given, moving, gained = (
+    commands, moving, gained = (
         _transform(x)[band]
         for x in (
             record.inputs[:count],
@@ -84,14 +84,16 @@ def _compare(record: Record, low: float, high: float) -> list[tuple[np.ndarray, 
         )
     )
     columns = moving.shape[1] + 1  # with a transient
-    for block in np.array_split(np.arange(len(given)), max(len(given) // (_BLOCK * columns), 1)):
+    for block in np.array_split(
+        np.arange(len(commands)), max(len(commands) // (_BLOCK * columns), 1)
+    ):
         if block.size < 2 * _POWERS * columns:
             continue
         smooth = np.linspace(-1, 1, block.size)[:, None] ** np.arange(_POWERS)
         signals = np.hstack([moving[block], np.ones((block.size, 1))])
         basis = (signals[:, :, None] * smooth[:, None, :]).reshape(block.size, -1)
         scale = np.maximum(np.linalg.norm(basis, axis=0), 1e-300)
-        basis, inputs = basis / scale, given[block]
+        basis, inputs = basis / scale, commands[block]
         factors = np.linalg.lstsq(basis, inputs, rcond=None)[0] / scale[:, None]
         factors = factors.reshape(columns, _POWERS, -1)[: y.shape[1]]
         added = np.einsum("bo,bp,opi->bi", gained[block], smooth, factors)
