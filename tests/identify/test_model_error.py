@@ -181,6 +181,7 @@ def flown_notch(seed):
 def test_a_notch_is_remarked_where_it_is_and_intervals_hold_what_it_moves():
     for seed in range(4):
         fit = jq.fit(jq.LaggedIntegrator(48.0, 0.024, 0.011), flown_notch(seed))
+        assert fit.discrepancy is not None
         assert fit.discrepancy.none > 0.05, "a stationary discrepancy does not see it"
         (text,) = (text for text in fit.remarks if text.kind == "misfit")
         assert " times from " in text and " to 70 rad/s" in text

@@ -129,7 +129,8 @@ def with_resonance(budget: ErrorBudget, local: LocalMisfit | None) -> ErrorBudge
     number, o, i = local.place
     record, inverse = budget.records[number], scaled_inverse(budget.bread)
     used, s = record.used[:, o, i], 1j * np.asarray(record.frf.omega)
-    dot = lambda one, other: np.tensordot(one, other, axes=((0, 1, 2, 3),) * 2)
+    each = (0, 1, 2, 3)
+    dot = lambda one, other: np.tensordot(one, other, axes=(each, each))
     lowered, moves = [0.0], [np.zeros((budget.count, budget.count))] * 2
     for place in np.geomspace(local.low / _OUTSIDE, local.high * _OUTSIDE, _PLACES).tolist():
         for damping in _DAMPINGS:
@@ -137,7 +138,7 @@ def with_resonance(budget: ErrorBudget, local: LocalMisfit | None) -> ErrorBudge
             pole = place**2 / (s**2 + 2 * damping * place * s + place**2)
             logs = np.stack([s / place * pole, pole - 1], axis=1)
             parts = np.zeros((*record.misfit.shape, 2))
-            parts[used, o, i] = np.stack([logs.real, logs.imag], axis=1)[used]
+            parts[used, o, i] = np.stack([np.real(logs), np.imag(logs)], axis=1)[used]
             rows = np.asarray(mix(record.mixing, record.weights[..., None] * parts))
             along, own = dot(record.rows[..., : budget.count], rows), dot(rows, rows)
             left = own - along.T @ inverse @ along
