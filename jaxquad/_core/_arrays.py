@@ -56,7 +56,7 @@ def concrete_values(tree: Tree, what: str) -> Tree:
     return values
 
 
-def is_traced(tree: Tree) -> bool:
+def is_traced(tree: object) -> bool:
     """Whether a transformation of JAX is looking at any of its numbers."""
     return not all(map(is_concrete, jax.tree.leaves(tree)))
 

@@ -22,7 +22,7 @@ from ._channel import (
     window,
     within,
 )
-from ._log import choose_range, FEWEST, GapError, mend_holes, RecordError, warn
+from ._log import choose_range, FEWEST, GapError, mend_holes, MOST_SAMPLES, RecordError, warn
 from ._record import as_tuple, assemble, Record
 
 
@@ -35,7 +35,6 @@ _BETA = 0.1102 * (72 - 8.7)
 _HALF = 0.5 * (72 - 7.95) / (2.285 * 2 * np.pi * 0.2)  # samples of the target grid
 _CUTOFF = 0.4  # of the target rate, where the filter is down by 6 dB
 _SAME = 1.05  # rates closer than this need neither a filter nor a warning
-_MOST = 50_000_000  # samples
 
 
 def resample(
@@ -88,11 +87,11 @@ def resample(
     if not (np.isfinite(sample_rate) and sample_rate > 0):
         raise RecordError(f"the sample rate is {sample_rate} Hz: it must be positive.")
     steps = (end - begin) * sample_rate
-    if not FEWEST - 1 <= steps + 1e-6 < _MOST:
+    if not FEWEST - 1 <= steps + 1e-6 < MOST_SAMPLES:
         raise RecordError(
             f"a sample rate of {sample_rate:.6g} Hz over {end - begin:.6g} s makes "
-            f"{steps + 1:.6g} samples; {FEWEST} .. {_MOST} are allowed. Choose another rate or "
-            f"range."
+            f"{steps + 1:.6g} samples; {FEWEST} .. {MOST_SAMPLES} are allowed. Choose another "
+            f"rate or range."
         )
     time = begin + np.arange(int(steps + 1e-6) + 1) / sample_rate
     # The filter looks as far to either side, and a spline at its end needs some samples more.

@@ -205,8 +205,11 @@ def _remarks(
 def _beyond_band(controller: PyTree, band: tuple[float, float] | None) -> Iterator[tuple[str, str]]:
     """The bandwidths of a LADRC that no data support, and what to do."""
     ladrc = find_ladrc(controller)
-    for name in () if ladrc is None or band is None else ("wc", "wo"):
-        value, (low, high) = float(np.max(np.asarray(vars(ladrc)[name]))), band
+    if ladrc is None or band is None:
+        return
+    low, high = band
+    for name in ("wc", "wo"):
+        value = float(np.max(np.asarray(vars(ladrc)[name])))
         if value > _ROUNDED * high:
             yield (
                 f"{name} = {value:.4g} rad/s lies beyond the identified band of {low:.3g} to "
@@ -288,9 +291,7 @@ def peers(plant: Plant, *, pid: PyTree | None = None, dt: float = 0.002) -> dict
     return designs if pid is None else designs | {"tuned PID": pid}
 
 
-def _nominal_numbers(
-    plant: Plant,
-) -> tuple[Float[np.ndarray, " axes"], Float[np.ndarray, " axes"]]:
+def _nominal_numbers(plant: Plant) -> tuple[Float[np.ndarray, " axes"], ...]:
     """KT in N m per unit of command and J in kg m^2, in NumPy: nothing is compiled."""
     if not isinstance(plant, DecoupledAxes | Multirotor):
         raise ValueError(
@@ -303,8 +304,7 @@ def _nominal_numbers(
             f"the plant is an ensemble of {axes.shape[1:]}: give the nominal one, for whose "
             "gain the designs are made"
         )
-    KT, J = np.broadcast_arrays(np.asarray(axes.torque_gain, float), np.asarray(axes.inertia))
-    return KT, J
+    return np.broadcast_arrays(np.asarray(axes.torque_gain, float), np.asarray(axes.inertia))
 
 
 def worst_flights(

@@ -1,7 +1,4 @@
-"""What a descent lowers, for many designs at once, and members beyond limits to lower it on.
-
-Thousands of members of an ensemble are searched; limits are kept on the worst of them.
-"""
+"""What a descent lowers, for many designs at once, and the search for members beyond limits."""
 
 import dataclasses
 import functools as ft

@@ -196,13 +196,10 @@ def summarise_design(design: DesignResult, *, independent: bool) -> DesignSummar
     count = design.unstable_count
     bound = None if count is None else upper_bound(count, design.members)
     return DesignSummary(
-        members=design.members,
-        unstable=count,
-        unstable_at_most=bound if independent else None,
-        diverged=int(np.sum(design.diverged)),
-        lost=int(np.sum(design.lost)),
+        members=design.members, unstable=count, unstable_at_most=bound if independent else None,
+        diverged=int(np.sum(design.diverged)), lost=int(np.sum(design.lost)),
         statistics={name: _statistics(design, name) for name in design.by_axis},
-    )
+    )  # fmt: skip
 
 
 def _statistics(design: DesignResult, name: str) -> Statistics:

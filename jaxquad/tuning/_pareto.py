@@ -92,14 +92,10 @@ class Pareto(eqx.Module):
             f"{'unstable, %':>13}",
         ]
         points = (self.levels, self.certificates, self.front, self.converged)
-        rows = [
-            (
-                f"{k + 1}{'' if on else ', dominated'}{'' if done else ', not done'}",
-                f"{level:.3g}",
-                certificate.design,
-            )
-            for k, (level, certificate, on, done) in enumerate(zip(*points, strict=True))
-        ]
+        rows = []
+        for k, (level, certificate, on, done) in enumerate(zip(*points, strict=True), 1):
+            marks = f"{'' if on else ', dominated'}{'' if done else ', not done'}"
+            rows.append((f"{k}{marks}", f"{level:.3g}", certificate.design))
         rows += [(name, "", design) for name, design in self.peers.items()]
         for name, level, design in rows:
             row = summarise_design(design, independent=first.independent)

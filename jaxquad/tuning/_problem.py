@@ -330,14 +330,10 @@ def make_problem(
     windows = [window(samples, dt, start=a, stop=b, load_start=None) for a, b in span.parts]
     parts = [(int(x[0]), int(x[1])) for x in windows] if len(windows) > 1 else [(first, until)]
     return Problem(
-        loop=loop,
-        linear=linear_loops(members, devices),
-        limited=None,
-        flight=flight,
-        window=Window(first, last, loaded, parts[-1][1]),
-        parts=tuple(parts),
+        loop=loop, linear=linear_loops(members, devices), limited=None, flight=flight,
+        window=Window(first, last, loaded, parts[-1][1]), parts=tuple(parts),
         counted=members.size if counted is None else counted,
-    )
+    )  # fmt: skip
 
 
 def linear_loops(members: Members, devices: DeviceChoice) -> LinearLoops:

@@ -491,5 +491,5 @@ def require_kinds(
         raise ValueError(f"limits are {limits}: give a list, as [jq.Limit('overshoot', at_most=5)]")
     if not isinstance(method, LBFGS | GaussNewton):
         raise ValueError(f"method is {method!r}: give jq.tuning.LBFGS() or jq.tuning.GaussNewton()")
-    if isinstance(method, GaussNewton):
+    if isinstance(method, GaussNewton) and isinstance(objective, Objective):
         require_squares(objective, limits)

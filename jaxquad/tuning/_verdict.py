@@ -128,19 +128,12 @@ def measure_distances(
         slack = sign * (bound - reached)
         beyond, over = int(np.sum(~(values <= sign * bound))), risk_text(limit.over)
         distance = Distance(
-            quantity=limit.quantity,
-            over=over,
-            sense="at least" if limit.at_most is None else "at most",
-            bound=bound,
-            reached=reached,
-            slack=slack,
-            percent=100 * slack / abs(bound) if bound else np.copysign(np.inf, slack),
-            beyond=beyond,
-            without=values.size - stable.size,
-            of_others=sign * risk(stable),
-            members=values.size,
-            member=None if np.isnan(values).any() else int(np.argmax(values)),
-        )
+            quantity=limit.quantity, over=over,
+            sense="at least" if limit.at_most is None else "at most", bound=bound, reached=reached,
+            slack=slack, percent=100 * slack / abs(bound) if bound else np.copysign(np.inf, slack),
+            beyond=beyond, without=values.size - stable.size, of_others=sign * risk(stable),
+            members=values.size, member=None if np.isnan(values).any() else int(np.argmax(values)),
+        )  # fmt: skip
         if independent and covers(distance):
             distance = distance._replace(beyond_at_most=upper_bound(beyond, values.size))
         distances.append(distance)
@@ -253,11 +246,12 @@ def evaluate_attainable(
     different = (inertia, gain, lag, damping, stiffness, friction, delay[None], payload,
                  np.asarray(drawn.assumed_inertia))  # fmt: skip
     varies = any(np.any(np.ptp(x, axis=-1) > 0) for x in different)
-    bounds = (np.stack(x) for x in zip(*rows, strict=True))
+    drive_bound, nothing, carried = (np.stack(x) for x in zip(*rows, strict=True))
     half_squares = 0.5 * np.reshape(seconds, (-1, 1, 1)) ** 2
     result = Attainable(
-        linear.by_part, linear.peaks, *bounds, half_squares, command, step, moved, varies
-    )
+        linear.by_part, linear.peaks, drive_bound, nothing, carried, half_squares, command, step,
+        moved, varies,
+    )  # fmt: skip
     return result._replace(settled=result.band * half_squares)
 
 
@@ -413,26 +407,21 @@ def judge_performance(certificate: "Certificate") -> Verdict:
         fastest = np.maximum(np.maximum(limits.linear, limits.drive) / WORTH, limits.settled)
         imperfect = np.any(np.sum(flown, axis=0) > np.sum(fastest, axis=0), axis=0)
         imperfect |= np.any((limits.drive > 0) & (flown > fastest), axis=(0, 1))
-        what = (
-            "make more than twice the error of their linear loops, which know neither limit, nor "
-            "friction, nor resolution"
-        )
+        what = "make more than twice the error of their linear loops, which know neither limit, "
+        what += "nor friction, nor resolution"
         checks.append((imperfect, what, "Raise the limit, reduce friction, or measure finer"))
         degrees = np.degrees(np.max(limits.carried))
         what = f"are carried off by the disturbance, up to {degrees:.3g} deg against full torque"
         farther = limits.carried > np.maximum(WORTH * limits.linear_peak, limits.band)
         checks.append((np.any(farther, axis=(0, 1)), what, less))
         if limits.moved and limits.band > SETTLED * limits.moved:
-            text = (
-                f"half a step of the encoder is {np.degrees(limits.step) / 2:.3g} deg, beyond "
-                f"{SETTLED:.0%} of the manoeuvre of {np.degrees(limits.moved):.3g} deg"
-            )
+            text = f"half a step of the encoder is {np.degrees(limits.step) / 2:.3g} deg, beyond "
+            text += f"{SETTLED:.0%} of the manoeuvre of {np.degrees(limits.moved):.3g} deg"
             remarks.append((text, "Take a finer encoder, or fly a larger manoeuvre"))
     if start is not None:
         busy, before = (float(np.median(x.of("activity_rate"))) for x in (design, start))
-        limit = np.inf if limits is None else limits.command
-        quiet = QUIET * limit**2 if np.isfinite(limit) else 0.0
-        if before > 0 and busy > max(BUSIER * before, quiet):
+        limit = 0.0 if limits is None or np.isinf(limits.command) else limits.command
+        if before > 0 and busy > max(BUSIER * before, QUIET * limit**2):
             text = f"the command's activity is {busy / before:.3g} times that of the start"
             remarks.append((text, "Penalise activity with a knee near that of the start"))
     numbers = f"{shown.title} {shown.text(float(np.mean(mine)))} in the mean and "
@@ -446,8 +435,8 @@ def judge_performance(certificate: "Certificate") -> Verdict:
     checks += remarks
     if checks:
         texts, remedies = zip(*checks, strict=True)
-        remedy = ". ".join(dict.fromkeys(remedies))
-        return Verdict("PERFORMANCE", False, f"{'; '.join(texts)}: {numbers}", remedy)
+        text, remedy = f"{'; '.join(texts)}: {numbers}", ". ".join(dict.fromkeys(remedies))
+        return Verdict("PERFORMANCE", False, text, remedy)
     none = np.zeros(design.members, bool)
     text = f"{_count(~none)} members make less than half the error of doing nothing"
     text += " and less than twice that of their linear loops" * (limits is not None)

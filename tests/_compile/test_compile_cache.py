@@ -81,6 +81,7 @@ def test_the_folder_of_a_killed_process_goes_and_that_of_a_living_one_stays(tmp_
     for folder in folders[:2]:
         os.utime(folder, (time.time() - 100, time.time() - 100))
     lock = _door._locked(folders[1])
+    assert lock is not None
     try:
         _door._prune(tmp_path)
     finally:

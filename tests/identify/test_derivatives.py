@@ -1,10 +1,15 @@
 """Derivatives through `jq.fit` are those of fitting again, with other data, priors or constants."""
 
+import dataclasses
+import re
+from types import SimpleNamespace
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from conftest import ROOT
 from synthetic import OMEGA, response_of
 
 import jaxquad as jq
@@ -18,6 +23,7 @@ class Notched(jq.LaggedIntegrator):
     """What the model of the fits does not explain."""
 
     def frequency_response(self, omega):
+        omega = jnp.asarray(omega)
         s = jax.lax.complex(jnp.zeros_like(omega), omega)
         notch = (s**2 + 3 * s + 900) / (s**2 + 12 * s + 900)
         return super().frequency_response(omega) * notch[:, None, None]
@@ -97,7 +103,8 @@ def test_slopes_by_each_measured_number(kind, field):
     if kind == "coherence":
         cost = jq.identify.CoherenceWeighted()
     if kind == "unexplained":
-        assert jq.fit(START, frf).discrepancy.none < 0.05
+        discrepancy = jq.fit(START, frf).discrepancy
+        assert discrepancy is not None and discrepancy.none < 0.05
 
     def estimates(x):
         return logs(jq.fit(START, at(frf, **{field: x}), cost=cost))
@@ -131,3 +138,54 @@ def test_slopes_by_priors_and_known_changes_of_several_records():
         return logs(jq.fit(START, frfs, priors=[prior], conditions=[None, change]))
 
     assert_slopes_of_refits(estimates, jnp.ones(3))
+
+
+@pytest.mark.slow
+def test_second_derivatives_are_the_slopes_of_the_first():
+    frf, cost = response_of(TRUTH, seed=1), jq.identify.CoherenceWeighted()
+
+    def lag(scale):
+        y = frf.response * jnp.exp(scale * jnp.cos(jnp.asarray(OMEGA)))[:, None, None].astype(
+            complex
+        )
+        return jq.fit(START, at(frf, response=y), cost=cost)["lag"]
+
+    slope, here, h = jax.grad(lag), jnp.asarray(0.05), 1e-4
+    change = (slope(here + h) - slope(here - h)) / (2 * h)
+    np.testing.assert_allclose(jax.hessian(lag)(here), change, rtol=1e-5)
+
+
+@pytest.mark.slow
+def test_a_lag_at_zero_stays_there_and_the_others_move():
+    frf = response_of(jq.LaggedIntegrator(280.0, 0.0, 0.011), seed=8)
+    assert jq.fit(START, frf).values[1] == 0
+
+    def estimates(y):
+        gain, lag, delay = jq.fit(START, at(frf, response=y)).values
+        return jnp.stack([jnp.log(gain), lag, jnp.log(delay)])
+
+    # Where the lag is at zero, small steps leave it there.
+    assert_slopes_of_refits(estimates, frf.response, step=1e-6, rtol=1e-4)
+
+
+@pytest.mark.slow
+def test_the_guide_says_which_frequency_would_have_helped_the_tuned_loop_most():
+    sweep = jq.sweep(0.5, 30.0, duration=60.0, sample_rate=100.0, amplitude=1.0)
+    model = jq.LaggedIntegrator(80.0, 0.03, 0.02)
+    q = jq.models.simulate_linear(model.transfer_function(), sweep.signal, 0.01)
+    q = q + np.random.default_rng(0).normal(0, 0.3, q.shape)
+    record = jq.Record(sweep.time, sweep.signal, q, input_names="M", output_names="q", hold="dt")
+    response = jq.frequency_response(record)
+    page = (ROOT / "docs" / "tuning.md").read_text()
+    names = {
+        "start": jq.LaggedIntegrator(20.0, 0.1, 0.01),
+        "response": response,
+        "tuned": SimpleNamespace(controller=jq.LADRC(3.0, 15.0, 80.0)),
+        "flight": jq.scenario(duration=4.0, axes=1, reference=jq.Step(np.radians(4.0))),
+    } | {module.__name__: module for module in (dataclasses, jax)}
+    code = re.search(r"```python\n(def itae.*?)```", page, flags=re.S)
+    assert code is not None
+    names |= {"jq": jq, "np": np}
+    with jax.numpy_dtype_promotion("standard"):
+        exec(code[1], names)
+    assert_slopes_of_refits(names["itae"], response.response, rtol=1e-5, seeds=1)

@@ -18,7 +18,9 @@ LOOP: dict[str, Any] = {"drive": Saturation(10.0), "dt": 0.002}
 SOUND = equivalent(8.0, 25.0)
 
 
-def certified(controller=SOUND, *, loop=(), members=64, scenario=None, events=EVENTS, **laws):
+def certified(
+    controller: Any = SOUND, *, loop=(), members=64, scenario=None, events=EVENTS, **laws
+):
     options = LOOP | dict(loop)
     drawn = laws.pop("ensemble", None) or ensemble(**laws)
     return certify(

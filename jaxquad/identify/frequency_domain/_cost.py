@@ -16,7 +16,7 @@ import dataclasses
 import functools as ft
 import itertools
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple, Protocol, runtime_checkable
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import equinox as eqx
 import jax
@@ -307,7 +307,8 @@ def mixing_of(points: Points, weights: Weights) -> Mixing | None:
     if not points.correlations and points.between is None:
         return None
     none, xp = unmixed(points.used.shape), namespace_of(weights)
-    factor, correlation = np.array(none.factor), np.array(none.correlation)
+    factor: Any = np.array(none.factor)
+    correlation: Any = np.array(none.correlation)
     for (o, i), shared in points.correlations.items():
         mine = np.flatnonzero(points.used[:, o, i])
         # A floor on the error is shared with no other point.
@@ -317,7 +318,8 @@ def mixing_of(points: Points, weights: Weights) -> Mixing | None:
         root = np.sqrt(1 + _DOUBT) * xp.linalg.inv(xp.linalg.cholesky(total))
         place = (o, i, mine[:, None], mine)
         factor, correlation = _placed(factor, place, root), _placed(correlation, place, shared)
-    across, between = none.across, none.between
+    across: Any = none.across
+    between: Any = none.between
     if points.between is not None:  # what whitens the pairs at each frequency
         alone = xp.minimum((weights[..., 0] * points.floor) ** 2, 1.0).reshape(len(weights), -1)
         size, identity = xp.sqrt(1 - alone), np.eye(alone.shape[1])
@@ -328,7 +330,7 @@ def mixing_of(points: Points, weights: Weights) -> Mixing | None:
     return Mixing(factor, correlation, across, between, np.array(False))
 
 
-def _placed(array: Numbers, place: tuple, values: Numbers) -> Numbers:
+def _placed(array: Numbers, place: tuple, values: Numbers) -> Any:
     """`array` with these values in place."""
     if namespace_of(values) is not np:
         return jnp.asarray(array).at[place].set(values)

@@ -10,7 +10,7 @@ what the model leaves unexplained there: so derivatives go from stop to stop.
 import functools as ft
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -138,7 +138,7 @@ def _estimate(data: _Data, rest: PyTree, grids: tuple) -> Vector:
         return jnp.asarray(z)
 
     @estimate.defjvp
-    def along(primals, tangents):
+    def along(primals, tangents) -> Any:
         (data,), (changes,) = primals, tangents
         if is_traced(data):  # by a second derivative
             follow = lambda data: _follow_jitted(frame, grids, data, rest)[0]
@@ -216,11 +216,11 @@ def _follow(
 _follow_jitted = jax.jit(_follow, static_argnums=(0, 1))
 
 
-def _traced(points: Points, frf: tuple[Numbers, ...], grid: tuple) -> Points:
+def _traced(points: Points, numbers: tuple[Numbers, ...], grid: tuple) -> Points:
     """The points with the response and its errors as they are traced; 1 where they do not count."""
     shape, used, omega = grid
     used, old = np.frombuffer(used, bool).reshape(shape), points.frf
-    response, error, coherence = (jnp.where(used, x, 1.0) for x in frf)
+    response, error, coherence = (jnp.where(used, x, 1.0) for x in numbers)
     # Correlations are relative to the response: they turn with its phase.
     turn = jnp.conj(response / jnp.where(used, old.response, 1.0))
     turn = turn / jnp.abs(turn)

@@ -30,7 +30,7 @@ from ..uncertainty._assess import assess, unfitted
 from ..uncertainty._error_budget import weighting_at
 from ..uncertainty._local_misfit import DOUBT
 from ..uncertainty._verdict import without_numbers
-from ..uncertainty._zero_bounds import solve_within_bounds
+from ..uncertainty._zero_bounds import linearise, solve_within_bounds
 from ._cost import (
     Band,
     Cost,
@@ -52,6 +52,7 @@ from ._feedthrough import (
     limited,
     remarks_on_samples,
     sample_limits,
+    Solved,
     unsampled,
 )
 from ._parameters import Condition, Free, Numbers, Parameters, select_parameters, Tie
@@ -161,10 +162,15 @@ def fit(
     A `jq.identify.Fit`. Its `verdict` says what the record determines; where too few frequencies
     are usable to fit anything, the result holds the starting values.
 
+    Within `jax.grad`, `jvp`, `jacrev`, `jacfwd` and `hessian` its model and values have derivatives
+    by responses, their random errors and coherences, fixed parameters, priors and conditions: those
+    of fitting again, by the implicit function theorem with the cost's whole Hessian. Frequencies
+    and the correlation of errors count as constant, and so does which points are in use.
+
     **Raises:**
 
     - `ValueError`: for names that the model does not have, options that make no sense, and a
-        solver that diverged.
+        solver that diverged; within `jax.jit` and `vmap`, and for derivatives without a minimum.
     - `PrecisionError`, a `ValueError`: JAX runs in 32 bits; call `jq.enable_x64()` first.
 
     !!! example
@@ -279,9 +285,15 @@ def _fit(
         starts = spread_starts(parameters, options.starts, fastest=fastest)
         solution, minima = solve_from_many(problem, starts, solver, max_steps)
         solution = solve_within_bounds(problem, solution, solver, max_steps)
-    solve_from = lambda problem, z: solve_within_bounds(problem, z, solver, max_steps)
+
+    def solve_from(problem: Problem, z: Numbers) -> Solved:
+        end = solve_within_bounds(problem, np.asarray(z), solver, max_steps)
+        local = linearise(problem, end)
+        return Solved(end, end.z, local.cost, local.jacobian.T @ local.jacobian)
+
     if delays:
-        problem, solution = find_samples(problem, solution, delays, solve_from)
+        problem, sampled = find_samples(problem, solution.z, delays, solve_from)
+        solution = sampled.solution
     descents.append(Descent(problem, points, solution))
     again = weigh(points, solution)
     if not are_close(weights, again, 1e-4):
@@ -304,11 +316,11 @@ def _fit(
         descents.append(Descent(problem, raised, solution))
         _check_finite(solution)
         weighting = weighting_at(problem, points, solution)
-    limits, within = sample_limits(problem, solution, delays, solve_from)
+    limits, z = sample_limits(problem, solution.z, delays, solve_from)
     if limits:
         problem = limited(problem, limits)
         descents.clear()  # what limits a delay to its sample has no derivative
-        solution = solve_from(problem, within.z)
+        solution = solve_from(problem, z).solution
         weighting = weighting_at(problem, points, solution)
     if lifted:
         weighting = weighting._replace(by_noise=weighted(points, weigh(points, solution)))

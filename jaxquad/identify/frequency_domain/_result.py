@@ -2,6 +2,7 @@
 
 import functools as ft
 from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -118,7 +119,7 @@ class Fit:
         unbounded = np.isinf(self.standard_errors)
         return np.where(unbounded, np.inf, np.sqrt(np.diagonal(self.noise_covariance)))
 
-    def __getitem__(self, name: str) -> float | Float[Array, ""]:
+    def __getitem__(self, name: str) -> Any:  # a float, or what a derivative traces
         """The value of one parameter: `fit["gain"]`; `fit.interval(name)` has its error.
 
         **Raises:** KeyError for a name that the fit does not have, UndeterminedError (a ValueError)

@@ -41,10 +41,10 @@ Residual = Callable[[Float[Array, " parameters"], PyTree], Float[Array, " residu
 class Sensitivity(NamedTuple):
     """Misfits and their derivatives with respect to free and then fixed parameters."""
 
-    misfits: list[Float[Numbers, "frequencies outputs inputs 2"]]  # magnitude and phase
-    slopes: list[Float[Numbers, "frequencies outputs inputs 2 all"]]  # of the misfits
-    prior_misfits: Float[Numbers, " priors"]
-    prior_slopes: Float[Numbers, "priors all"]
+    misfits: list[Float[np.ndarray, "frequencies outputs inputs 2"]]  # magnitude and phase
+    slopes: list[Float[np.ndarray, "frequencies outputs inputs 2 all"]]  # of the misfits
+    prior_misfits: Float[np.ndarray, " priors"]
+    prior_slopes: Float[np.ndarray, "priors all"]
 
     def weighted(self, problem: Problem) -> Float[np.ndarray, " residuals"]:
         """The residuals of the points in use, and then of the priors."""
@@ -167,7 +167,7 @@ def evaluate(problem: Problem, *places: Vector) -> list[Sensitivity]:
     return evaluations
 
 
-def by_record(problem: Problem, lined_up: Numbers, rows: Numbers) -> Sensitivity:
+def by_record(problem: Problem, lined_up: Any, rows: Any) -> Sensitivity:
     parts, slopes, start = [], [], 0
     for measured in problem.measured:
         shape, size = (2, *measured.shape[1:], len(measured)), 2 * measured.size

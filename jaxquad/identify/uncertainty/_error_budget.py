@@ -19,7 +19,7 @@ from typing import NamedTuple
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Complex, Float
+from jaxtyping import Complex, Float
 
 from jaxquad._core import pytree_node
 from jaxquad.spectra import FrequencyResponse
@@ -62,8 +62,8 @@ def rescale(solution: Solution, units: Units) -> Units:
 class PriorRows(NamedTuple):
     """Prior knowledge, in standard errors, by relative changes."""
 
-    misfit: Float[Numbers, " priors"]
-    slopes: Float[Numbers, "priors all"]
+    misfit: Float[np.ndarray, " priors"]
+    slopes: Float[np.ndarray, "priors all"]
 
 
 def prior_rows(solution: Solution, units: Units) -> PriorRows:
@@ -83,6 +83,13 @@ class Noise(NamedTuple):
 
 def scaled_inverse(matrix: Matrix) -> Matrix:
     """Pseudo-inverse after unit scaling of the diagonal."""
+    return _scaled_inverse(matrix.tobytes(), len(matrix))
+
+
+@ft.lru_cache(maxsize=64)
+def _scaled_inverse(elements: bytes, count: int) -> Matrix:
+    # Ten parts of an assessment ask for the inverse of the same matrix.
+    matrix = np.frombuffer(elements).reshape(count, count)
     scale = np.sqrt(np.diagonal(matrix))
     scale = np.where(scale > 0, scale, 1.0)
     unit = matrix / np.outer(scale, scale)
@@ -175,7 +182,7 @@ class Mixture(NamedTuple):
     """A posterior mean of squared amplitudes by length, and the probability of none."""
 
     powers: Float[Numbers, " lengths"]
-    none: float | Float[Array, ""]
+    none: float
 
     @property
     def amplitude(self) -> float:
