@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from jaxquad.spectra._estimators import in_hertz
+from jaxquad.spectra import in_hertz
 
 from ..frequency_domain._cost import mix, Points
 from ._error_budget import ErrorBudget, scaled_inverse, SHARES
