@@ -83,6 +83,13 @@ class Noise(NamedTuple):
 
 def scaled_inverse(matrix: Matrix) -> Matrix:
     """Pseudo-inverse after unit scaling of the diagonal."""
+    return _scaled_inverse(matrix.tobytes(), len(matrix))
+
+
+@ft.lru_cache(maxsize=64)
+def _scaled_inverse(elements: bytes, count: int) -> Matrix:
+    # Ten parts of an assessment ask for the inverse of the same matrix.
+    matrix = np.frombuffer(elements).reshape(count, count)
     scale = np.sqrt(np.diagonal(matrix))
     scale = np.where(scale > 0, scale, 1.0)
     unit = matrix / np.outer(scale, scale)
