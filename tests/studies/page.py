@@ -19,6 +19,7 @@ PAGE = Path(__file__).parents[2] / "docs" / "validation.md"
 NOTES = "notes.txt"
 ORDER = (
     "healthy",
+    "new_ground",
     "refined",
     "ringdown",
     "hold",
