@@ -113,7 +113,7 @@ def table(rows: list[dict], seed: int) -> list[dict]:
             "title": "New ground",
             "command": command,
             "text": f"Seed {seed}, {count} plants. {TEXT}",
-            "columns": ["plants", "number", "printed numbers", "coverage %", "bias / claimed",
+            "columns": ["category", "plants", "printed numbers", "coverage %", "bias / claimed",
                         "scatter / claimed", "plants with a number beyond 4 errors %",
                         "silent misses %", "nothing determined %", "partly determined %",
                         "with remarks of the fit %", "with remarks of the response %"],

@@ -328,6 +328,17 @@ def true_combination(name: str, sum_of: tuple[str, ...], truth: dict[str, float]
     return value
 
 
+def nearest_truth(setting: Setting, fitted: dict[str, float]) -> dict[str, float]:
+    """The true values; of a lag and a damping, which can change places, in the order of the fit."""
+    truth = dict(zip(setting.names, map(float, setting.truth), strict=True))
+    if "damping" not in truth:
+        return truth
+    lag, damping = truth["lag"], truth["damping"]
+    swapped = truth | {"gain": truth["gain"] / (lag * damping), "lag": 1 / damping}
+    far = lambda one: abs(np.log(max(fitted["lag"], 1e-9) / one["lag"]))
+    return min(truth, swapped | {"damping": 1 / lag}, key=far)
+
+
 def judge(setting: Setting) -> dict:
     """One plant: all that is printed without a mark, against the truth."""
     try:
@@ -341,7 +352,7 @@ def judge(setting: Setting) -> dict:
             "numbers": [],
             "misfit": None,
         }
-    truth = dict(zip(setting.names, setting.truth, strict=True))
+    truth = nearest_truth(setting, dict(zip(fit.names, fit.values, strict=True)))
     bounds = {bound.name: bound for bound in fit.verdict.bounds}
     numbers = []
     for k, name in enumerate(fit.names):
