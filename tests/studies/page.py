@@ -57,8 +57,8 @@ Each of them, by its number.
 """,
     "New ground": """\
 1000 plants drawn at random, seed 806560 (each run draws others): 94.1 % of the printed 95 %
-intervals hold the truth, and 5 % of records have a remark. 1.3 % of plants are silent misses, by more
-than 4 claimed errors without a mark or remark (wanted: 0.2 %), all of order 3 or 4.
+intervals hold the truth, and 5 % of records have a remark. 1.3 % of plants are silent misses, by
+more than 4 claimed errors without a mark or remark (wanted: 0.2 %), all of order 3 or 4.
 """,
     "Healthy plants, parameter by parameter": """\
 95 % of 400 draws is known to 2.1 %. Counting model error widens intervals by 0 to 12 % where the
