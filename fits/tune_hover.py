@@ -49,6 +49,7 @@ ASSUMED: dict[str, Any] = {
 }
 LIMITS = (jq.Limit("sensitivity_peak", at_most=3.6), jq.Limit("overshoot", at_most=10.0))
 FREE = ("ladrc.wc", "ladrc.wo", "map.values")
+HELD = ("ladrc.wc", "map.values")  # with wo at the end of the sweep's band
 HALF = ("ladrc.feedback_factor", "ladrc.observer_factor")
 # A PID's noise has to roll off as a LADRC's does, else it is no match at the same activity.
 PID_FREE = ("pid.kp", "pid.ki", "pid.measurement_filter", "pid.proportional_weight", "map.values")
@@ -71,7 +72,8 @@ def identified(fit: jq.identify.Fit) -> Case:
     """Gain and lag as uncertain as the fit leaves them, and the assumed rest."""
     band = float(OMEGA[0]), float(OMEGA[-1])
     posterior = jq.ensembles.Posterior(fit, plant=roll, band=band)
-    return case_of(posterior.plant, jq.Ensemble(posterior, **ASSUMED))
+    case = case_of(posterior.plant, jq.Ensemble(posterior, **ASSUMED), wo=band[1])
+    return case._replace(free=HELD, half=())
 
 
 def assumed() -> Case:
@@ -96,9 +98,9 @@ def flight() -> jq.simulation.Scenario:
     )
 
 
-def case_of(plant: jq.DecoupledAxes, ensemble: jq.Ensemble) -> Case:
+def case_of(plant: jq.DecoupledAxes, ensemble: jq.Ensemble, *, wo: float = 30.0) -> Case:
     """The tuning of both controllers, and their limits."""
-    ladrc, pid = starts(plant, SPAN, limit=LIMIT, dt=DT)
+    ladrc, pid = starts(plant, SPAN, limit=LIMIT, dt=DT, wo=wo)
     loop = jq.Loop(plant, ladrc, drive=jq.simulation.Saturation(LIMIT), dt=DT)
     others = paper_designs(SHEET_ROLL, dt=DT) | equivalent(loop)
     standard = jq.Objective().penalties

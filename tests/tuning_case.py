@@ -24,7 +24,7 @@ from jaxquad.models import DecoupledAxes
 from jaxquad.simulation import Pulse, Saturation, scenario, Sine, Step
 from jaxquad.tuning import Objective
 from jaxquad.tuning._cost import count_members, evaluate_cost, stack_copies, Subproblem
-from jaxquad.tuning._lbfgs import minimise as minimise  # for its test and its benchmark
+from jaxquad.tuning._descent import minimise as minimise  # for its test and its benchmark
 from jaxquad.tuning._problem import linear_loops, make_problem, select_coordinates, TimeSpan
 
 

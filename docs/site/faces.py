@@ -16,7 +16,8 @@ class Faces(griffe.Extension):
         """`from ._file import X as X` makes X public, as if `__all__` named it."""
         for room in pkg.modules.values():
             for face in (room, *room.modules.values()):
-                face.exports = [n for n, m in face.members.items() if m.is_alias and n[0] != "_"]
+                aliases = [n for n, m in face.members.items() if m.is_alias and n[0] != "_"]
+                face.exports = face.exports or aliases  # a room of one file has `__all__`
 
     def on_attribute_instance(self, *, attr: griffe.Attribute, agent: Any, **_: Any) -> None:
         """The comment behind a field or a constant becomes its docstring."""

@@ -97,13 +97,14 @@ def study(case: Case, size: Size, key: jax.Array) -> Study:
     assert isinstance(scheduled, jq.control.ScheduledLADRC)
     around_pid = loop.with_controller(case.pid)
     pid = tuned(around_pid, free=case.pid_free, fresh=None) if size.others else None
-    full = tuned(loop, free=case.free, fresh=None) if size.others else None
+    others = size.others and case.half  # without factors the design itself has full gains
+    full = tuned(loop, free=case.free, fresh=None) if others else None
     named = {PID_NAME: pid, FULL_NAME: full}
-    others = {n: found.controller for n, found in named.items() if found} | dict(case.peers)
+    peers = {n: found.controller for n, found in named.items() if found} | dict(case.peers)
     free = [*case.free, *case.half]
     start = loop.with_controller(halved(scheduled, case.half))
-    ladrc = tuned(start, free=free, fresh=size.fresh, peers=others)
-    return Study(ladrc, pid, full, others)
+    ladrc = tuned(start, free=free, fresh=size.fresh, peers=peers)
+    return Study(ladrc, pid, full, peers)
 
 
 def halved(start: jq.control.ScheduledLADRC, factors: Sequence[str]) -> jq.control.ScheduledLADRC:

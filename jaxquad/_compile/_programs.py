@@ -184,7 +184,7 @@ class _Program:
         run.__name__ = function.__name__
         self._function, self._options, self._run = function, options, run
         self._settings = structure, others
-        self.plain = jax.jit(run, compiler_options=options() or None)
+        self.plain: Any = jax.jit(run, compiler_options=options() or None)
         self._compiled: dict[tuple, _Call] = {}
         self._lock = threading.Lock()
 

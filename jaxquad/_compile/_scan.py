@@ -6,13 +6,12 @@ Long scans run in blocks and large ensembles in chunks, which keeps gradients an
 import math
 import sys
 from collections.abc import Callable
-from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, PyTree
+from jaxtyping import Array, Float, PyTree
 
 from ._door import compilers
 
@@ -22,24 +21,10 @@ from ._door import compilers
 KEPT = "kept_of_sample"
 _POLICY = jax.checkpoint_policies.save_only_these_names(KEPT)
 _SHORT = 128  # samples that need no blocks
+_LONG = 8  # samples of a queue, from which on no block is longer than it
 SINGLE, _SOME = 8, 64  # members up to which a loop is compiled as a single one, and briefly
 Step = Callable[..., tuple[PyTree, PyTree]]
-
-
-class Queue(NamedTuple):
-    """Inputs on their way to the plant, for as many samples as every member waits."""
-
-    rows: Float[Array, "rows inputs *ensemble"] | None  # in the order of their places; None for one
-    newest: Float[Array, " inputs *ensemble"]
-
-    def exchange(self, index: Int[Array, ""]) -> tuple["Queue", Array]:
-        """At sample `index` the newest input takes the oldest one's place. Also the oldest."""
-        if self.rows is None:
-            return self, self.newest
-        place = index % len(self.rows)
-        oldest = jax.lax.dynamic_index_in_dim(self.rows, place, 0, keepdims=False)
-        rows = jax.lax.dynamic_update_index_in_dim(self.rows, self.newest, place, 0)
-        return Queue(rows, self.newest), oldest
+Queue = Float[Array, "waiting inputs *ensemble"]  # on their way to the plant, the oldest first
 
 
 def scan_members(
@@ -56,7 +41,8 @@ def scan_members(
     - `parts`: what does not change with time.
     - `signals`: [samples, ...], of which `now` is one sample.
     - `members`: on the last axis of the carry; None for a single loop, or for more axes.
-    - `queue`: then `step(carry, parts, now, oldest)` returns (carry, (newest, stored)).
+    - `queue`: then `step(carry, parts, now, oldest)` returns (carry, (newest, stored)), and what is
+        newest in a sample is the oldest `len(queue)` samples later.
     """
     few = members is not None and are_few(members)
 
@@ -75,8 +61,7 @@ def scan_members(
     if members is not None and compilers().why_no_device_kernels() is None:
         advance, begun = lambda carry, now: step(carry, parts, now), carry
         if queue is not None:
-            rows = () if queue.rows is None else tuple(queue.rows)
-            advance, begun = with_rows, ((*rows, queue.newest), carry)  # the oldest first
+            advance, begun = with_rows, (tuple(queue), carry)
         result = compilers().scan_on_device(advance, begun, signals, members, scan_in_blocks)
         if result is not None:
             return result if queue is None else (result[0][1], result[1])
@@ -94,15 +79,17 @@ def scan_in_blocks(
     """`jax.lax.scan` whose reverse keeps the carry of blocks only, and of the one it is in.
 
     Twice the square root of the samples' number of carries instead of all, for one forward pass
-    more. With a `queue`, of which only blocks are kept, `step(carry, x, oldest)` returns
-    (carry, (newest, y)). The reverse of `few` members is kernels that two cores compile at once.
+    more. With a `queue`, `step(carry, x, oldest)` returns (carry, (newest, y)). The reverse of
+    `few` members is kernels that two cores compile at once.
     """
     count = len(jax.tree.leaves(xs)[0])
-    size = count
-    if count > _SHORT:  # near the square root of `count`, and a divisor if there is one
-        root = math.isqrt(count)
-        near = sorted(range(root // 2, 2 * root + 1), key=lambda size: abs(size - root))
-        size = next((size for size in near if count % size == 0), root)
+    waits = 0 if queue is None else len(queue)
+    size, most = count, count if waits < _LONG else min(count, waits)
+    if count > min(most, _SHORT):  # near the square root of `count`, and a divisor if there is one
+        root = min(math.isqrt(count), most)
+        near = range(root // 2, min(2 * root, most) + 1)
+        divisors = [size for size in near if count % size == 0]
+        size = min(divisors, key=lambda size: abs(size - root), default=root)
     length = -(-count // size) * size
 
     def until_count(carry: PyTree, xs: tuple[Array, PyTree], *oldest: Array) -> PyTree:
@@ -119,28 +106,36 @@ def scan_in_blocks(
     # Within a scan nothing can be merged with the forward pass, so no barriers are needed.
     sample = jax.checkpoint(sample, prevent_cse=False, policy=_POLICY)
 
-    def with_queue(both: tuple[Queue, PyTree], xs: tuple[Array, PyTree]) -> tuple[PyTree, PyTree]:
-        """Changes it outside of what reverse mode computes again: that would have to keep it."""
-        (queue, carry), (index, now) = both, xs
-        queue, oldest = queue.exchange(index)
-        carry, (newest, out) = sample(carry, now, oldest)
-        return (queue._replace(newest=newest), carry), out
+    def by_sample(both: tuple[Queue, PyTree], now: PyTree) -> tuple[PyTree, PyTree]:
+        """Moves a short queue by one place, outside of what reverse mode computes again."""
+        queue, carry = both
+        carry, (newest, out) = sample(carry, now, queue[0])
+        return (jnp.concatenate([queue[1:], newest[None]]), carry), out
 
-    if queue is not None:
-        carry, xs = (queue, carry), (jnp.arange(length), xs)
-
-    def jaxquad_block(carry: PyTree, xs: PyTree) -> tuple[PyTree, PyTree]:
-        return jax.lax.scan(sample if queue is None else with_queue, carry, xs)
+    def jaxquad_block(carry: PyTree, xs: PyTree, arriving: Queue | None) -> tuple[PyTree, PyTree]:
+        if arriving is not None:
+            return jax.lax.scan(lambda carry, now: sample(carry, *now), carry, (xs, arriving))
+        return jax.lax.scan(sample if queue is None else by_sample, carry, xs)
 
     # A function of this name becomes kernels of its own where it is computed again and reversed:
     # two cores compile these two at once, and the time of both grows faster than their operations.
     block = jax.checkpoint(jax.jit(jaxquad_block) if few else jaxquad_block, prevent_cse=False)
 
+    def by_block(both: tuple[Queue, PyTree], xs: PyTree) -> tuple[PyTree, PyTree]:
+        """What arrives in a block was sent before it: reverse mode sums no queue in its samples."""
+        queue, carry = both
+        parts = (size, waits - size) if waits > size else (size,)
+        arriving, *later = jax.lax.split(queue, parts)  # slices have sums as their reverse
+        carry, (sent, out) = block(carry, xs, arriving)
+        return (jnp.concatenate([*later, sent]), carry), out
+
+    run = lambda carry, xs: block(carry, xs, None) if waits < _LONG else by_block(carry, xs)
+    carry = carry if queue is None else (queue, carry)
     if length == size:
-        carry, out = block(carry, xs)
+        carry, out = run(carry, xs)
     else:
         in_rows = lambda x: x.reshape(length // size, size, *x.shape[1:])
-        carry, out = jax.lax.scan(block, carry, jax.tree.map(in_rows, xs))
+        carry, out = jax.lax.scan(run, carry, jax.tree.map(in_rows, xs))
         out = jax.tree.map(lambda x: x.reshape(length, *x.shape[2:])[:count], out)
     return (carry if queue is None else carry[1]), out
 

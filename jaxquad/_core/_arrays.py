@@ -42,6 +42,25 @@ def on_host(tree: Tree) -> Tree:
     return jax.tree.map(lambda x: np.asarray(x) if has_values(x) else x, tree)
 
 
+def concrete_values(tree: Tree, what: str) -> Tree:
+    """With the values of what `jax.grad` and its like trace, in the place of their tracers.
+
+    **Raises:** ValueError under `jax.jit` and `vmap`, whose tracers have none.
+    """
+    values = jax.tree.map(lambda x: x if is_concrete(x) else jax.lax.stop_gradient(x), tree)
+    if not all(map(is_concrete, jax.tree.leaves(values))):
+        raise ValueError(
+            f"{what} decides by the values of its data, which jax.jit and jax.vmap hide: call it "
+            "outside of them (jax.grad, jvp, jacfwd, jacrev and hessian take it as it is)"
+        )
+    return values
+
+
+def is_traced(tree: object) -> bool:
+    """Whether a transformation of JAX is looking at any of its numbers."""
+    return not all(map(is_concrete, jax.tree.leaves(tree)))
+
+
 def as_float_or_none(x: ArrayLike | Sequence | None) -> Array | None:
     return None if x is None else as_float(x)
 

@@ -1,13 +1,7 @@
 """Controllers (LADRC, PID, adaptive LADRC), observers and estimators of the inertia."""
 
-from ._estimator import NoProbe as NoProbe, ProbeTones as ProbeTones
 from ._ladrc import LADRC as LADRC, LADRCLaw as LADRCLaw
-from ._lock_in import LockInInertia as LockInInertia
-from ._observers import (
-    CurrentObserver as CurrentObserver,
-    EulerObserver as EulerObserver,
-    PredictiveObserver as PredictiveObserver,
-)
+from ._lock_in import LockInInertia as LockInInertia, NoProbe as NoProbe, ProbeTones as ProbeTones
 from ._pid import (
     BackCalculation as BackCalculation,
     Clamping as Clamping,
@@ -18,6 +12,8 @@ from ._pid import (
 from ._protocols import (
     AntiWindup as AntiWindup,
     as_setpoint as as_setpoint,
+    CurrentObserver as CurrentObserver,
+    EulerObserver as EulerObserver,
     find_transform as find_transform,
     InertiaEstimate as InertiaEstimate,
     InertiaEstimator as InertiaEstimator,
@@ -26,6 +22,7 @@ from ._protocols import (
     Member as Member,
     Observer as Observer,
     ObserverController as ObserverController,
+    PredictiveObserver as PredictiveObserver,
     ProbingEstimator as ProbingEstimator,
     Reference as Reference,
     schedule_for_analysis as schedule_for_analysis,

@@ -25,23 +25,21 @@ from jaxquad._core import (
 )
 from jaxquad.models import TransferFunction
 
-from ._observers import (
+from ._protocols import (
     barrier,
     continuous_gains,
     CurrentObserver,
     error_dynamics,
-    instability_in_words,
-    list_range,
-    slowness_in_words,
-)
-from ._protocols import (
     Gain,
+    instability_in_words,
     LinearController,
+    list_range,
     Member,
     Observer,
     Reference,
     Setpoint,
     Signal,
+    slowness_in_words,
     Transform,
 )
 

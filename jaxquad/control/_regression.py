@@ -11,7 +11,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxquad._core import as_float, require_all_positive, require_positive, signal_shape
 
-from ._estimator import (
+from ._lock_in import (
     AbstractInertia,
     empty_past,
     LastEstimate,

@@ -216,11 +216,9 @@ def crazypad_hover(
     """
     rate, group = _RATES[_AXES.index(axis)], "fixedFrequency.controller"
     return read(
-        locate(FILES[f"crazypad_hover {flight}"]),
-        inputs={"command": {f"{group}.cmd_{axis}": 1.0}},
-        outputs={rate: {f"{group}.r_{axis}": 1.0}},
-        units={rate: "rad/s"},
-    )
+        locate(FILES[f"crazypad_hover {flight}"]), inputs={"command": {f"{group}.cmd_{axis}": 1.0}},
+        outputs={rate: {f"{group}.r_{axis}": 1.0}}, units={rate: "rad/s"},
+    )  # fmt: skip
 
 
 def cessna_xplane() -> Record:
@@ -230,10 +228,7 @@ def cessna_xplane() -> Record:
     for it are in `fits/cessna_navfit.py`. Licence: MIT, by the README of its publisher.
     """
     return read(
-        locate(FILES["cessna_xplane"]),
-        inputs={"elevator": {"data[1]": 1.0}},
-        outputs={"q": {"data[4]": _RADIANS}},
-        units={"q": "rad/s"},
-        time="data[0]",
+        locate(FILES["cessna_xplane"]), inputs={"elevator": {"data[1]": 1.0}},
+        outputs={"q": {"data[4]": _RADIANS}}, units={"q": "rad/s"}, time="data[0]",
         sample_rate=40.0,
-    )
+    )  # fmt: skip

@@ -171,6 +171,7 @@ def simulate_linear(
     dt: Number,
     *,
     hold: str = "zero",
+    direct_samples: Float[ArrayLike, "outputs inputs"] | None = None,
 ) -> Float[Array, " samples"] | Float[Array, "samples outputs"]:
     """Simulate a linear model from rest, exactly at the samples.
 
@@ -184,6 +185,8 @@ def simulate_linear(
         was 0 before the first sample.
     - `dt`: the sample interval in s.
     - `hold`: between samples the input stays at the last one ("zero") or is straight ("first").
+    - `direct_samples`: after how many samples a held input passes directly, outputs per inputs; by
+        default what its delays make of it, which changes by whole samples.
 
     **Returns:** The outputs, (samples,) or (samples, outputs).
 
@@ -199,7 +202,9 @@ def simulate_linear(
         raise ValueError(f"u has the shape {u.shape}, but this model takes {shape}: reshape it.")
     u = u[:, None] if columns is None else u
     change = jnp.diff(u, axis=0, append=u[-1:]) if hold == "first" else jnp.zeros_like(u)
-    outputs = _simulate(_plant(model), jnp.stack([u.T, change.T], axis=2), dt)
+    segments = jnp.stack([u.T, change.T], axis=2)
+    direct = None if direct_samples is None else jnp.asarray(direct_samples)
+    outputs = _simulate(_plant(model), segments, dt, direct)
     return outputs[:, 0] if columns is None else outputs
 
 
@@ -303,7 +308,10 @@ def _plant(model: TransferFunction | StateSpace) -> _Plant:
 
 @ft.partial(Jit, options=brief_options)
 def _simulate(
-    plant: _Plant, segments: Float[Array, "inputs samples 2"], dt: Number
+    plant: _Plant,
+    segments: Float[Array, "inputs samples 2"],
+    dt: Number,
+    direct_samples: Float[Array, "outputs inputs"] | None,
 ) -> Float[Array, "samples outputs"]:
     shift, late = split_delay(plant.input_delay, dt)
     parts = [jax.vmap(_shift_samples)(segments, shift + n) for n in (1, 0)]
@@ -337,6 +345,10 @@ def _simulate(
         outputs = jax.vmap(late_output, out_axes=1)(plant.C, plant.output_delay)
     if plant.D is None:
         return outputs
+    if direct_samples is not None:
+        shifted = jax.vmap(_shift_samples, in_axes=(0, 0))
+        by_both = jax.vmap(shifted, in_axes=(None, 0))(segments, direct_samples.astype(int))
+        return outputs + jnp.einsum("oi,oik->ko", plant.D, by_both[..., 0], precision="highest")
     wait = plant.output_delay
     wait = jnp.zeros(len(plant.D), plant.D.dtype) if wait is None else wait
     one = lambda wait, late, segments: _delay_input(segments, wait + late, dt)

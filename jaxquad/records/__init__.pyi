@@ -6,7 +6,7 @@ from ._edit import (
     select as select,
     trim as trim,
 )
-from ._errors import (
+from ._log import (
     ReadError as ReadError,
     RecordError as RecordError,
     RecordWarning as RecordWarning,

@@ -8,12 +8,11 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from ._errors import RecordError, unknown_name
+from ._log import dates_in_seconds, FEWEST, RecordError, unknown_name
 
 
 Times = Float[np.ndarray, " samples"]  # s
 Values = Float[np.ndarray, " samples"]
-FEWEST = 16  # samples in a record
 JITTER = 0.02  # of a sample: largest departure from the uniform grid that still counts as uniform
 GAP = 1.5  # nominal samples: a longer step is a gap
 TimeUnit = Literal["s", "ms", "us", "ns"]
@@ -23,10 +22,6 @@ Valid = Mapping[str, Range]  # by channel
 PER_SECOND = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}
 _SLOW = 0.25  # s: as large a step may be one of milliseconds
 _DATES = 1e8  # s: stamps from here on are dates, in s since 1970
-_DATE_UNITS = {
-    "W": 604800.0, "D": 86400.0, "h": 3600.0, "m": 60.0, "s": 1.0,
-    "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "ps": 1e-12, "fs": 1e-15, "as": 1e-18,
-}  # fmt: skip
 
 
 def clock_start(time: Times) -> float:
@@ -56,17 +51,6 @@ def doubt_of_seconds(stamps: Times) -> str:
         f"steps by {step:.6g}, {doubt}. Give its unit («time_unit=»): ms, us or ns, or s if the "
         f"log really is that slow; for a count of rows give the sampling interval («dt=»)"
     )
-
-
-def dates_in_seconds(stamps: np.ndarray) -> np.ndarray | None:
-    """Dates (s since 1970) or durations (s) of NumPy; None where they have no fixed unit."""
-    if stamps.dtype.kind == "M" and np.datetime_data(stamps.dtype)[0] in ("Y", "M"):
-        stamps = stamps.astype("M8[D]")
-    unit, count = np.datetime_data(stamps.dtype)
-    if unit not in _DATE_UNITS:
-        return None
-    seconds = stamps.astype(np.int64) * (count * _DATE_UNITS[unit])
-    return np.where(np.isnat(stamps), np.nan, seconds)
 
 
 def check_increasing(label: str, time: Times) -> None:
@@ -259,7 +243,15 @@ def check_ranges(valid: Valid, channels: Iterable[str]) -> None:
 
 def as_float64(label: str, values: ArrayLike, *, copy: bool = True) -> np.ndarray:
     """In float64, NaN where masked; a `copy`, or a view. Raises RecordError for no numbers."""
-    array = np.ma.asanyarray(values)
+    try:
+        array = np.ma.asanyarray(values)
+    except TypeError as error:
+        if type(error).__name__ != "TracerArrayConversionError":
+            raise
+        raise RecordError(
+            f"{label} is traced by JAX, but records and frequency responses are made by NumPy and "
+            "have no derivatives: take them by the numbers of the response, which jq.fit has."
+        ) from error
     if array.dtype.names:
         raise RecordError(
             f"{label} is a structured array with the fields {', '.join(array.dtype.names)}: stack "

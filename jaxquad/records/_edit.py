@@ -12,7 +12,6 @@ from ._channel import (
     Channel,
     chosen_span,
     clock_start,
-    FEWEST,
     longest_gap,
     longest_step,
     nonuniformity,
@@ -23,7 +22,7 @@ from ._channel import (
     window,
     within,
 )
-from ._errors import choose_range, GapError, mend_holes, RecordError, warn
+from ._log import choose_range, FEWEST, GapError, mend_holes, MOST_SAMPLES, RecordError, warn
 from ._record import as_tuple, assemble, Record
 
 
@@ -36,17 +35,12 @@ _BETA = 0.1102 * (72 - 8.7)
 _HALF = 0.5 * (72 - 7.95) / (2.285 * 2 * np.pi * 0.2)  # samples of the target grid
 _CUTOFF = 0.4  # of the target rate, where the filter is down by 6 dB
 _SAME = 1.05  # rates closer than this need neither a filter nor a warning
-_MOST = 50_000_000  # samples
 
 
 def resample(
-    channels: Sequence[Channel],
-    sample_rate: Number,
-    *,
-    start: Number | None = None,
-    stop: Number | None = None,
-    max_gap: Number | None = None,
-) -> tuple[Times, Channels]:
+    channels: Sequence[Channel], sample_rate: Number, *, start: Number | None = None,
+    stop: Number | None = None, max_gap: Number | None = None,
+) -> tuple[Times, Channels]:  # fmt: skip
     """Resample channels with different time stamps to one uniform grid.
 
     Where a channel is faster than the grid, every channel passes the same linear-phase filter,
@@ -93,11 +87,11 @@ def resample(
     if not (np.isfinite(sample_rate) and sample_rate > 0):
         raise RecordError(f"the sample rate is {sample_rate} Hz: it must be positive.")
     steps = (end - begin) * sample_rate
-    if not FEWEST - 1 <= steps + 1e-6 < _MOST:
+    if not FEWEST - 1 <= steps + 1e-6 < MOST_SAMPLES:
         raise RecordError(
             f"a sample rate of {sample_rate:.6g} Hz over {end - begin:.6g} s makes "
-            f"{steps + 1:.6g} samples; {FEWEST} .. {_MOST} are allowed. Choose another rate or "
-            f"range."
+            f"{steps + 1:.6g} samples; {FEWEST} .. {MOST_SAMPLES} are allowed. Choose another "
+            f"rate or range."
         )
     time = begin + np.arange(int(steps + 1e-6) + 1) / sample_rate
     # The filter looks as far to either side, and a spline at its end needs some samples more.
@@ -232,14 +226,10 @@ def trim(record: Record, start: Number | None = None, stop: Number | None = None
     span = window(record.time, start, stop)
     time = record.time[span]
     return dataclasses.replace(
-        record,
-        time=time,
-        inputs=record.inputs[span],
-        outputs=record.outputs[span],
-        references=record.references[span],
-        time_unit="s",
+        record, time=time, inputs=record.inputs[span], outputs=record.outputs[span],
+        references=record.references[span], time_unit="s",
         repaired=within(record.repaired, time[0], time[-1]),
-    )
+    )  # fmt: skip
 
 
 def detrend(record: Record, *, order: Literal[0, 1] = 0) -> Record:
@@ -266,21 +256,15 @@ def detrend(record: Record, *, order: Literal[0, 1] = 0) -> Record:
         return level - order * slope * centred
 
     return dataclasses.replace(
-        record,
-        inputs=flatten(record.inputs),
-        outputs=flatten(record.outputs),
-        references=flatten(record.references),
-        time_unit="s",
-    )
+        record, inputs=flatten(record.inputs), outputs=flatten(record.outputs),
+        references=flatten(record.references), time_unit="s",
+    )  # fmt: skip
 
 
 def select(
-    record: Record,
-    *,
-    inputs: str | Sequence[str],
-    outputs: str | Sequence[str],
+    record: Record, *, inputs: str | Sequence[str], outputs: str | Sequence[str],
     references: str | Sequence[str] = (),
-) -> Record:
+) -> Record:  # fmt: skip
     """Assign new roles to channels, and drop the others.
 
     **Arguments:**
@@ -298,23 +282,15 @@ def select(
     roles = [as_tuple(names) for names in (inputs, outputs, references)]
     hold = record.hold if set(roles[0]) <= set(record.input_names) else None
     return assemble(
-        record.time,
-        roles,
-        record.channel,
-        record.unit,
-        source=record.source,
-        hold=hold,
+        record.time, roles, record.channel, record.unit, source=record.source, hold=hold,
         repaired=record.repaired,
-    )
+    )  # fmt: skip
 
 
 def mix(
-    record: Record,
-    name: str,
-    weights: Mapping[str, Number],
-    *,
+    record: Record, name: str, weights: Mapping[str, Number], *,
     role: Literal["input", "output", "reference"] = "input",
-) -> Record:
+) -> Record:  # fmt: skip
     """Add a channel that is a weighted sum of others, such as a roll command of four motors.
 
     **Arguments:**
@@ -347,14 +323,10 @@ def mix(
     roles[_ROLES.index(role)] += (name,)
     unknown_hold = role == "input" and not set(weights) <= set(record.input_names)
     return assemble(
-        record.time,
-        roles,
-        lambda channel: column if channel == name else record.channel(channel),
-        lambda channel: unit if channel == name else record.unit(channel),
-        source=record.source,
-        hold=None if unknown_hold else record.hold,
-        repaired=record.repaired,
-    )
+        record.time, roles, lambda channel: column if channel == name else record.channel(channel),
+        lambda channel: unit if channel == name else record.unit(channel), source=record.source,
+        hold=None if unknown_hold else record.hold, repaired=record.repaired,
+    )  # fmt: skip
 
 
 def combine(name: str, weights: Mapping[str, Number], values: Callable[[str], Times]) -> Times:

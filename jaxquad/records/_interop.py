@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ._channel import dates_in_seconds, doubt_of_seconds, PER_SECOND, Times, TimeUnit
-from ._errors import ReadError, RecordError, unknown_name
+from ._log import ReadError, RecordError, unknown_name
 from ._record import as_tuple, assemble, Names, Record
 from .formats import load_log
 

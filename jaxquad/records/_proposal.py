@@ -11,9 +11,8 @@ from jaxtyping import Float
 
 from jaxquad._core import marked_text
 
-from ._errors import printable, RecordError
 from ._firmwares import firmware_log, firmware_names
-from ._log import flattened, Log, SettingChange, Signals
+from ._log import flattened, Log, printable, RecordError, SettingChange, Signals
 from .firmware import (
     AXES,
     channel_rate,
@@ -165,14 +164,9 @@ def _flights_of(log: Log) -> tuple[Flight, ...]:
 
 
 def propose(
-    path: str | Path,
-    *,
-    axis: str | None = None,
-    chirp: int | None = None,
-    flight: int | None = None,
-    start: float | int | None = None,
-    stop: float | int | None = None,
-) -> Proposal:
+    path: str | Path, *, axis: str | None = None, chirp: int | None = None,
+    flight: int | None = None, start: float | int | None = None, stop: float | int | None = None,
+) -> Proposal:  # fmt: skip
     """Propose which channels of an autopilot's log are command, rate and external reference.
 
     Injected excitation is found, with its time and band: ArduPilot's SystemID mode, PX4's

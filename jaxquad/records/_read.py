@@ -26,8 +26,7 @@ from ._channel import (
     without_turns,
 )
 from ._edit import combine, resample
-from ._errors import GapError, located, ReadError, RecordError, unknown_name, warn
-from ._log import known_unit
+from ._log import GapError, known_unit, located, ReadError, RecordError, unknown_name, warn
 from ._record import as_tuple, assemble, check_distinct, Hold, Record
 from ._timebase import Timebases
 from .formats import load_signals
@@ -38,23 +37,12 @@ Selection = str | Sequence[str] | Mixes
 
 
 def read(
-    path: str | Path,
-    *,
-    inputs: Selection,
-    outputs: Selection,
-    references: Selection | None = None,
-    sample_rate: Number | None = None,
-    start: Number | None = None,
-    stop: Number | None = None,
-    time: str | None = None,
-    time_unit: TimeUnit | None = None,
-    dt: Number | None = None,
-    time_factor: Number | None = None,
-    max_gap: Number | None = None,
-    units: Mapping[str, str] | None = None,
-    hold: Hold = None,
-    valid: Valid | None = None,
-) -> Record:
+    path: str | Path, *, inputs: Selection, outputs: Selection, references: Selection | None = None,
+    sample_rate: Number | None = None, start: Number | None = None, stop: Number | None = None,
+    time: str | None = None, time_unit: TimeUnit | None = None, dt: Number | None = None,
+    time_factor: Number | None = None, max_gap: Number | None = None,
+    units: Mapping[str, str] | None = None, hold: Hold = None, valid: Valid | None = None,
+) -> Record:  # fmt: skip
     """Read a record from a log: ArduPilot, PX4, Betaflight, Crazyflie, or a table of arrays.
 
     The format is recognised by the first bytes of the file, else by its name: DataFlash .bin and
@@ -136,12 +124,9 @@ class _Logged:
     hold: Hold
 
     def record(
-        self,
-        roles: Sequence[Mixes],
-        units: Mapping[str, str],
-        sample_rate: Number | None,
+        self, roles: Sequence[Mixes], units: Mapping[str, str], sample_rate: Number | None,
         segment: "Segment",
-    ) -> Record:
+    ) -> Record:  # fmt: skip
         """Weighted sums of the channels in one segment, at one rate."""
         channels, hold = self.channels, self.hold
         stamps, span = channels[0].time, None
@@ -179,28 +164,17 @@ class _Logged:
             shared = {"" if converted else logged[source] for source in mix}
             agreed[name] = shared.pop() if len(shared) == 1 else ""
         return assemble(
-            stamps,
-            roles,
-            lambda name: combine(name, mixes[name], columns.__getitem__),
-            (agreed | dict(units)).__getitem__,
-            source=str(self.path),
-            hold=hold,
+            stamps, roles, lambda name: combine(name, mixes[name], columns.__getitem__),
+            (agreed | dict(units)).__getitem__, source=str(self.path), hold=hold,
             repaired=within(self.repaired, stamps[0], stamps[-1]),
-        )
+        )  # fmt: skip
 
 
 def _read_channels(
-    path: str | Path,
-    roles: Sequence[Mixes],
-    time: str | None,
-    time_unit: TimeUnit | None,
-    dt: Number | None,
-    time_factor: Number | None,
-    *,
-    max_gap: Number | None,
-    hold: Hold,
+    path: str | Path, roles: Sequence[Mixes], time: str | None, time_unit: TimeUnit | None,
+    dt: Number | None, time_factor: Number | None, *, max_gap: Number | None, hold: Hold,
     valid: Valid,
-) -> _Logged:
+) -> _Logged:  # fmt: skip
     names = list(dict.fromkeys(name for role in roles for mix in role.values() for name in mix))
     signals = load_signals(path)
     if not names:
@@ -281,22 +255,12 @@ _SHORTEST = 1.0  # s, of a part between two gaps
 
 
 def read_segments(
-    path: Path,
-    segments: Sequence[Segment],
-    *,
-    inputs: Mix,
-    outputs: Mix,
-    references: Mix | None = None,
-    sample_rate: Number | None = None,
-    time: str | None = None,
-    time_unit: TimeUnit | None = None,
-    dt: Number | None = None,
-    time_factor: Number | None = None,
-    units: Mapping[str, str] | None = None,
-    hold: Hold = None,
-    max_gap: Number | None = None,
+    path: Path, segments: Sequence[Segment], *, inputs: Mix, outputs: Mix,
+    references: Mix | None = None, sample_rate: Number | None = None, time: str | None = None,
+    time_unit: TimeUnit | None = None, dt: Number | None = None, time_factor: Number | None = None,
+    units: Mapping[str, str] | None = None, hold: Hold = None, max_gap: Number | None = None,
     valid: Valid | None = None,
-) -> list[Record]:
+) -> list[Record]:  # fmt: skip
     """Read several segments of a file as records with one sample rate.
 
     **Arguments:**
@@ -359,14 +323,10 @@ def read_segments(
             agreed[name] = shared.pop() if len(shared) == 1 else ""
         powers = lambda name: (weight * raw.channel(c) ** p for c, p, weight in terms[name])
         return assemble(
-            raw.time,
-            roles,
-            lambda name: sum(powers(name), np.zeros(raw.samples)),
-            (agreed | dict(units)).__getitem__,
-            source=raw.source,
-            hold=raw.hold,
+            raw.time, roles, lambda name: sum(powers(name), np.zeros(raw.samples)),
+            (agreed | dict(units)).__getitem__, source=raw.source, hold=raw.hold,
             repaired=raw.repaired,
-        )
+        )  # fmt: skip
 
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")

@@ -20,7 +20,7 @@ from ._channel import (
     uniform_stamps,
     Valid,
 )
-from ._errors import mend_holes, RecordError, unknown_name, warn
+from ._log import mend_holes, RecordError, unknown_name, warn
 
 
 if TYPE_CHECKING:
@@ -86,25 +86,13 @@ class Record:
     repaired: dict[str, Float[np.ndarray, " repaired"]]  # s; when values were interpolated
 
     def __init__(
-        self,
-        time: ArrayLike,
-        inputs: ArrayLike,
-        outputs: ArrayLike,
-        references: ArrayLike | None = None,
-        *,
-        input_names: Names = None,
-        output_names: Names = None,
-        reference_names: Names = None,
-        input_units: Names = None,
-        output_units: Names = None,
-        reference_units: Names = None,
-        source: str = "",
-        hold: Hold = None,
-        time_unit: TimeUnit | None = None,
-        valid: Valid | None = None,
-        max_gap: Number | None = None,
-        repaired: Mapping[str, ArrayLike] | None = None,
-    ):
+        self, time: ArrayLike, inputs: ArrayLike, outputs: ArrayLike,
+        references: ArrayLike | None = None, *, input_names: Names = None,
+        output_names: Names = None, reference_names: Names = None, input_units: Names = None,
+        output_units: Names = None, reference_units: Names = None, source: str = "",
+        hold: Hold = None, time_unit: TimeUnit | None = None, valid: Valid | None = None,
+        max_gap: Number | None = None, repaired: Mapping[str, ArrayLike] | None = None,
+    ):  # fmt: skip
         stamps = uniform_stamps(time, time_unit)
         start, rows, none = clock_start(stamps), stamps.size, np.empty((stamps.size, 0))
         roles = (
@@ -255,20 +243,11 @@ class Record:
 
     @classmethod
     def from_dataframe(
-        cls,
-        frame: "pandas.DataFrame",
-        *,
-        inputs: Names = None,
-        outputs: Names = None,
-        references: Names = None,
-        time: str | None = None,
-        time_unit: TimeUnit | None = None,
-        sample_rate: Number | None = None,
-        max_gap: Number | None = None,
-        units: Mapping[str, str] | None = None,
-        hold: Hold = None,
-        source: str = "",
-    ) -> "Record":
+        cls, frame: "pandas.DataFrame", *, inputs: Names = None, outputs: Names = None,
+        references: Names = None, time: str | None = None, time_unit: TimeUnit | None = None,
+        sample_rate: Number | None = None, max_gap: Number | None = None,
+        units: Mapping[str, str] | None = None, hold: Hold = None, source: str = "",
+    ) -> "Record":  # fmt: skip
         """A record of columns of a table of pandas (extra `interop`).
 
         **Arguments:**
@@ -319,14 +298,10 @@ class Record:
                 raise RecordError(f"a unit is given for {name!r}: {unknown_name(name, flat)}")
         units = {**stored.get("units", {}), **(units or {})}
         return assemble(
-            stamps,
-            names,
-            values.__getitem__,
-            lambda name: units.get(name, ""),
+            stamps, names, values.__getitem__, lambda name: units.get(name, ""),
             hold=stored.get("hold") if hold is None else hold,
-            source=source or stored.get("source", ""),
-            max_gap=max_gap,
-        )
+            source=source or stored.get("source", ""), max_gap=max_gap,
+        )  # fmt: skip
 
     def to_dataframe(self) -> "pandas.DataFrame":
         """A table of pandas (extra `interop`): a column per channel over the time in s.
@@ -415,16 +390,10 @@ class Record:
 
 
 def assemble(
-    time: Times,
-    roles: Sequence[Iterable[str]],
-    values: Callable[[str], Times],
-    unit: Callable[[str], str],
-    *,
-    source: str,
-    hold: Hold,
-    repaired: Mapping[str, ArrayLike] | None = None,
-    max_gap: Number | None = None,
-) -> Record:
+    time: Times, roles: Sequence[Iterable[str]], values: Callable[[str], Times],
+    unit: Callable[[str], str], *, source: str, hold: Hold,
+    repaired: Mapping[str, ArrayLike] | None = None, max_gap: Number | None = None,
+) -> Record:  # fmt: skip
     """A record of the named inputs, outputs and references, by what gives a channel's values."""
     names = [tuple(role) for role in roles]
     columns = [
@@ -433,20 +402,10 @@ def assemble(
     ]
     units = [[unit(name) for name in role] for role in names]
     return Record(
-        time,
-        *columns,
-        input_names=names[0],
-        output_names=names[1],
-        reference_names=names[2],
-        input_units=units[0],
-        output_units=units[1],
-        reference_units=units[2],
-        source=source,
-        hold=hold,
-        time_unit="s",
-        max_gap=max_gap,
-        repaired=repaired,
-    )
+        time, *columns, input_names=names[0], output_names=names[1], reference_names=names[2],
+        input_units=units[0], output_units=units[1], reference_units=units[2], source=source,
+        hold=hold, time_unit="s", max_gap=max_gap, repaired=repaired,
+    )  # fmt: skip
 
 
 def _all_channels(record: Record) -> list[Float[np.ndarray, " samples"]]:

@@ -13,7 +13,6 @@ from ._channel import (
     check_unit,
     clock_start,
     doubt_of_seconds,
-    FEWEST,
     Number,
     PER_SECOND,
     repair_time,
@@ -22,8 +21,17 @@ from ._channel import (
     TimeUnit,
     unwrap,
 )
-from ._errors import listed, located, ReadError, RecordError, unknown_name, warn
-from ._log import Signal, Signals
+from ._log import (
+    FEWEST,
+    listed,
+    located,
+    ReadError,
+    RecordError,
+    Signal,
+    Signals,
+    unknown_name,
+    warn,
+)
 from .formats import load_signals
 
 
@@ -61,12 +69,9 @@ class ChannelSummary(NamedTuple):
 
 
 def channels(
-    path: str | Path,
-    *,
-    time: str | None = None,
-    time_unit: TimeUnit | None = None,
+    path: str | Path, *, time: str | None = None, time_unit: TimeUnit | None = None,
     dt: Number | None = None,
-) -> list[ChannelSummary]:
+) -> list[ChannelSummary]:  # fmt: skip
     """List the channels that `read` can take from a file.
 
     **Arguments:**
@@ -110,13 +115,9 @@ class Timebases:
     """
 
     def __init__(
-        self,
-        signals: Signals,
-        time: str | None,
-        time_unit: TimeUnit | None,
-        dt: Number | None = None,
-        time_factor: Number | None = None,
-    ):
+        self, signals: Signals, time: str | None, time_unit: TimeUnit | None,
+        dt: Number | None = None, time_factor: Number | None = None,
+    ):  # fmt: skip
         check_unit(time_unit)
         if time_factor is not None and not 0.5 <= time_factor <= 2:
             raise RecordError(

@@ -11,15 +11,23 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from ._channel import FEWEST as FEWEST, native_rate, Number
-from ._errors import ReadError, RecordError
+from ._channel import native_rate, Number
 from ._firmwares import (
     axis_of_rate as axis_of_rate,
     firmware_log as firmware_log,
     firmware_names as firmware_names,
     register_log as register_log,
 )
-from ._log import flattened as flattened, Log as Log, Signal, Signals as Signals, Table as Table
+from ._log import (
+    FEWEST as FEWEST,
+    flattened as flattened,
+    Log as Log,
+    ReadError,
+    RecordError,
+    Signal,
+    Signals as Signals,
+    Table as Table,
+)
 from .formats import load_log, Reader as Reader
 
 

@@ -222,13 +222,15 @@ _DRAWN = 7  # designs that can be distinguished in a figure
 
 def verdict_headlines(tuned: "Tuned | Certificate") -> list[Headline]:
     """The three verdicts of a design; of gains that were given, those that were asked for."""
-    headlines = []
+    headlines, certified = [], getattr(tuned, "certificate", tuned) is not None
     for verdict in tuned.verdicts:
-        if verdict.holds is not None:
+        undecided = verdict.holds is None and bool(verdict.remedy) and certified
+        if verdict.holds is not None or undecided:
             level, fails = ("good", "") if verdict.holds else ("bad", " FAILS")
+            level, fails = ("warn", " NOT DECIDED") if undecided else (level, fails)
             text = ". ".join(filter(None, (verdict.text, verdict.remedy)))
             headlines.append(Headline(level, f"{verdict.name}{fails}", text))
-    if getattr(tuned, "certificate", tuned) is None:
+    if not certified:
         text = "no fresh members were drawn to certify on"
         headlines.insert(0, Headline("warn", "NOT CERTIFIED", text))
     return headlines

@@ -19,7 +19,6 @@ from ._hardware import (
     RotorDrive as RotorDrive,
     Saturation as Saturation,
 )
-from ._memory import in_slices as in_slices
 from ._metrics import (
     evaluate as evaluate,
     Metrics as Metrics,
@@ -30,6 +29,7 @@ from ._metrics import (
 from ._parallel import (
     Devices as Devices,
     devices_for as devices_for,
+    in_slices as in_slices,
     loop_over_devices as loop_over_devices,
     over_cores as over_cores,
     over_devices as over_devices,

@@ -177,7 +177,7 @@ class DelayLine(eqx.Module):
     """The inputs on their way to the plant, for a delay of any number of samples, whole or not.
 
     During a sample interval the plant first feels an `early` input, for the share of the interval
-    by which the delay exceeds whole samples, then a `late` one. All inputs first wait in a `Queue`
+    by which the delay exceeds whole samples, then a `late` one. All inputs first wait in a queue
     for the samples that every member waits at least; only the further ones differ by member.
     """
 
@@ -188,9 +188,7 @@ class DelayLine(eqx.Module):
 
     def queue(self, inputs: Float[Array, " inputs *ensemble"]) -> Queue | None:
         """Before the first sample the plant feels `inputs`."""
-        if self.fewest == 0:
-            return None
-        return Queue(_repeated(inputs, self.fewest - 1), inputs)
+        return _repeated(inputs, self.fewest)
 
     def init(self, inputs: Float[Array, " inputs *ensemble"]) -> Float[Array, "past ..."] | None:
         """The inputs that have left the queue."""

@@ -1,4 +1,4 @@
-"""An ensemble computed on several devices, of one host or of several, or by the cores of a CPU."""
+"""An ensemble computed on several devices or hosts, by the cores of a CPU, or slice by slice."""
 
 import math
 import re
@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Device
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
-from jaxtyping import Array, PyTree
+from jaxtyping import Array, ArrayLike, Int, PyTree
 
 from jaxquad._compile import are_few, Jit, SINGLE
 from jaxquad._core import (
@@ -67,6 +67,51 @@ def over_devices(
     if len(places) < 2:
         return function(members, shared)
     return _split(function, members, shared, count, places)
+
+
+def in_slices(
+    function: Callable[[Int[Array, " at_once"]], PyTree], members: int, *, at_once: int
+) -> PyTree:
+    """`function(indices)` of a few members at a time, its results joined on the last axis.
+
+    For ensembles that do not fit the memory together: what is drawn in the function, such as the
+    noise of each member, exists for one slice only. Every call is given equally many indices, so
+    that it compiles once; where they run out, the last is repeated, and what that gives is dropped.
+
+        fly = lambda few: jq.evaluate(few.loop(ladrc), few.flight(scenario))
+        found = jq.simulation.in_slices(lambda k: fly(members.take(k)), members.size, at_once=4096)
+
+    A loop in Python whose results wait in the host's memory. It saves none under `jax.grad`: for
+    the gradient of a mean, sum those of its slices.
+
+    **Arguments:**
+
+    - `function`: of indices; all its results have the members last, as `Metrics` have.
+    - `members`: how many there are.
+    - `at_once`: how many indices a call gets.
+
+    **Raises:** ValueError for counts below 1 and for results of other shapes.
+    """
+    if members < 1 or at_once < 1:
+        raise ValueError(f"{members} members, {at_once} at once: give 1 or more of both")
+    at_once = min(members, at_once)
+
+    def part_of(x: ArrayLike, left: int) -> np.ndarray:
+        values = np.asarray(x)
+        if values.shape[-1:] != (at_once,):
+            raise ValueError(
+                f"a result has the shape {values.shape}, but the {at_once} members of a slice "
+                "belong on its last axis: return what each member gives, and nothing that they "
+                "share"
+            )
+        return values[..., :left]
+
+    parts = []
+    for first in range(0, members, at_once):
+        indices = np.minimum(np.arange(first, first + at_once), members - 1)
+        part = function(jnp.asarray(indices))
+        parts.append(jax.tree.map(lambda x, left=members - first: part_of(x, left), part))
+    return jax.tree.map(lambda *xs: jnp.asarray(np.concatenate(xs, axis=-1)), *parts)
 
 
 def placed(loop: Loop, scenario: Scenario, devices: DeviceChoice) -> tuple[Run, Devices | None]:

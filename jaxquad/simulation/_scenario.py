@@ -1,8 +1,11 @@
 """What happens to a loop: scenarios from signals of single axes, and experiments."""
 
+import contextlib
 import functools as ft
 import math
 from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -15,7 +18,6 @@ from jaxquad._core import as_float, ensemble_shape, per_member, require_all_posi
 from jaxquad.excitation import Excitation
 from jaxquad.records import AXES
 
-from ._memory import require_memory
 from ._signal import as_signal, Clock, fit, gauss_markov_of, Motion, Signal
 
 
@@ -259,3 +261,43 @@ def _excited(signal, key, levels, dt, axis) -> Scenario:
     still = jnp.zeros((signal.shape[0], len(AXES), *signal.shape[1:]), signal.dtype)
     injection, disturbance, noise = (still.at[:, axis].set(x) for x in (signal, torque, jitter))
     return Scenario(still, injection, disturbance, noise, dt=dt)
+
+
+# What an ensemble needs, held against what there is, before an allocation fails.
+
+_GB = 1e9
+_SIZED = (jax.Array, np.ndarray, jax.ShapeDtypeStruct)
+
+
+def require_memory(what: str, needed: float | int, remedy: str) -> None:
+    """Raises ValueError where `needed` bytes are more than the default device has left.
+
+    Where a machine does not tell what that is, nothing is refused.
+    """
+    chosen = getattr(jax.config, "jax_default_device", None)
+    free = free_memory(chosen if isinstance(chosen, jax.Device) else jax.local_devices()[0])
+    if free is not None and needed > free:
+        raise ValueError(
+            f"{what} needs about {needed / _GB:.3g} GB, but {free / _GB:.3g} GB are free: {remedy}"
+        )
+
+
+def size_of(tree: PyTree) -> int:
+    """The bytes of its arrays."""
+    return sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(tree) if isinstance(x, _SIZED))
+
+
+def free_memory(device: Any) -> float | None:
+    """Of a `jax.Device` in bytes; of the host for a CPU, and of what a container may use of it."""
+    if device.platform != "cpu":
+        stats = device.memory_stats() or {}
+        limit = stats.get("bytes_limit")
+        return None if limit is None else limit - stats.get("bytes_in_use", 0)
+    free: list[float] = []
+    with contextlib.suppress(OSError, StopIteration, ValueError):
+        lines = Path("/proc/meminfo").read_text().splitlines()
+        free.append(next(1024.0 * int(x.split()[1]) for x in lines if x.startswith("MemAvailable")))
+    # Of all that the container may use ("max" without a limit) the page cache can be freed.
+    with contextlib.suppress(OSError, ValueError):
+        free.append(float(Path("/sys/fs/cgroup/memory.max").read_text()))
+    return min(free, default=None)

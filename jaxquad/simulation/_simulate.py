@@ -16,9 +16,8 @@ from jaxquad.loops import CarriesPayload, Loop, Plant
 from jaxquad.records import AXES, Record
 
 from ._hardware import Authority, find_authority, warn_beyond_authority
-from ._memory import require_memory, size_of
 from ._parallel import DeviceChoice, Devices, loop_over_devices, over_cores, placed
-from ._scenario import Scenario
+from ._scenario import require_memory, Scenario, size_of
 from ._step import are_sound, Carry, guarded, LoopStep, make_step, require_runnable, SampleResult
 
 
@@ -295,7 +294,7 @@ def _run_members(
         _, accumulator = eqx.combine(parts, static)
         total, output = accumulator.update(carry[1], result)
         if oldest:
-            output = inner.queue.newest, output
+            output = inner.queue[0], output
         return (inner._replace(queue=None), total), output
 
     parts = arrays, jax.lax.stop_gradient(start)

@@ -131,7 +131,7 @@ class Carry(NamedTuple):
     memory: PyTree  # of the controller
     past: Float[Array, "past inputs *ensemble"] | None  # inputs that have left the queue
     running: Bool[Array, "*ensemble"]
-    queue: Queue | None = None  # inputs that no member feels yet
+    queue: Queue | None = None  # inputs that no member feels yet; after a sample the newest alone
 
 
 class LoopStep(eqx.Module):
@@ -174,7 +174,7 @@ class LoopStep(eqx.Module):
         felt, signals = inputs if oldest is None else oldest, signals_of(self.controller, memory)
         following = self._move(carry, memory, felt, happens, fine)
         if oldest is not None:
-            following = following._replace(queue=Queue(None, inputs))
+            following = following._replace(queue=inputs[None])
         result = SampleResult(
             index=index,
             time=index.astype(angle.dtype) * self.dt,

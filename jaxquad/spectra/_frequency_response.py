@@ -10,7 +10,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Complex, Float
 
-from jaxquad._core import pytree_node, require_float64, require_x64
+from jaxquad._core import (
+    concrete_values,
+    is_traced,
+    pytree_node,
+    require_float64,
+    require_x64,
+)
 from jaxquad.records import Record
 
 from ._error_covariance import ErrorCovariance, independent_errors
@@ -113,7 +119,7 @@ class FrequencyResponse:
     that know the frequencies they are about.
     """
 
-    omega: Float[Array, " frequencies"]  # rad/s
+    omega: Float[Array | np.ndarray, " frequencies"]  # rad/s
     response: Complex[Array, "frequencies outputs inputs"]  # output unit per input unit
     coherence: Float[Array, "frequencies outputs inputs"]  # of the joint estimate: the smaller one
     random_error: Float[Array, "frequencies outputs inputs"]  # 1 sigma: relative, and in rad
@@ -127,7 +133,7 @@ class FrequencyResponse:
     resolution: float = eqx.field(static=True, default=0.0)  # one cycle in a window, rad/s
     distortion: Distortion | None = None  # of a periodic excitation
     log_noise_covariance: Square | None = None
-    divided: Pairs | None = None  # 0 to 1; 0 without
+    divided: Pairs | Array | None = None  # 0 to 1; 0 without
     dt: float = eqx.field(static=True, default=0.0)  # s; 0 where nothing was sampled
     hold: float | None = eqx.field(static=True, default=None)  # s
     fed_back: bool = eqx.field(static=True, default=False)  # the records had references: a loop
@@ -171,12 +177,15 @@ class FrequencyResponse:
         Source: Bendat and Piersol, "Random Data", 4th ed., Table 9.6.
         """
 
-        def like(name: str, numbers: ArrayLike) -> np.ndarray:
+        xp = jnp if is_traced((response, coherence, random_error)) else np
+        seen = lambda x: np.asarray(concrete_values(x, "FrequencyResponse.from_table"))
+
+        def like(name: str, numbers: ArrayLike) -> Array | np.ndarray:
             """A number, one for each frequency, or one for each pair, as all of the response."""
-            array = np.asarray(numbers, float)
+            array = xp.asarray(numbers, float)
             array = array[:, None, None] if array.ndim == 1 else array
             try:
-                return np.broadcast_to(array, values.shape).copy()
+                return xp.broadcast_to(array, values.shape).copy()
             except ValueError:
                 raise ValueError(
                     f"{name} has the shape {np.shape(numbers)} and the response {values.shape}: "
@@ -196,7 +205,7 @@ class FrequencyResponse:
             omega, response = np.asarray(omega.omega), np.moveaxis(np.asarray(omega.frdata), -1, 0)
         elif response is None:
             raise ValueError("a table needs its response: give omega and as many complex numbers")
-        grid, values = np.asarray(omega, float), np.asarray(response, complex)
+        grid, values = np.asarray(omega, float), xp.asarray(response, complex)
         values = values[:, None, None] if values.ndim == 1 else values
         if grid.ndim != 1 or values.ndim != 3 or len(values) != grid.size:
             raise ValueError(
@@ -205,8 +214,9 @@ class FrequencyResponse:
             )
         if not (np.all(np.isfinite(grid)) and np.all(grid > 0) and np.all(np.diff(grid) > 0)):
             raise ValueError("omega must be finite, above 0 and rising: sort the table, in rad/s")
-        if not np.all(np.isfinite(values)):
-            first = grid[int(np.argmin(np.isfinite(values).all(axis=(1, 2))))]
+        finite = np.isfinite(seen(values)).all(axis=(1, 2))
+        if not np.all(finite):
+            first = grid[int(np.argmin(finite))]
             raise ValueError(f"the response is not finite at {first:.4g} rad/s: leave that row out")
         if (coherence is None) == (random_error is None):
             raise ValueError(
@@ -219,21 +229,22 @@ class FrequencyResponse:
             )
         if coherence is not None:
             coherent = like("coherence", coherence)
-            if not np.all((coherent > 0) & (coherent <= 1)):
-                ends = f"{coherent.min():.4g} to {coherent.max():.4g}"
+            low, high = seen(coherent).min(), seen(coherent).max()
+            if not 0 < low <= high <= 1:
+                ends = f"{low:.4g} to {high:.4g}"
                 raise ValueError(f"the coherence runs from {ends}: give numbers above 0, up to 1")
-            error = np.sqrt((1 - coherent) / (2 * averages * coherent))
+            error = xp.sqrt((1 - coherent) / (2 * averages * coherent))
         else:
             assert random_error is not None
             error = like("random_error", random_error)
-            if not np.all(error > 0):
+            low = seen(error).min()
+            if not low > 0:
                 raise ValueError(
-                    f"the random error is {error.min():.4g} at its least: give it above 0, 0.02 "
-                    "for 2 %"
+                    f"the random error is {low:.4g} at its least: give it above 0, 0.02 for 2 %"
                 )
             coherent = 1 / (1 + 2 * averages * error**2)
-        error = np.maximum(error, _LEAST)
-        variance = 2 * (error * np.abs(values)) ** 2
+        error = xp.maximum(error, _LEAST)
+        variance = 2 * (seen(error) * np.abs(seen(values))) ** 2
         _, outputs, inputs = values.shape
         return cls(
             omega=jnp.asarray(grid),
@@ -295,7 +306,7 @@ class FrequencyResponse:
         return covariance / np.outer(response, response.conj())
 
     @property
-    def error_exponent(self) -> Pairs:
+    def error_exponent(self) -> Pairs | Array:
         """The power p of |measurement / model| in the random error relative to a model.
 
         Noise of a numerator is relative to the measured one: error |measurement| / |model|, p = 1.
@@ -407,12 +418,15 @@ def frequency_response(
             estimate = estimate_local_polynomial(records, grid, estimator, method)
 
     def find_remarks() -> tuple[Remark, ...]:
+        from ._clock import remarks_on_clock
         from ._feedback import remarks_on_feedback
         from ._linearity import remarks_on_linearity
 
         remarks = remarks_on_feedback(records, method, estimate)
         if estimate.distortion is None:  # periods show their own
             remarks += remarks_on_linearity(records, method, estimate)
+        if method == "joint":
+            remarks += remarks_on_clock(records, estimate)
         return remarks + estimate.remarks()
 
     # Not jnp.asarray: it compiles a program for each new shape. Each array once, in one go.

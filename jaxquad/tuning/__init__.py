@@ -9,7 +9,8 @@ from ._certify import (
     peers as peers,
     worst_flights as worst_flights,
 )
-from ._cost import Evaluation as Evaluation, GaussNewton as GaussNewton
+from ._cost import Evaluation as Evaluation, Tail as Tail
+from ._descent import GaussNewton as GaussNewton, LBFGS as LBFGS
 from ._design_result import (
     DesignResult as DesignResult,
     DesignSummary as DesignSummary,
@@ -17,7 +18,6 @@ from ._design_result import (
     share_interval as share_interval,
     upper_bound as upper_bound,
 )
-from ._lbfgs import LBFGS as LBFGS
 from ._objective import (
     CVaR as CVaR,
     Limit as Limit,
@@ -31,6 +31,5 @@ from ._objective import (
 )
 from ._pareto import front_point as front_point, Pareto as Pareto, pareto as pareto
 from ._problem import Bound as Bound
-from ._tail import Tail as Tail
 from ._tune import LimitResult as LimitResult, Optimum as Optimum, tune as tune, Tuned as Tuned
-from ._verdict import Distance as Distance, Verdict as Verdict
+from ._verdict import Attainable as Attainable, Distance as Distance, Verdict as Verdict

@@ -19,7 +19,15 @@ from ._design_result import (
     upper_bound,
 )
 from ._objective import QUANTITIES
-from ._verdict import Distance, joined, judge_performance, judge_stability, NOT_TUNED, Verdict
+from ._verdict import (
+    Attainable,
+    Distance,
+    joined,
+    judge_performance,
+    judge_stability,
+    NOT_TUNED,
+    Verdict,
+)
 
 
 class Provenance(TypedDict):
@@ -154,9 +162,12 @@ class Certificate(eqx.Module):
 
     - `stability`: no member is linearly unstable (by the exact poles), none diverged in flight, no
         observer is unstable by itself (it would run away in saturation), and every limit is met.
-    - `performance`: every member stays in the range of the model, makes less than half the error
-        of doing nothing (the command 0), and has its command at the limit for less than a quarter
-        of the time.
+    - `performance`: every member stays in the range of the model, and makes less than half the
+        error of doing nothing (the command 0) and less than twice that of its linear loop; the
+        drive holds the disturbance, the encoder tells the manoeuvre, the command is at its limit
+        for less than a quarter of the time and not ten times as busy as at the start, and wc and wo
+        lie within the identified band. It is not decided on fewer than 64 members, or without
+        spread.
     - `convergence`: the tuning ended at a stationary point; not asked of gains that were given.
 
     It `holds` if none of them fails, and `str()` begins with them. None of n members drawn at
@@ -183,6 +194,8 @@ class Certificate(eqx.Module):
     error: str = eqx.field(static=True, default="itae")  # by which performance is measured
     convergence: Verdict = NOT_TUNED
     further: LinearMembers | None = None  # of whom the linear loop alone was analysed
+    attainable: Attainable | None = None  # what the same plants allow
+    unsupported: tuple[tuple[str, str], ...] = ()  # bandwidths beyond the band; what to do
 
     @property
     def name(self) -> str:
@@ -215,8 +228,7 @@ class Certificate(eqx.Module):
     @property
     def performance(self) -> Verdict:
         """Whether the design is of use, against doing nothing and beside its start."""
-        compared = self.design, self.idle, self.start
-        return judge_performance(*compared, self.error, self.independent)
+        return judge_performance(self)
 
     @property
     def verdicts(self) -> tuple[Verdict, Verdict, Verdict]:
@@ -225,8 +237,8 @@ class Certificate(eqx.Module):
 
     @property
     def holds(self) -> bool:
-        """Whether none of the three verdicts fails: only then the design may be flown."""
-        return all(verdict.holds is not False for verdict in self.verdicts)
+        """Whether no verdict fails and performance is decided: only then it may be flown."""
+        return self.performance.holds is True and False not in [x.holds for x in self.verdicts]
 
     @property
     def independent(self) -> bool:
@@ -259,6 +271,7 @@ class Certificate(eqx.Module):
             "limits": [distance.content() for distance in self.distances],
             "designs": {name: row.content() for name, row in self.summaries.items()},
             "baselines": {name: summarise(x).content() for name, x in baselines.items()},
+            "attainable": None if self.attainable is None else self.attainable._asdict(),
             "error": self.error,
             "remarks": self.remarks,
             "members": self.facts | {"nominal_inertia": self.nominal},
@@ -275,6 +288,8 @@ class Certificate(eqx.Module):
         failed = [v.name for v in self.verdicts if v.holds is False]
         if failed:
             return f"CERTIFICATE FAILS on {on}, not to be flown: {joined(failed)}"
+        if self.performance.holds is None:
+            return f"CERTIFICATE OPEN on {on}, not to be flown: PERFORMANCE is not decided"
         holding = [v.name for v in self.verdicts if v.holds is not None]
         return f"CERTIFICATE HOLDS on {on}: {joined(holding)}"
 

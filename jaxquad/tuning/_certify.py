@@ -23,6 +23,7 @@ from jaxquad.ensembles import Ensemble, Members, Posterior
 from jaxquad.loops import Loop
 from jaxquad.models import DecoupledAxes, Multirotor, QUANSER_HOVER
 from jaxquad.simulation import (
+    Authority,
     beyond_authority,
     find_authority,
     Scenario,
@@ -33,8 +34,8 @@ from jaxquad.simulation import (
 from ._certificate import Certificate, find_ladrc, lag_remark, Provenance
 from ._design_result import analyse_further, evaluate_design, member_facts
 from ._objective import Limit, QUANTITIES
-from ._problem import decouple, DeviceChoice, Plant, require_same_rate, TimeSpan
-from ._verdict import measure_distances
+from ._problem import decouple, DeviceChoice, Plant, require_ensemble, require_same_rate, TimeSpan
+from ._verdict import evaluate_attainable, measure_distances
 
 
 if TYPE_CHECKING:
@@ -113,11 +114,7 @@ def certify(
     - `ValueError`: parts do not fit together, or a limit is on what is not computed.
     """
     key = jax.random.key(0) if key is None else key
-    if not isinstance(ensemble, Ensemble | Members):
-        raise ValueError(
-            f"ensemble is a {type(ensemble).__name__}: give jq.Ensemble(inertia=...), or "
-            "jq.ensembles.Members of it"
-        )
+    require_ensemble(ensemble)
     span, peers = TimeSpan(tuple(events), start, stop, load_start), peers or {}
     if name in peers:
         raise ValueError(f"a peer has the name {name!r} of the design itself: rename it")
@@ -148,6 +145,9 @@ def certify(
         "versions": {name: version(name) for name in ("jaxquad", "jax", "jaxlib", "numpy")},
         "controller": describe_controller(loop.controller),
     }
+    alike = drawn.loop(loop.controller)
+    authority = _find_authority(alike.plant, alike.drive, alike.controller)
+    plants = ensemble.plants if isinstance(ensemble, Ensemble) else None
     certificate = Certificate(
         designs={name: design} | others,
         distances=measure_distances(design, limits, independent=not given_members, further=further),
@@ -161,9 +161,10 @@ def certify(
         start=error_at_start,
         error="itae" if np.any(np.asarray(flight.reference) != 0) else "rms",
         further=further,
+        attainable=evaluate_attainable(loop.controller, drawn, flight, span, authority, devices),
+        unsupported=tuple(_beyond_band(loop.controller, None if plants is None else plants.band)),
     )
-    plants = ensemble.plants if isinstance(ensemble, Ensemble) else None
-    remarks = _remarks(certificate, loop.controller, drawn, flight, plants)
+    remarks = _remarks(certificate, loop.controller, drawn, flight, authority, plants)
     return dataclasses.replace(certificate, remarks=tuple(remarks))
 
 
@@ -173,7 +174,7 @@ _ROUNDED = 1.01  # by which a number may exceed what the record knows without a 
 
 def _remarks(
     certificate: Certificate, controller: PyTree, drawn: Members, flight: Scenario,
-    plants: Posterior | None,
+    authority: Authority | None, plants: Posterior | None,
 ) -> Iterator[str]:  # fmt: skip
     missed = [x for x in certificate.distances if QUANTITIES[x.quantity].linear and not x.met]
     lag = lag_remark(controller, drawn.delay, decouple(drawn.plant).lag)
@@ -188,22 +189,10 @@ def _remarks(
     for name, design in certificate.designs.items():
         if name != certificate.name and design.observer_instability:
             yield f"of {name}: {design.observer_instability}"
-    loop = drawn.loop(controller)
-    authority = _find_authority(loop.plant, loop.drive, loop.controller)
     yield from beyond_authority(authority, flight)
     if plants is None:
         return
-    ladrc, band, largest = find_ladrc(controller), plants.band, plants.largest_command
-    for name in ("wc", "wo"):
-        value = 0.0 if ladrc is None else float(np.max(np.asarray(vars(ladrc)[name])))
-        if band is not None and value > _ROUNDED * band[1]:
-            hertz = f"{band[0] / (2 * np.pi):.3g} to {band[1] / (2 * np.pi):.3g} Hz"
-            yield (
-                f"{name} = {value:.4g} rad/s lies beyond the identified band of {band[0]:.3g} to "
-                f"{band[1]:.3g} rad/s ({hertz}): the design relies on a model that no data support "
-                f"there. Hold {name} at {band[1]:.2g} rad/s or below, or record to higher "
-                "frequencies"
-            )
+    largest = plants.largest_command
     limit = np.inf if authority is None else float(np.max(np.asarray(authority.command)))
     if largest is not None and np.isfinite(limit) and limit > _ROUNDED * largest:
         yield (
@@ -211,6 +200,23 @@ def _remarks(
             f"command of the record, {largest:.3g}: the model is not known there. Lower the limit "
             f"to {largest:.2g}, or record larger commands"
         )
+
+
+def _beyond_band(controller: PyTree, band: tuple[float, float] | None) -> Iterator[tuple[str, str]]:
+    """The bandwidths of a LADRC that no data support, and what to do."""
+    ladrc = find_ladrc(controller)
+    if ladrc is None or band is None:
+        return
+    low, high = band
+    for name in ("wc", "wo"):
+        value = float(np.max(np.asarray(vars(ladrc)[name])))
+        if value > _ROUNDED * high:
+            yield (
+                f"{name} = {value:.4g} rad/s lies beyond the identified band of {low:.3g} to "
+                f"{high:.3g} rad/s ({low / (2 * np.pi):.3g} to {high / (2 * np.pi):.3g} Hz): no "
+                "data support the model there",
+                f"Hold {name} at {high:.2g} rad/s or below, or record to higher frequencies",
+            )
 
 
 def describe_controller(controller: PyTree) -> dict[str, object]:
@@ -285,9 +291,7 @@ def peers(plant: Plant, *, pid: PyTree | None = None, dt: float = 0.002) -> dict
     return designs if pid is None else designs | {"tuned PID": pid}
 
 
-def _nominal_numbers(
-    plant: Plant,
-) -> tuple[Float[np.ndarray, " axes"], Float[np.ndarray, " axes"]]:
+def _nominal_numbers(plant: Plant) -> tuple[Float[np.ndarray, " axes"], ...]:
     """KT in N m per unit of command and J in kg m^2, in NumPy: nothing is compiled."""
     if not isinstance(plant, DecoupledAxes | Multirotor):
         raise ValueError(
@@ -300,8 +304,7 @@ def _nominal_numbers(
             f"the plant is an ensemble of {axes.shape[1:]}: give the nominal one, for whose "
             "gain the designs are made"
         )
-    KT, J = np.broadcast_arrays(np.asarray(axes.torque_gain, float), np.asarray(axes.inertia))
-    return KT, J
+    return np.broadcast_arrays(np.asarray(axes.torque_gain, float), np.asarray(axes.inertia))
 
 
 def worst_flights(

@@ -1,5 +1,6 @@
-"""What a descent lowers: the cost of many designs at once with its gradient, or its residuals."""
+"""What a descent lowers, for many designs at once, and the search for members beyond limits."""
 
+import dataclasses
 import functools as ft
 import sys
 import time
@@ -10,27 +11,17 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, PyTree
+from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
 from jaxquad._compile import brief_options, Jit
-from jaxquad._core import as_array
+from jaxquad._core import as_array, mark_members, on_host
 from jaxquad.control import ObserverController
-from jaxquad.simulation import SampleResult, scan_loop
+from jaxquad.ensembles import Members
 
-from ._objective import (
-    is_gated,
-    Limit,
-    Mean,
-    Objective,
-    Penalty,
-    QUANTITIES,
-    risk_text,
-    soft,
-    split_quantities,
-    stability_gate,
-    Worst,
-)
-from ._problem import Coordinates, Problem
+from ._design_result import DesignResult, Numbers
+from ._objective import Limit, Objective, QUANTITIES, soft, split_quantities, Worst
+from ._problem import Coordinates, LinearLoops, Problem
+from ._verdict import Distance
 
 
 _BARRIER = 0.01  # weight of the barrier before observers that are slower than the feedback
@@ -77,12 +68,9 @@ class CostResult(NamedTuple):
 
 @ft.partial(Jit, options=brief_options)
 def evaluate_cost(
-    z: Float[Array, "problems n"],
-    on: Bool[Array, " problems"],
-    coordinates: Coordinates,
-    problem: Problem,
-    subproblem: Subproblem,
-) -> CostResult:
+    z: Float[Array, "problems n"], on: Bool[Array, " problems"], coordinates: Coordinates,
+    problem: Problem, subproblem: Subproblem,
+) -> CostResult:  # fmt: skip
     """Value and gradient for each problem that is `on`; zeros for the others.
 
     A problem by itself is evaluated in any case.
@@ -227,135 +215,143 @@ def describe_evaluation(count: int, now: Evaluation) -> str:
     return "  ".join([*parts, f"{now.seconds:.1f} s"])
 
 
-_LEAST = 1e-12
+SEARCHES = 5  # at most, until one finds none
+SLICE = 2048  # linear loops that are evaluated at once
+GUARDS = 16  # members that fly for limits alone
+LOOPS, FLIGHTS = 8192, 2048  # of a search, unless it has enough members to go on with before
+ADDED = 64  # linear loops at most, after a search
+_ENOUGH = 16  # members beyond a limit
+_NEAR = 0.1  # nepers within a limit: so near, they are tuned on with those beyond it
+_LOST = 5.0  # nepers beyond a limit: the peak of a loop that is unstable, or as good as that
 
 
-class GaussNewton(eqx.Module):
-    """Least squares on the tracking errors of all members, by Levenberg-Marquardt.
+class Tail(NamedTuple):
+    """What was searched, and what came of it."""
 
-    Residuals are sqrt(t) times the errors, so tracking counts as ITSE, the integral of t error^2;
-    ITAE itself is no sum of squares. Each member's errors are in units of their size at the start,
-    which stands for the logarithm, and penalties enter by their square roots.
+    searches: int = 0
+    searched: int = 0  # linear loops, in all searches
+    flown: int = 0  # flights, in all searches
+    beyond: int = 0  # members of the last search beyond a limit
+    added: int = 0  # to those that limits are kept on
+    certificates: int = 0  # each on other members; all but the last found members to tune on
 
-    **Arguments:**
 
-    - `steps`: the most steps.
-    - `tolerance`: relative, of cost and parameters.
-    - `stride`: samples that share a residual.
+class Beyond(NamedTuple):
+    """Members that are beyond a limit; the worst of them, to tune on."""
 
-    **Raises:**
+    loops: Members | None  # whose linear loops are
+    flown: Members | None  # whose flights are
+    count: int  # how many there are in all
+    searched: int = 0  # linear loops
+    flights: int = 0
 
-    - `ValueError`: `steps` or `stride` is below 1. A tune raises it for terms other than ITAE, for
-        risks other than the mean and for limits, none of which are sums of squares.
+    @property
+    def added(self) -> int:
+        """How many there are to tune on."""
+        return sum(some.size for some in (self.loops, self.flown) if some is not None)
+
+    def __str__(self) -> str:
+        flights = f" and {self.flights} flights" * bool(self.flights)
+        return f"tail: {self.count} of {self.searched} linear loops{flights} are beyond limits"
+
+
+def search(
+    draw: Callable[[int], Members], number: int, most: int,
+    levels: Callable[[Members], Sequence[Float[ArrayLike, " members"]]], added: int,
+) -> tuple[Members | None, int, int]:  # fmt: skip
+    """The worst members, how many are beyond limits, and how many were searched.
+
+    Searched are `most` slices that `draw` makes, unless there are enough members to go on before.
     """
-
-    steps: int = 30
-    tolerance: float = 1e-4
-    stride: int = 10
-
-    def __check_init__(self):
-        if self.steps < 1 or self.stride < 1:
-            raise ValueError(f"steps is {self.steps} and stride {self.stride}: give 1 or more")
-
-
-class _Squares(eqx.Module):
-    coordinates: Coordinates
-    problem: Problem
-    penalties: Sequence[Penalty]
-    scale: Float[Array, "axes members"]  # of the squared errors' sums
-    stride: int = eqx.field(static=True)
+    slices: list[Members] = []
+    ranked: list[tuple[float, tuple[int, int]]] = []
+    count = 0
+    while len(slices) < most and count < _ENOUGH:
+        s = len(slices)
+        slices.append(draw(number * most + s))
+        level = np.max([np.asarray(x) for x in levels(slices[s])], axis=0)
+        ranked += [(float(level[k]), (s, int(k))) for k in np.flatnonzero(level > -_NEAR)]
+        count += int(np.sum(level > 0))
+    worst = [place for _, place in sorted(ranked, reverse=True)[:added]]
+    return take_members(slices, worst), count, sum(x.size for x in slices)
 
 
-def require_squares(objective: Objective, limits: Sequence[Limit]) -> None:
-    """Raise ValueError for what is no sum of squares."""
-    odd = [name for name in objective.terms if name != "itae"]
-    odd += [f"limit on {limit.quantity}" for limit in limits]
-    if not isinstance(objective.risk, Mean):
-        odd.append(f"risk {risk_text(objective.risk)}")
-    if odd:
-        raise ValueError(
-            f"GaussNewton cannot minimise {', '.join(odd)}: no sum of squares. Take LBFGS(), "
-            "or the term itae with penalties and the mean risk"
-        )
+@ft.partial(Jit, options=brief_options)
+def loop_levels(
+    z: Float[Array, " n"], coordinates: Coordinates, loops: LinearLoops, limits: tuple[Limit, ...]
+) -> Float[Array, " members"]:
+    """How far linear loops are beyond limits that every member has to keep, the greatest of all.
+
+    An unstable loop has no number that a limit could pull at: it is left to the certificate.
+    """
+    kept = [limit for limit in limits if is_kept_by(limit, flights=False)]
+    names = {limit.quantity for limit in kept}
+    numbers = loops.numbers(coordinates.controller_at(z), names, SMOOTHING)
+    values = {name: QUANTITIES[name].combine_axes(numbers[name], worst=True) for name in names}
+    level = jnp.max(jnp.stack([limit.beyond(values[limit.quantity]) for limit in kept]), axis=0)
+    return jnp.where(level < _LOST, level, -jnp.inf)
 
 
-def minimise_squares(
-    coordinates: Coordinates,
-    problem: Problem,
-    objective: Objective,
-    start: Float[np.ndarray, " n"],
-    method: GaussNewton,
-) -> tuple[Float[np.ndarray, " n"], int, bool]:
-    """Where the descent ended, its steps, and whether it converged."""
-    import lineax as lx
-    import optimistix as optx
-
-    units = jnp.ones((problem.linear.assumed_inertia.shape[0], problem.members))
-    squares = _Squares(coordinates, problem, objective.penalties, units, method.stride)
-    size = jnp.sum(_errors(jnp.asarray(start), squares) ** 2, axis=0)
-    squares = eqx.tree_at(
-        lambda s: s.scale, squares, jnp.sum(size, axis=0, keepdims=True) + 0 * size
-    )
-    solver = optx.LevenbergMarquardt(
-        rtol=method.tolerance, atol=method.tolerance, linear_solver=lx.Normal(lx.Cholesky())
-    )
-    with jax.numpy_dtype_promotion("standard"):
-        solution = optx.least_squares(
-            _linearised, solver, jnp.asarray(start), squares, max_steps=method.steps, throw=False
-        )
-    done = bool(solution.result == optx.RESULTS.successful)
-    return np.asarray(solution.value), int(solution.stats["num_steps"]), done
+def flight_levels(
+    numbers: dict[str, Float[np.ndarray, "axes members"]], limits: Sequence[Limit]
+) -> Float[np.ndarray, " members"]:
+    """As `loop_levels`, of the numbers of flights."""
+    levels = []
+    for limit in limits:
+        if is_kept_by(limit, flights=True):
+            sign = QUANTITIES[limit.quantity].sign
+            worst = sign * np.max(sign * numbers[limit.quantity], axis=0)
+            levels.append(_level(limit.quantity, worst, limit.bound))
+    return np.max(levels, axis=0)
 
 
-def _residuals(z: Float[Array, " n"], squares: _Squares) -> tuple[Array, Array]:
-    members = squares.problem.members
-    tracking = _errors(z, squares) / jnp.sqrt(squares.scale + _LEAST)[None]
-    controller = squares.coordinates.controller_at(z)
-    flights, linear = split_quantities({p.quantity for p in squares.penalties} | {"abscissa"})
-    numbers = squares.problem.linear.numbers(controller, linear, SMOOTHING)
-    if flights:
-        numbers |= squares.problem.in_time(controller, flights)
-    gate = stability_gate(numbers["abscissa"])
-    costs = [
-        p(
-            QUANTITIES[p.quantity].combine_axes(numbers[p.quantity]),
-            gate if is_gated(p.quantity) else gate + 1,
-        )
-        for p in squares.penalties
-    ]
-    bounds = jnp.sqrt(jnp.stack(costs) + _LEAST) if costs else jnp.zeros((0, members))
-    # ITSE goes as the square of ITAE: half of it, for the same change of the cost.
-    return tracking / np.sqrt(2 * members), bounds / np.sqrt(members)
+def _level(quantity: str, values: Numbers, bound: Float[ArrayLike, ""]) -> Numbers:
+    """How far values are beyond a bound; minus infinity for those that are no number."""
+    shown = QUANTITIES[quantity]
+    level = np.asarray(shown.sign * (shown.level(values) - shown.level(on_host(bound))))
+    return np.where(np.isfinite(level), level, -np.inf)
 
 
-_linearised = eqx.filter_custom_jvp(_residuals)
+def is_kept_by(limit: Limit, *, flights: bool) -> bool:
+    """Whether every member has to keep this limit, and in flight or by its linear loop."""
+    return QUANTITIES[limit.quantity].linear != flights and isinstance(limit.over, Worst)
 
 
-@_linearised.def_jvp
-def _with_columns(primals: PyTree, tangents: PyTree) -> PyTree:
-    # A column for each parameter, one flight after the other: linearised, the loop would store all.
-    (z, _), run = primals, lambda z: _residuals(z, primals[1])
-    column = lambda unit: jax.jvp(run, (z,), (unit,))[1]
-    columns = jax.lax.map(column, jnp.eye(z.size, dtype=z.dtype))
-    return run(z), jax.tree.map(lambda c: jnp.tensordot(tangents[0], c, 1), columns)
+def rank_beyond(design: DesignResult, missed: Sequence[Distance]) -> list[int]:
+    """The members that are beyond limits, the worst first; without those that have no number."""
+    if not missed:
+        return []
+    values = [design.of(x.quantity, worst_axis=True) for x in missed]
+    pairs = zip(missed, values, strict=True)
+    level = np.max([_level(x.quantity, value, x.bound) for x, value in pairs], axis=0)
+    return [int(k) for k in np.argsort(-level, kind="stable") if level[k] > 0]
 
 
-class _Errors(eqx.Module):
-    """Stores the error of every sample, rad."""
+def rank_places(
+    result: CostResult, kept: Sequence[bool], on: np.ndarray, first: int = 0
+) -> Int[np.ndarray, " members"]:
+    """Members from the `first` on, those before that are furthest within the limits `kept`."""
+    beyond = [x for x, mine in zip(result.beyond, kept, strict=True) if mine]
+    levels = np.max([np.asarray(x)[on, first:] for x in beyond], axis=(0, 1))
+    return np.argsort(np.where(np.isfinite(levels), levels, -np.inf), kind="stable")
 
-    def begin(self, like: Array) -> None:
+
+def take_members(slices: Sequence[Members], places: Sequence[tuple[int, int]]) -> Members | None:
+    """The members at these places, (slice, place in it); None without any. Compiles nothing."""
+    if not places:
         return None
+    of, index = np.array(places).T
+    longest = max(slices[s].longest_delay for s in of)
+    alike = [dataclasses.replace(x, longest_delay=longest) for x in slices]
+    first = np.cumsum([0, *(x.size for x in slices)])[of]
 
-    def update(self, total: None, now: SampleResult) -> tuple[None, Array]:
-        return total, now.reference - now.angle
+    def pick(per_member: bool, *parts: Array) -> PyTree:
+        if not per_member:
+            return parts[0]
+        keys = jnp.issubdtype(parts[0].dtype, jax.dtypes.prng_key)
+        arrays = [np.asarray(jax.random.key_data(x)).T if keys else np.asarray(x) for x in parts]
+        together = np.concatenate(arrays, axis=-1)[..., first + index]
+        return jax.random.wrap_key_data(as_array(together.T)) if keys else as_array(together)
 
-
-def _errors(z: Float[Array, " n"], squares: _Squares) -> Float[Array, "points axes members"]:
-    """sqrt(t) error every few samples, t from the last event."""
-    problem, stride = squares.problem, squares.stride
-    loop = problem.loop_around(squares.coordinates.controller_at(z))
-    stored = scan_loop(loop, problem.flight, _Errors())[1]
-    index = np.arange(int(problem.window.first), int(problem.window.last) + 1, stride)
-    since = np.min([np.where(index >= a, index - a, np.inf) for a, _ in problem.parts], axis=0)
-    weight = np.sqrt(since * loop.dt * loop.dt * stride)
-    return stored[index] * weight[:, None, None]
+    marks = mark_members(alike[0], (alike[0].size,))
+    return jax.tree.map(pick, marks, *alike)

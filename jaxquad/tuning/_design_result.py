@@ -59,6 +59,8 @@ class DesignResult(eqx.Module):
     diverged: Bool[np.ndarray, " members"]
     lost: Bool[np.ndarray, " members"]  # diverged, or carried off beyond the model's range
     observer_instability: str = ""  # why an observer of the controller is unstable by itself
+    # ITAE from event to event, rad s^2
+    by_part: Float[np.ndarray, "parts axes members"] | None = None
 
     @property
     def members(self) -> int:
@@ -194,13 +196,10 @@ def summarise_design(design: DesignResult, *, independent: bool) -> DesignSummar
     count = design.unstable_count
     bound = None if count is None else upper_bound(count, design.members)
     return DesignSummary(
-        members=design.members,
-        unstable=count,
-        unstable_at_most=bound if independent else None,
-        diverged=int(np.sum(design.diverged)),
-        lost=int(np.sum(design.lost)),
+        members=design.members, unstable=count, unstable_at_most=bound if independent else None,
+        diverged=int(np.sum(design.diverged)), lost=int(np.sum(design.lost)),
         statistics={name: _statistics(design, name) for name in design.by_axis},
-    )
+    )  # fmt: skip
 
 
 def _statistics(design: DesignResult, name: str) -> Statistics:
@@ -222,7 +221,7 @@ def evaluate_design(
     controller: PyTree, members: Members, flight: Scenario, span: TimeSpan, devices: DeviceChoice
 ) -> DesignResult:
     """`controller` on all `members`, in a `flight` that has their noise in it."""
-    flown = fly(flying_loop(controller, members), flight, span, devices)
+    flown = fly_members(controller, members, flight, span, devices)
     numbers = flown.numbers
     linear = _linear(controller, members, flight)
     if linear is not None:
@@ -234,27 +233,29 @@ def evaluate_design(
     reference = np.asarray(flight.reference)
     moved = max(float(np.max(reference)), 0.0) - min(float(np.min(reference)), 0.0)
     lost = flown.diverged | ~(flown.greatest <= _TILTED + moved)
-    return DesignResult(numbers, unstable, flown.diverged, lost, why)
+    return DesignResult(numbers, unstable, flown.diverged, lost, why, flown.by_part)
 
 
-def flying_loop(controller: PyTree, members: Members) -> Loop:
-    """The loops of all members around a controller, its gains as wide as all of its kind have."""
+def fly_members(
+    controller: PyTree, members: Members, flight: Scenario, span: TimeSpan, devices: DeviceChoice
+) -> "Flown":
+    """All members around a controller, its gains as wide as all of its kind have."""
     loop = members.loop(controller)
-    return loop.with_controller(_widen(loop.controller, members.axes, members.size))
+    loop = loop.with_controller(_widen(loop.controller, members.axes, members.size))
+    flown = _fly(loop, flight, span, devices)
+    if flown.diverged.ndim:
+        return flown
+    wide = lambda x: np.broadcast_to(x[..., None], (*x.shape, members.size))
+    return jax.tree.map(wide, flown)  # of members that do not differ, one flew
 
 
 _MULTIPLE, _MOST = 8, 2048  # of members that fly, and at most
 
 
 def analyse_further(
-    loop: Loop,
-    ensemble: Ensemble,
-    scenario: Scenario,
-    key: Key[Array, ""],
-    *,
-    flown: int,
+    loop: Loop, ensemble: Ensemble, scenario: Scenario, key: Key[Array, ""], *, flown: int,
     count: int | None,
-) -> LinearMembers | None:
+) -> LinearMembers | None:  # fmt: skip
     """Of at least `count` further members, in slices of as many as have `flown`."""
 
     def analyse(drawn: Members) -> tuple[LoopNumbers | None, dict[str, np.ndarray]]:
@@ -362,9 +363,11 @@ class Flown(NamedTuple):
     numbers: dict[str, Float[np.ndarray, "axes members"]]
     diverged: Bool[np.ndarray, " members"]
     greatest: Float[np.ndarray, " members"]  # rad, the error at any time and of any axis
+    by_part: Float[np.ndarray, "parts axes members"]  # ITAE from event to event, rad s^2
+    peaks: Float[np.ndarray, "parts axes members"]  # rad, the greatest error from event to event
 
 
-def fly(loop: Loop, flight: Scenario, span: TimeSpan, devices: DeviceChoice = None) -> Flown:
+def _fly(loop: Loop, flight: Scenario, span: TimeSpan, devices: DeviceChoice) -> Flown:
     """From event to event the integrals' clock starts again, and the greatest overshoot counts."""
     check_run(loop, flight)
     samples, dt = len(flight.reference), loop.dt
@@ -381,7 +384,9 @@ def fly(loop: Loop, flight: Scenario, span: TimeSpan, devices: DeviceChoice = No
     numbers |= {name: stack(name).sum(axis=0) for name in _INTEGRALS}
     numbers["overshoot"] = np.where(some.any(axis=0), greatest, np.nan)
     numbers["activity_rate"] = numbers["activity"] / ((span_of_all[1] + 1 - span_of_all[0]) * dt)
-    return Flown(numbers, np.asarray(diverged), np.max(stack("peak"), axis=(0, 1)))
+    peaks = stack("peak")
+    greatest = np.max(peaks, axis=(0, 1))
+    return Flown(numbers, np.asarray(diverged), greatest, stack("itae"), peaks)
 
 
 _Finished = tuple[dict[str, Array], list[dict[str, Array]], Bool[Array, "*ensemble"]]

@@ -369,10 +369,6 @@ def _weights(terms: Mapping[str, float]) -> dict[str, Array]:
     return {name: as_float(weight) for name, weight in terms.items()}
 
 
-def _penalties() -> tuple[Penalty, ...]:
-    return tuple(Penalty(name, knee=knee, weight=weight) for name, knee, weight in _STANDARD)
-
-
 class Objective(eqx.Module):
     """What a tune minimises: the `risk` over the members of each one's terms and penalties.
 
@@ -401,7 +397,9 @@ class Objective(eqx.Module):
     """
 
     terms: dict[str, Array] = eqx.field(converter=_weights, default_factory=lambda: {"itae": 1.0})
-    penalties: Sequence[Penalty] = eqx.field(default_factory=_penalties)
+    penalties: Sequence[Penalty] = eqx.field(
+        default_factory=lambda: tuple(Penalty(n, knee=k, weight=w) for n, k, w in _STANDARD)
+    )
     risk: Risk = Mean()
     events: tuple[float, ...] = eqx.field(static=True, default=(), kw_only=True)  # s
     start: float = eqx.field(static=True, default=0.0, kw_only=True)  # s

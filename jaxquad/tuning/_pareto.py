@@ -17,8 +17,8 @@ from jaxquad.simulation import Scenario
 
 from ._certificate import Certificate
 from ._certify import certify
+from ._descent import LBFGS
 from ._design_result import DesignResult, summarise_design
-from ._lbfgs import LBFGS
 from ._objective import Limit, Objective, Penalty, QUANTITIES
 from ._problem import build_design, DeviceChoice
 from ._tuner import Tuner
@@ -92,14 +92,10 @@ class Pareto(eqx.Module):
             f"{'unstable, %':>13}",
         ]
         points = (self.levels, self.certificates, self.front, self.converged)
-        rows = [
-            (
-                f"{k + 1}{'' if on else ', dominated'}{'' if done else ', not done'}",
-                f"{level:.3g}",
-                certificate.design,
-            )
-            for k, (level, certificate, on, done) in enumerate(zip(*points, strict=True))
-        ]
+        rows = []
+        for k, (level, certificate, on, done) in enumerate(zip(*points, strict=True), 1):
+            marks = f"{'' if on else ', dominated'}{'' if done else ', not done'}"
+            rows.append((f"{k}{marks}", f"{level:.3g}", certificate.design))
         rows += [(name, "", design) for name, design in self.peers.items()]
         for name, level, design in rows:
             row = summarise_design(design, independent=first.independent)

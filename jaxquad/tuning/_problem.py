@@ -19,7 +19,7 @@ from jaxquad.control import (
     Transform,
     Tunable,
 )
-from jaxquad.ensembles import Members
+from jaxquad.ensembles import Ensemble, Members
 from jaxquad.identify import Free, name_places, Parameters, Place, select_parameters, with_values
 from jaxquad.loops import linear_numbers, Loop
 from jaxquad.models import DecoupledAxes, Multirotor
@@ -314,14 +314,9 @@ class Problem(eqx.Module):
 
 
 def make_problem(
-    controller: PyTree,
-    members: Members,
-    scenario: Scenario,
-    *,
-    span: TimeSpan = _FULL_FLIGHT,
-    devices: DeviceChoice = None,
-    counted: int | None = None,
-) -> Problem:
+    controller: PyTree, members: Members, scenario: Scenario, *, span: TimeSpan = _FULL_FLIGHT,
+    devices: DeviceChoice = None, counted: int | None = None,
+) -> Problem:  # fmt: skip
     """Of `members`, of whom the first are `counted` in the objective (all, by default)."""
     flight, loop = members.flight(scenario), members.loop(controller)
     check_run(loop, flight)
@@ -335,14 +330,10 @@ def make_problem(
     windows = [window(samples, dt, start=a, stop=b, load_start=None) for a, b in span.parts]
     parts = [(int(x[0]), int(x[1])) for x in windows] if len(windows) > 1 else [(first, until)]
     return Problem(
-        loop=loop,
-        linear=linear_loops(members, devices),
-        limited=None,
-        flight=flight,
-        window=Window(first, last, loaded, parts[-1][1]),
-        parts=tuple(parts),
+        loop=loop, linear=linear_loops(members, devices), limited=None, flight=flight,
+        window=Window(first, last, loaded, parts[-1][1]), parts=tuple(parts),
         counted=members.size if counted is None else counted,
-    )
+    )  # fmt: skip
 
 
 def linear_loops(members: Members, devices: DeviceChoice) -> LinearLoops:
@@ -363,6 +354,15 @@ def decouple(plant: object) -> DecoupledAxes:
             "derivatives and jq.analyse take any plant"
         )
     return axes
+
+
+def require_ensemble(ensemble: object) -> None:
+    """Raise ValueError for what is neither an ensemble nor members of one."""
+    if not isinstance(ensemble, Ensemble | Members):
+        raise ValueError(
+            f"ensemble is a {type(ensemble).__name__}: give jq.Ensemble(inertia=...), or "
+            "jq.ensembles.Members of it"
+        )
 
 
 def require_same_rate(loop: Loop, members: Members) -> None:

@@ -17,11 +17,20 @@ from jaxquad.simulation import Scenario
 
 from ._certificate import Certificate, lag_remark
 from ._certify import certify
-from ._cost import Evaluation, Listener, stack_copies
+from ._cost import (
+    ADDED,
+    Beyond,
+    Evaluation,
+    GUARDS,
+    Listener,
+    rank_beyond,
+    stack_copies,
+    Tail,
+    take_members,
+)
 from ._design_result import certified_members
 from ._objective import Limit, Objective, QUANTITIES
 from ._problem import Bound, build_design, DeviceChoice
-from ._tail import ADDED, Beyond, GUARDS, rank_beyond, Tail, take_members
 from ._tuner import Method, Tuner
 from ._verdict import covers, Verdict, with_further
 
@@ -337,9 +346,7 @@ def certified_beyond(certificate: Certificate, drawn: Sequence[Members]) -> Beyo
 _ACTIVE = 1e-3  # the multiplier's sum above which a limit costs something
 
 
-@eqx.filter_jit  # as one program
-def _excess(limit: Limit, values: Float[Array, " members"]) -> Float[Array, ""]:
-    return limit.excess(values)
+_excess = eqx.filter_jit(Limit.excess)  # as one program
 
 
 def _tuned(
@@ -357,23 +364,14 @@ def _tuned(
     if certificate is not None:
         certificate = dataclasses.replace(certificate, convergence=convergence)
     return Tuned(
-        controller=controller,
-        certificate=certificate,
-        bounds=bounds,
-        convergence=convergence,
-        stabilised=bool(tuner.stabilised[best]),
-        converged=bool(tuner.converged[best]),
-        cost=float(tuner.cost[best]),
-        values=tuner.coordinates.values(tuner.z[best]),
-        limits=tuple(limits),
-        minima=distinct_optima(tuner),
-        evaluations=int(tuner.evaluations[best]),
-        stabilising=int(tuner.stabilising[best]),
-        tail=tuner.tail._replace(certificates=certificates),
-        history=tuple(tuner.progress.history),
-        seconds=seconds,
-        remarks=tuple(_remarks(tuner, controller, best, limits)),
-    )
+        controller=controller, certificate=certificate, bounds=bounds, convergence=convergence,
+        stabilised=bool(tuner.stabilised[best]), converged=bool(tuner.converged[best]),
+        cost=float(tuner.cost[best]), values=tuner.coordinates.values(tuner.z[best]),
+        limits=tuple(limits), minima=distinct_optima(tuner),
+        evaluations=int(tuner.evaluations[best]), stabilising=int(tuner.stabilising[best]),
+        tail=tuner.tail._replace(certificates=certificates), history=tuple(tuner.progress.history),
+        seconds=seconds, remarks=tuple(_remarks(tuner, controller, best, limits)),
+    )  # fmt: skip
 
 
 def _remarks(

@@ -14,20 +14,40 @@ from jaxquad.loops import Loop
 from jaxquad.simulation import find_steps, Scenario
 
 from ._cost import (
+    ADDED,
+    Beyond,
     CostResult,
     count_members,
     evaluate_cost,
-    GaussNewton,
+    flight_levels,
+    FLIGHTS,
+    GUARDS,
+    is_kept_by,
     Listener,
-    minimise_squares,
+    loop_levels,
+    LOOPS,
     Progress,
-    require_squares,
+    rank_places,
+    search,
+    SEARCHES,
+    SLICE,
     stack_copies,
     Subproblem,
+    Tail,
+    take_members,
     take_problem,
 )
-from ._design_result import fly, flying_loop
-from ._lbfgs import Descent, Evaluate, LBFGS, minimise, Pairs
+from ._descent import (
+    Descent,
+    Evaluate,
+    GaussNewton,
+    LBFGS,
+    minimise,
+    minimise_squares,
+    Pairs,
+    require_squares,
+)
+from ._design_result import fly_members
 from ._objective import Limit, Objective, QUANTITIES, Worst
 from ._problem import (
     Bound,
@@ -38,25 +58,10 @@ from ._problem import (
     linear_loops,
     make_problem,
     Problem,
+    require_ensemble,
     require_same_rate,
     select_coordinates,
     TimeSpan,
-)
-from ._tail import (
-    ADDED,
-    Beyond,
-    flight_levels,
-    FLIGHTS,
-    GUARDS,
-    is_kept_by,
-    loop_levels,
-    LOOPS,
-    rank_places,
-    search,
-    SEARCHES,
-    SLICE,
-    Tail,
-    take_members,
 )
 from ._verdict import Verdict
 
@@ -397,7 +402,7 @@ class Tuner:
 
             def levels_of_flights(drawn: Members) -> list[np.ndarray]:
                 flight = drawn.flight(self.scenario)
-                run = lambda x: fly(flying_loop(x, drawn), flight, self.span, self.devices)
+                run = lambda x: fly_members(x, drawn, flight, self.span, self.devices)
                 return [flight_levels(run(x).numbers, self.limits) for x in designs]
 
             draw, most = lambda k: self._fresh(_FLOWN + k, self.size), max(1, FLIGHTS // self.size)
@@ -470,34 +475,21 @@ def tighten(limit: Limit, reserve: float) -> Limit:
 
 
 def require_kinds(
-    loop: object,
-    ensemble: object,
-    scenario: object,
-    objective: object,
-    limits: object,
+    loop: object, ensemble: object, scenario: object, objective: object, limits: object,
     method: object,
-) -> None:
+) -> None:  # fmt: skip
     """Raise ValueError for an argument of another kind, and for limits on no sum of squares."""
-    if not isinstance(loop, Loop):
-        raise ValueError(
-            f"loop is a {type(loop).__name__}: give jq.Loop(plant, controller, ...), whose "
-            "controller is the start"
-        )
-    if not isinstance(ensemble, Ensemble | Members):
-        raise ValueError(
-            f"ensemble is a {type(ensemble).__name__}: give jq.Ensemble(inertia=...), or "
-            "jq.ensembles.Members of it"
-        )
-    if not isinstance(scenario, Scenario):
-        raise ValueError(
-            f"scenario is a {type(scenario).__name__}: give jq.scenario(duration=..., ...)"
-        )
-    if not isinstance(objective, Objective):
-        name = type(objective).__name__
-        raise ValueError(f"objective is a {name}: give jq.Objective(terms={{'itae': 1.0}}, ...)")
+    require_ensemble(ensemble)
+    for name, value, kind, remedy in (
+        ("loop", loop, Loop, "jq.Loop(plant, controller, ...), whose controller is the start"),
+        ("scenario", scenario, Scenario, "jq.scenario(duration=..., ...)"),
+        ("objective", objective, Objective, "jq.Objective(terms={'itae': 1.0}, ...)"),
+    ):
+        if not isinstance(value, kind):
+            raise ValueError(f"{name} is a {type(value).__name__}: give {remedy}")
     if not isinstance(limits, Sequence) or not all(isinstance(x, Limit) for x in limits):
         raise ValueError(f"limits are {limits}: give a list, as [jq.Limit('overshoot', at_most=5)]")
     if not isinstance(method, LBFGS | GaussNewton):
         raise ValueError(f"method is {method!r}: give jq.tuning.LBFGS() or jq.tuning.GaussNewton()")
-    if isinstance(method, GaussNewton):
+    if isinstance(method, GaussNewton) and isinstance(objective, Objective):
         require_squares(objective, limits)

@@ -456,6 +456,7 @@ _WORDS = {  # of a message, by what stands in its guillemets
     "sign": " (--no-lag, --no-delay)",
     "other sign": ". A lag and a delay cannot be negative: the model",
     " (leave it out of free=)": "",
+    "free=": "what is fitted (--no-delay)",
     "fit with a jq.identify.Prior or a second record, or ask for a determined combination":
         "fit without one of them (--no-lag, --no-delay), or fly again with more excitation",
     "Fit.explain()": "--explain",

@@ -5,8 +5,11 @@ import os
 import subprocess
 import sys
 import time
+import zlib
 
 import pytest
+
+from jaxquad._compile import _door
 
 
 COMPILE = """
@@ -69,6 +72,38 @@ def test_processes_at_once_leave_whole_programs_for_the_next(tmp_path):
     assert names and all(name.endswith("-cache") and name != "old-cache" for name in names)
     after = json.loads(answer(started(COMPILE, "3", cwd=tmp_path, JAXQUAD_CACHE=str(shared))))
     assert after[-1] >= 3 and {path.name for path in shared.iterdir()} == names
+
+
+def test_the_folder_of_a_killed_process_goes_and_that_of_a_living_one_stays(tmp_path):
+    folders = [tmp_path / f"process-{name}" for name in ("killed", "alive", "young")]
+    for folder in folders:
+        folder.mkdir()
+    for folder in folders[:2]:
+        os.utime(folder, (time.time() - 100, time.time() - 100))
+    lock = _door._locked(folders[1])
+    assert lock is not None
+    try:
+        _door._prune(tmp_path)
+    finally:
+        os.close(lock)
+    assert sorted(tmp_path.iterdir()) == sorted(folders[1:])
+
+
+def test_damaged_entries_are_removed_with_one_warning_each(tmp_path):
+    mine = tmp_path / "process-mine"
+    mine.mkdir()
+    content = b"a program"
+    sound = tmp_path / f"{zlib.crc32(content):08x}.jit_f-1-cache"
+    sound.write_bytes(content)
+    damaged = tmp_path / f"{zlib.crc32(b'another'):08x}.jit_f-2-cache"
+    damaged.write_bytes(content)
+    (tmp_path / "traced-g-cache").mkdir()
+    _door._link_entry(sound, mine)
+    for path in (damaged, tmp_path / "traced-g-cache"):
+        with pytest.warns(UserWarning, match="damaged: it is removed and compiled again"):
+            _door._link_entry(path, mine)
+    assert sorted(tmp_path.iterdir()) == [sound, mine]
+    assert [path.name for path in mine.iterdir()] == ["jit_f-1-cache"]
 
 
 @pytest.mark.slow

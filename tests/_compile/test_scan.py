@@ -200,3 +200,57 @@ def test_an_accumulator_may_have_numbers_of_each_member():
     run = eqx.filter_jit(lambda: scan_loop(loop, HAPPENS, Weighted(weight))[0])
     record = simulate(loop, HAPPENS)
     close(run(), weight * jnp.sum(record.angle, axis=0), rtol=1e-9)
+
+
+NOISE_ROWS = np.asarray(NOISE)[:, :3]
+
+
+def queued(waits, count=SAMPLES):
+    """A scan whose state is driven by what it sent `waits` samples ago, and the same without it."""
+
+    def move(x, gain, now, oldest):
+        x = 0.9 * x + 0.1 * jnp.tanh(oldest) + gain * now[None]
+        return x, (jnp.sin(x) * gain, x)
+
+    def by_queue(gain, start):
+        queue, signal = jnp.zeros((waits, 2, 3)), jnp.asarray(NOISE_ROWS[:count])
+        return scan_members(move, start, gain, signal, members=3, queue=queue)
+
+    def by_list(gain, start):
+        sent, states = [jnp.zeros((2, 3))] * waits, []
+        for now in NOISE_ROWS[:count]:
+            start, (newest, state) = move(start, gain, now, sent[len(states)])
+            sent, states = [*sent, newest], [*states, state]
+        return start, jnp.stack(states)
+
+    return by_queue, by_list
+
+
+@pytest.mark.parametrize("waits, count", [(1, 20), (7, 20), (8, 20), (8, 19), (13, 20), (30, 20)])
+def test_a_queue_hands_on_what_was_sent_as_many_samples_ago(waits, count):
+    by_queue, by_list = queued(waits, count)
+    close(jax.jit(by_queue)(0.7, START[:, :3]), by_list(0.7, START[:, :3]))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("waits", [3, 40])
+def test_all_derivatives_pass_through_a_queue(waits):
+    cost = lambda run: lambda gain, start: jnp.sum(run(gain, start)[1] ** 2)
+    fast, slow = map(cost, queued(waits, 12))
+    gains, start = jnp.asarray([0.5, 0.7]), START[:, :3]
+    for transform in (
+        lambda f: jax.vmap(jax.grad(f), in_axes=(0, None)),
+        lambda f: jax.vmap(jax.hessian(f), in_axes=(0, None)),
+        lambda f: jax.vmap(jax.jacfwd(jax.checkpoint(f)), in_axes=(0, None)),
+    ):
+        found, expected = (jax.jit(transform(f))(gains, start) for f in (fast, slow))
+        close(found, expected, rtol=1e-9)
+
+
+def test_no_sample_of_a_reverse_pass_adds_up_a_whole_queue():
+    """It would cost the delay's length in every sample, and be too wide for a kernel."""
+    late = lambda gain: Loop(rig(INERTIA[:, :2]), LADRC(gain, 30.0, 0.85), delay=0.1)
+    cost = lambda gain: jnp.mean(evaluate(late(gain), HAPPENS).itae)
+    text = jax.jit(jax.grad(cost)).lower(10.0).as_text()
+    assert "tensor<50x1x2xf64>" in text
+    assert not [x for x in text.splitlines() if "stablehlo.add" in x and "50x1x2" in x]

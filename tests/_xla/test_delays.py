@@ -34,7 +34,7 @@ def test_a_longer_delay_makes_no_larger_program():
         .lower(np.array([2.0, 12.0]), 0.0)
         .as_text()
     )
-    short, long = size(0.012), size(0.512)
+    short, long = size(0.062), size(0.512)
     assert long < 1.02 * short
 
 

@@ -221,8 +221,7 @@ MISSING = """
 import sys
 import equinox, jax  # equinox needs some of them itself
 {how}
-from jaxquad._compile import engine
-from jaxquad._compile._door import PLAIN
+from jaxquad._compile import engine, no_fuse
 import warnings
 with warnings.catch_warnings(record=True) as said:
     warnings.simplefilter('always')
@@ -230,7 +229,7 @@ with warnings.catch_warnings(record=True) as said:
 assert not told.one_kernel and 'lacks what kernels are made with' in told.why_not
 assert told.why_not in str(said[-1].message)
 x = jax.numpy.ones(3)
-assert jax.numpy.allclose(PLAIN.as_one_kernel(jax.numpy.sin, x), jax.numpy.sin(1.0))
+assert jax.numpy.allclose(no_fuse(jax.numpy.sin, x), jax.numpy.sin(1.0))
 print("plain")
 """
 WITHOUT = {

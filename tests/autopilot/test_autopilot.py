@@ -119,8 +119,8 @@ CANNOT_TELL = Message(f"this log cannot tell: «plant|{POOR}». Fly a chirp")
 @pytest.mark.parametrize(("verdict", "kind"), [(CANNOT_TELL, "flown"), (AGAIN, "not flown")])
 def test_the_printed_verdict_repeats_nothing_of_what_is_above_it(verdict, kind):
     """Of stand-ins: such fits and loops were printed of a measured flight, each sentence twice."""
-    flown = SimpleNamespace(version=(4, 2), axis=0, firmware="betaflight", unmodelled=(), old={})
-    vars(flown).update(filters_text="", angle=None, measured=None)
+    flown = SimpleNamespace(version=(4, 2), axis=0, firmware="betaflight", old={}, filters_text="")
+    vars(flown).update(loop=SimpleNamespace(unmodelled=()), angle=None, measured=None)
     found = object.__new__(AutopilotProposal)
     vars(found).update(
         kind="cannot tell", verdict=verdict, flown=flown, stages=(), throttle=None, filters=None,

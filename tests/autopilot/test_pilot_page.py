@@ -8,6 +8,7 @@ import pytest
 from html_pages import HOSTILE, Page, UNSEEN
 
 import jaxquad.plot
+import jaxquad.report
 from jaxquad.autopilot import _page, FilterChain, PilotPage, PT1, write_pilot_page
 from jaxquad.plot import FlownAgain, Spectrum, StepBand
 from jaxquad.report import Headline, provenance, Table
@@ -98,7 +99,7 @@ def test_a_section_that_raises_says_why_and_costs_no_other(tmp_path, monkeypatch
 
 def test_provenance_and_figures_may_fail_too(tmp_path, monkeypatch):
     monkeypatch.setattr(jaxquad.plot, "steps_figure", lambda *_: 1 / 0)
-    monkeypatch.setattr(_page, "provenance_section", lambda _: 1 / 0)
+    monkeypatch.setattr(jaxquad.report, "provenance_section", lambda _: 1 / 0)
     whole = dataclasses.replace(page("roll"), provenance=provenance())
     text = write_pilot_page(tmp_path / "page.html", whole).read_text(encoding="utf-8")
     shown = Page(text)

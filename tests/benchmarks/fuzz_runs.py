@@ -50,7 +50,8 @@ class Place:
                 resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
 
         command = [sys.executable, "-m", "jaxquad", *map(os.fsencode, map(str, words))]
-        names = os.environ | {"JAXQUAD_CACHE": str(self.cache)} | environment
+        ours = {k: v for k, v in os.environ.items() if not k.startswith("JAX_")}
+        names = ours | {"JAXQUAD_CACHE": str(self.cache)} | environment
         return subprocess.Popen(
             command, cwd=self.folder, env=names, preexec_fn=narrow, start_new_session=True,
             stdout=subprocess.PIPE, stderr=subprocess.PIPE,

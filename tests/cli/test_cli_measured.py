@@ -131,6 +131,7 @@ def test_a_limit_far_beyond_the_record_gives_no_design_to_be_flown(identified, t
     }  # fmt: skip
     for text in (printed, str(stored["certificate"]["remarks"]), page):
         assert "13 times the largest command of the record" in text
+    for text in (printed, stored["verdicts"][1]["text"], page):
         assert "rad/s lies beyond the identified band of 4.4 to 75.4 rad/s" in text
     assert "PERFORMANCE FAILS" in page
 

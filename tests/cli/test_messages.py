@@ -16,7 +16,7 @@ BANNED = (
 DEFINED = {  # words that need a definition, and where a reader of the command line finds it
     "Newton decrement": ("docs/first_steps.md", r"- \*\*Newton decrement\*\*: half of"),
     "condition": ("docs/first_steps.md", r"- \*\*condition\*\*: how much worse"),
-    "member": ("jaxquad/cli/_tune.py", r"A member is one plant"),
+    "member": ("jaxquad/cli/_logs.py", r"A member is one plant"),
 }
 
 

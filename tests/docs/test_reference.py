@@ -23,7 +23,8 @@ ROW = re.compile(r"^\| \[`jq\.(\w+)`\]\[jaxquad\.(\w+)\.(\w+)\] \| .+ \|$", flag
 def public(room):
     """What the face of a room exports, by name."""
     module = importlib.import_module(f"jaxquad.{room}")
-    found = {n: getattr(module, n) for n in dir(module) if not n.startswith("_")}
+    names = getattr(module, "__all__", dir(module))
+    found = {n: getattr(module, n) for n in names if not n.startswith("_")}
     return {n: v for n, v in found.items() if not inspect.ismodule(v)}
 
 

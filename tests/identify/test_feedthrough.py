@@ -78,6 +78,23 @@ def test_a_direct_part_that_nobody_tells_is_remarked():
 
 
 @pytest.mark.slow
+def test_a_fit_in_time_keeps_the_sample():
+    sweep = jq.sweep(1.5, 60.0, duration=25.0, sample_rate=1 / HOLD, amplitude=1.0)
+    u, delay = sweep.signal, 0.043
+    truth = jq.TransferFunction([1.0, 5.0], [1.0, 2.0], delay=delay)
+    clean = np.asarray(jq.models.simulate_linear(truth, u, HOLD))
+    noise = np.random.default_rng(7).normal(0, 0.02, u.size)
+    record = jq.Record(HOLD * np.arange(u.size), u, clean + noise, hold=HOLD)
+    start = jq.TransferFunction([0.9, 4.5], [1.0, 2.5], delay=0.035)
+    for model in (start, dataclasses.replace(start, delay=0.052)):
+        fit = jq.identify.refine(model, record, free=FREE)
+        off = (fit.values - [1.0, 5.0, 2.0, delay]) / fit.standard_errors
+        assert np.all(np.abs(off) < 3)
+        assert 0.002 < fit.standard_errors[3] < 0.004
+        assert [remark.kind for remark in fit.remarks] == ["sampled delay"]
+
+
+@pytest.mark.slow
 def test_many_fits_at_once_refuse_a_free_delay_of_the_direct_part():
     start = jq.TransferFunction([0.8, 4.0], [1.0, 3.0], delay=0.043)
     responses = [held(HeldLead(0.043), seed=k) for k in range(2)]

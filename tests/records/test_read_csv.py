@@ -9,7 +9,7 @@ from jaxquad.records.formats import READERS
 
 
 load = READERS["csv"].load
-MODULE = "jaxquad.records.formats._csv"
+MODULE = "jaxquad.records.formats._tables"
 ODD = (
     "1.5,nan,-inf,2e-7", "+1,.5,7.,0", " 3 ,\t4,5 , 6", "1e400,-1e400,1e-400,-0", "1,2,3", "1,,3,4",
     "1_0,2,3,4", '"1",2,3,4', "0x1,2,3,4", "1,2,3,4,", "n,2,3,4", "Infinity,NaN,INF,nAn",

@@ -12,7 +12,7 @@ import pytest
 
 import jaxquad as jq
 from jaxquad._compile import Jit
-from jaxquad.simulation import _memory, _parallel, _simulate
+from jaxquad.simulation import _parallel, _scenario, _simulate
 
 
 MEMBERS, SAMPLES, PART = 100, 200, 32
@@ -172,7 +172,7 @@ def test_within_another_program_nothing_is_parted(cores):
 def test_a_record_that_does_not_fit_is_refused_by_the_size_of_all(cores, monkeypatch):
     cores(4)
     size = 25 * SAMPLES * MEMBERS  # B, at least
-    monkeypatch.setattr(_memory, "free_memory", lambda device: 0.9 * size)
+    monkeypatch.setattr(_scenario, "free_memory", lambda device: 0.9 * size)
     with pytest.raises(ValueError, match=f"of {MEMBERS} members needs about"):
         fly()
 

@@ -81,6 +81,9 @@ remarks in 97 % of records or more; 3 rad/s at 5 % noise has them in 5 %.
 A command is held for 0.02 s. With the hold stated, 93.5 to 98 % of the intervals hold the truth.
 Not stated, parameters are biased by up to 90 claimed errors, and every record has a remark.
 """,
+    "A held command that passes directly": """\
+Delays of 0 to 6 samples: 88 to 100 % of 60 intervals hold, the worst error is 3.6 claimed ones.
+""",
     "Nonlinear actuators": """\
 A deadband of 15 % or a saturation at 80 % is remarked in 100 % of records, a linear actuator in
 none.

@@ -96,20 +96,25 @@ def test_the_members_are_fresh_and_those_of_the_key(certificate):
     assert certificate.provenance["key"] == jax.random.key_data(jax.random.key(3)).tolist()
 
 
-def test_a_design_within_its_limits_holds_and_says_what_that_proves():
+def test_a_design_within_its_limits_says_what_that_proves():
     limits = (Limit("sensitivity_peak", at_most=10.0), Limit("phase_margin", at_least=0.1))
     slow = jq.LADRC(4.0, 20.0, 1.0)
     found = judged(slow, limits=limits, linear_members=190)
-    assert found.holds and found.summaries["tuned"].unstable_at_most == upper_bound(0, MEMBERS)
+    assert found.stability.holds
+    assert found.summaries["tuned"].unstable_at_most == upper_bound(0, MEMBERS)
     first, stability, performance, convergence = str(found).splitlines()[:4]
-    assert first.startswith("CERTIFICATE HOLDS on 24 fresh members (216 linear loops): STABILITY")
+    assert first == (
+        "CERTIFICATE OPEN on 24 fresh members (216 linear loops), not to be flown: PERFORMANCE is "
+        "not decided"
+    )
     assert stability == (
         "  OK   STABILITY: 216 of 216 members are stable and within the limits on Ms and phase "
         "margin (proven: at most 1.4 % of all are not, 95 % confidence); 24 of 24 flights are "
         "bounded (proven: at most 12 % of all are not, 95 % confidence)"
     )
     assert "worst: of 24 members; at most 12 % of all are beyond it" in str(found)
-    assert performance.startswith("  OK   PERFORMANCE: 24 of 24 members make less than half")
+    few = "  --   PERFORMANCE: not decided, since 24 members are too few to speak of others; "
+    assert performance.startswith(f"{few}24 of 24 members make less than half")
     assert convergence == "  --   CONVERGENCE: the gains were given, not tuned here"
 
 
@@ -206,7 +211,7 @@ def test_a_payload_counts_in_the_linear_loop():
 def test_members_that_were_given_prove_no_share():
     given = OPEN.draw(LOOP, MEMBERS, jax.random.key(3))
     found = judged(jq.LADRC(4.0, 20.0, 1.0), ensemble=given)
-    assert found.holds and found.summaries["tuned"].unstable_at_most is None
+    assert found.stability.holds and found.summaries["tuned"].unstable_at_most is None
     assert "proven" not in str(found) and "fresh" not in str(found).splitlines()[0]
 
 

@@ -12,7 +12,7 @@ from jaxquad.loops import loop_numbers
 from jaxquad.models import DecoupledAxes
 from jaxquad.simulation import scenario
 from jaxquad.tuning import LBFGS, Limit, Tail, tune
-from jaxquad.tuning._tail import take_members
+from jaxquad.tuning._cost import take_members
 
 
 pytestmark = pytest.mark.usefixtures("compiled_quickly")

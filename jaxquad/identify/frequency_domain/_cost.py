@@ -16,7 +16,7 @@ import dataclasses
 import functools as ft
 import itertools
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple, Protocol, runtime_checkable
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import equinox as eqx
 import jax
@@ -26,6 +26,8 @@ from jaxtyping import Array, Bool, Complex, Float
 
 from jaxquad._core import Message, pytree_node
 from jaxquad.spectra import DOMINATED, FrequencyResponse
+
+from ._parameters import namespace_of, Numbers
 
 
 _COHERENT, _POOR = 0.6, 0.05  # least coherence: in general, and beside coherent points
@@ -38,16 +40,16 @@ _ALONE = 1.02  # sum of |rho|^2 below which all points of a pair count as indepe
 _W_g, _W_p = 1.0, 0.01745  # so that 1 dB weighs as much as 7.57 deg
 
 Mask = Bool[np.ndarray, "frequencies outputs inputs"]
-Ratio = Float[np.ndarray, "frequencies outputs inputs"]
-Weights = Float[np.ndarray, "frequencies outputs inputs 2"]
+Ratio = Float[Numbers, "frequencies outputs inputs"]
+Weights = Float[Numbers, "frequencies outputs inputs 2"]
 
 
-def coherence_weight(gamma_squared: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
+def coherence_weight(gamma_squared: Float[Numbers, "..."]) -> Float[Numbers, "..."]:
     """Eq. (14), the weight of a point: W_gamma = [1.58 (1 - exp(-gamma^2))]^2.
 
     The paper prints it without the square. Source: docs/equations.md.
     """
-    return (1.58 * (1 - np.exp(-gamma_squared))) ** 2
+    return (1.58 * (1 - namespace_of(gamma_squared).exp(-gamma_squared))) ** 2
 
 
 def paper_cost(
@@ -82,10 +84,10 @@ class Points:
     used: Mask  # the weights of the others have to be 0
     shared: Ratio
     floor: Ratio  # what the model leaves unexplained, in neper and rad; 0 before that is known
-    correlations: Mapping[tuple[int, int], Complex[np.ndarray, "used used"]] = eqx.field(
+    correlations: Mapping[tuple[int, int], Complex[Numbers, "used used"]] = eqx.field(
         default_factory=dict
     )
-    between: Complex[np.ndarray, "frequencies pairs pairs"] | None = None
+    between: Complex[Numbers, "frequencies pairs pairs"] | None = None
 
 
 @runtime_checkable
@@ -95,7 +97,8 @@ class Cost(Protocol):
     def weights(self, points: Points, ratio: Ratio) -> Weights:
         """Weights of `ln|T/T^|` and of `angle(T/T^)` in rad, on a last axis of two.
 
-        `ratio` is |model / measurement|, 1 before there is a model.
+        `ratio` is |model / measurement|, 1 before there is a model. For derivatives of a fit it is
+        an array of JAX, as is what they are taken by.
         """
         ...
 
@@ -112,10 +115,11 @@ class CoherenceWeighted:
 
     def weights(self, points: Points, ratio: Ratio) -> Weights:
         count = np.maximum(points.used.sum(axis=0, keepdims=True), 1)
-        W_gamma = coherence_weight(np.asarray(points.frf.coherence))
-        root = np.where(points.used, np.sqrt(20 / count) * np.sqrt(W_gamma), 0.0)
+        xp = namespace_of(ratio)
+        W_gamma = coherence_weight(xp.asarray(points.frf.coherence))
+        root = xp.where(points.used, np.sqrt(20 / count) * xp.sqrt(W_gamma), 0.0)
         units = np.sqrt(_W_g) * _DB, np.sqrt(_W_p) * np.degrees(1.0)
-        return np.stack([root * unit for unit in units], axis=-1)
+        return xp.stack([root * unit for unit in units], axis=-1)
 
 
 @pytree_node
@@ -132,12 +136,13 @@ class MaximumLikelihood:
     def weights(self, points: Points, ratio: Ratio) -> Weights:
         # 1e-7 keeps noise-free records from weights that overflow.
         # Where the model is off by far, as at the start, the measurement is the better guide.
-        off = np.clip(ratio, 1 / 3, 3) ** -points.frf.error_exponent
-        error = np.maximum(np.asarray(points.frf.random_error), 1e-7) * off
+        xp = namespace_of(ratio)
+        off = xp.clip(ratio, 1 / 3, 3) ** -points.frf.error_exponent
+        error = xp.maximum(xp.asarray(points.frf.random_error), 1e-7) * off
         with np.errstate(invalid="ignore"):  # an unknown response has an infinite error
-            deviation = np.hypot(error * np.sqrt(points.shared), points.floor)
-        root = np.where(points.used, 1 / deviation, 0.0)
-        return np.stack([root, root], axis=-1)
+            deviation = xp.hypot(error * xp.sqrt(points.shared), points.floor)
+        root = xp.where(points.used, 1 / deviation, 0.0)
+        return xp.stack([root, root], axis=-1)
 
 
 def least_coherence(wanted: float | None, cost: Cost, frf: FrequencyResponse) -> float:
@@ -301,26 +306,37 @@ def mixing_of(points: Points, weights: Weights) -> Mixing | None:
     """Of the points of a response; `None` where they share no noise."""
     if not points.correlations and points.between is None:
         return None
-    none = unmixed(points.used.shape)
-    factor, correlation = np.array(none.factor), np.array(none.correlation)
+    none, xp = unmixed(points.used.shape), namespace_of(weights)
+    factor: Any = np.array(none.factor)
+    correlation: Any = np.array(none.correlation)
     for (o, i), shared in points.correlations.items():
         mine = np.flatnonzero(points.used[:, o, i])
         # A floor on the error is shared with no other point.
-        alone = np.minimum((weights[mine, o, i, 0] * points.floor[mine, o, i]) ** 2, 1.0)
-        size = np.sqrt((1 - alone) / points.shared[mine, o, i])
-        total = size[:, None] * shared * size + np.diag(alone + _DOUBT)
-        root = np.sqrt(1 + _DOUBT) * np.linalg.inv(np.linalg.cholesky(total))
-        factor[o, i][np.ix_(mine, mine)] = root
-        correlation[o, i][np.ix_(mine, mine)] = shared
-    across, between = none.across, none.between
+        alone = xp.minimum((weights[mine, o, i, 0] * points.floor[mine, o, i]) ** 2, 1.0)
+        size = xp.sqrt((1 - alone) / points.shared[mine, o, i])
+        total = size[:, None] * shared * size + xp.diag(alone + _DOUBT)
+        root = np.sqrt(1 + _DOUBT) * xp.linalg.inv(xp.linalg.cholesky(total))
+        place = (o, i, mine[:, None], mine)
+        factor, correlation = _placed(factor, place, root), _placed(correlation, place, shared)
+    across: Any = none.across
+    between: Any = none.between
     if points.between is not None:  # what whitens the pairs at each frequency
-        alone = np.minimum((weights[..., 0] * points.floor) ** 2, 1.0).reshape(len(weights), -1)
-        size, identity = np.sqrt(1 - alone), np.eye(alone.shape[1])
+        alone = xp.minimum((weights[..., 0] * points.floor) ** 2, 1.0).reshape(len(weights), -1)
+        size, identity = xp.sqrt(1 - alone), np.eye(alone.shape[1])
         total = size[:, :, None] * points.between * size[:, None, :]
         total = total + (alone + _DOUBT)[:, :, None] * identity
-        across = np.sqrt(1 + _DOUBT) * np.linalg.inv(np.linalg.cholesky(total))
+        across = np.sqrt(1 + _DOUBT) * xp.linalg.inv(xp.linalg.cholesky(total))
         between = points.between
     return Mixing(factor, correlation, across, between, np.array(False))
+
+
+def _placed(array: Numbers, place: tuple, values: Numbers) -> Any:
+    """`array` with these values in place."""
+    if namespace_of(values) is not np:
+        return jnp.asarray(array).at[place].set(values)
+    assert isinstance(array, np.ndarray)
+    array[place] = values
+    return array
 
 
 @ft.lru_cache(maxsize=8)

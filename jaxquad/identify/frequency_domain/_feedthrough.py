@@ -10,7 +10,7 @@ Source: Minka (2001), Expectation propagation for approximate Bayesian inference
 
 import dataclasses
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -18,14 +18,13 @@ import numpy as np
 from jaxtyping import Array, Float, PyTree
 
 from jaxquad._core import Message
+from jaxquad.records import Record
 from jaxquad.spectra import FrequencyResponse
 
 from ..uncertainty._error_budget import scaled_inverse
-from ..uncertainty._zero_bounds import linearise
 from ._parameters import Condition, Numbers
 from ._problem import Problem
 from ._sampled import Aliases, direct_part, whole_samples
-from ._solve import Solution
 
 
 _DIGITS = 9  # of slopes: delays that change alike
@@ -133,18 +132,26 @@ def _to_middles(problem: Problem, z: Vector, groups: Sequence[Sequence[DirectDel
     return z
 
 
-def find_samples(
-    problem: Problem,
-    solution: Solution,
-    groups: Sequence[Sequence[DirectDelay]],
-    solve: Callable[[Problem, Vector], Solution],
-) -> tuple[Problem, Solution]:
-    """The problem with direct parts of whole samples, and its solution, from the even one's.
+class Solved(NamedTuple):
+    """Where a descent ended; of a fit in the time domain, too."""
 
-    Samples next to those of the even solution are solved, too, one group after the other, until
-    none is better.
+    solution: Any
+    z: Vector
+    cost: float  # or deviance
+    information: Float[np.ndarray, "free free"]  # J'J of its weighted residuals and priors
+
+
+Solve = Callable[[Problem, Vector], Solved]
+
+
+def find_samples(
+    problem: Problem, z: Vector, groups: Sequence[Sequence[DirectDelay]], solve: Solve
+) -> tuple[Problem, Solved]:
+    """The problem with direct parts of whole samples, and its solution, from near `z`.
+
+    Samples next to those of `z` are solved, too, one group after the other, until none is better.
     """
-    _, delays, _ = jax.tree.map(np.asarray, _delays(solution.z, problem))
+    _, delays, _ = jax.tree.map(np.asarray, _delays(z, problem))
 
     def sample(one: DirectDelay) -> float:
         samples = whole_samples(delays[one.record], _aliases(problem, one).hold)
@@ -152,13 +159,12 @@ def find_samples(
 
     counts = [[sample(one) for one in group] for group in groups]
 
-    def attempt(counts: Sequence[Sequence[float]], start: Solution) -> tuple[Problem, Solution]:
+    def attempt(counts: Sequence[Sequence[float]], z: Vector) -> tuple[Problem, Solved]:
         tried = with_samples(problem, groups, counts)
         # From within the samples: beyond their ends there may be minima that are none.
-        return tried, solve(tried, _to_middles(tried, start.z, groups))
+        return tried, solve(tried, _to_middles(tried, z, groups))
 
-    cost = lambda pair: linearise(*pair).cost
-    best, improved = attempt(counts, solution), True
+    best, improved = attempt(counts, z), True
     while improved:
         improved = False
         for k, row in enumerate(counts):
@@ -166,8 +172,8 @@ def find_samples(
                 moved = [*counts[:k], [count + step for count in row], *counts[k + 1 :]]
                 if min(moved[k]) < 0:
                     continue
-                other = attempt(moved, best[1])
-                if cost(other) < cost(best):
+                other = attempt(moved, best[1].z)
+                if other[1].cost < best[1].cost:
                     best, counts, improved = other, moved, True
     return best
 
@@ -183,18 +189,15 @@ class SampleLimit(NamedTuple):
 
 
 def sample_limits(
-    problem: Problem,
-    solution: Solution,
-    groups: Sequence[Sequence[DirectDelay]],
-    solve: Callable[[Problem, Vector], Solution],
-) -> tuple[list[SampleLimit], Solution]:
+    problem: Problem, z: Vector, groups: Sequence[Sequence[DirectDelay]], solve: Solve
+) -> tuple[list[SampleLimit], Vector]:
     """For delays of which the rest of the response tells less than the sample does.
 
-    With the solution under the limits of all samples.
+    With the parameters under the limits of all samples.
     """
     if not groups:
-        return [], solution
-    slopes = _delays(solution.z, problem)[2]
+        return [], z
+    slopes = _delays(z, problem)[2]
     rows, limits = [], []
     for one, *_ in groups:
         aliases, at = _aliases(problem, one), (one.output, one.input)
@@ -206,17 +209,16 @@ def sample_limits(
             middle, error = high - hold / 2, hold / np.sqrt(12)
             limits.append(SampleLimit(one, high - hold, high, middle, error))
     if not limits:
-        return [], solution
+        return [], z
     # With the mean and variance of each sample, which keeps the delays where slopes of the rest
     # hold; without its own, that of a delay is what all else tells of it.
     within = limited(problem, limits)
-    solution = solve(within, _to_middles(problem, solution.z, groups))
-    _, late, slopes = _delays(solution.z, problem)
+    solved = solve(within, _to_middles(problem, z, groups))
+    _, late, slopes = _delays(solved.z, problem)
     jacobian = np.array(
         [np.asarray(slopes[one.record])[one.output, one.input] for one, *_ in limits]
     )
-    by_all = linearise(within, solution).jacobian
-    spread = np.diagonal(jacobian @ scaled_inverse(by_all.T @ by_all) @ jacobian.T)
+    spread = np.diagonal(jacobian @ scaled_inverse(solved.information) @ jacobian.T)
     needed = []
     for limit, variance in zip(limits, spread, strict=True):
         one, low, high, middle, error = limit
@@ -240,7 +242,7 @@ def sample_limits(
         more = 1 / variance - precision
         value = (mean / variance - aim * precision) / more
         needed.append(limit._replace(value=value, standard_error=more**-0.5))
-    return needed, solution
+    return needed, solved.z
 
 
 def limited(problem: Problem, limits: Sequence[SampleLimit]) -> Problem:
@@ -254,14 +256,14 @@ def limited(problem: Problem, limits: Sequence[SampleLimit]) -> Problem:
 
 
 def remarks_on_samples(
-    problem: Problem, limits: Sequence[SampleLimit], frfs: Sequence[FrequencyResponse]
+    problem: Problem, limits: Sequence[SampleLimit], data: Sequence[FrequencyResponse | Record]
 ) -> list[Message]:
     """Say which sample is all that is known of a delay, and which direct part nobody knows."""
     remarks = list[Message]()
     for delay, low, high, *_ in limits:
-        frf = frfs[delay.record]
+        of = data[delay.record]
         text = (
-            f"{frf.input_names[delay.input]} passes directly to {frf.output_names[delay.output]}, "
+            f"{of.input_names[delay.input]} passes directly to {of.output_names[delay.output]}, "
             "which shows in whole samples of the held input: its delay lies between "
             f"{1e3 * low:.4g} and {1e3 * high:.4g} ms, and the interval is that sample; record at "
             "a higher rate to know it better"

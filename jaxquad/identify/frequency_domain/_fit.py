@@ -11,8 +11,10 @@ import numpy as np
 from jaxtyping import Float, PyTree
 
 from jaxquad._core import (
+    concrete_values,
     CONVERGED,
     decrement,
+    is_traced,
     Message,
     minimise,
     one_blas_thread,
@@ -27,7 +29,7 @@ from jaxquad.spectra import FrequencyResponse
 from ..uncertainty._assess import assess, DOUBT, unfitted
 from ..uncertainty._error_budget import weighting_at
 from ..uncertainty._verdict import without_numbers
-from ..uncertainty._zero_bounds import solve_within_bounds
+from ..uncertainty._zero_bounds import linearise, solve_within_bounds
 from ._cost import (
     Band,
     Cost,
@@ -42,12 +44,14 @@ from ._cost import (
     Weights,
     widen_band,
 )
+from ._derivatives import Descent, Inputs, with_derivatives
 from ._feedthrough import (
     find_samples,
     free_delays,
     limited,
     remarks_on_samples,
     sample_limits,
+    Solved,
     unsampled,
 )
 from ._parameters import Condition, Free, Numbers, Parameters, select_parameters, Tie
@@ -157,10 +161,15 @@ def fit(
     A `jq.identify.Fit`. Its `verdict` says what the record determines; where too few frequencies
     are usable to fit anything, the result holds the starting values.
 
+    Within `jax.grad`, `jvp`, `jacrev`, `jacfwd` and `hessian` its model and values have derivatives
+    by responses, their random errors and coherences, fixed parameters, priors and conditions: those
+    of fitting again, by the implicit function theorem with the cost's whole Hessian. Frequencies
+    and the correlation of errors count as constant, and so does which points are in use.
+
     **Raises:**
 
     - `ValueError`: for names that the model does not have, options that make no sense, and a
-        solver that diverged.
+        solver that diverged; within `jax.jit` and `vmap`, and for derivatives without a minimum.
     - `PrecisionError`, a `ValueError`: JAX runs in 32 bits; call `jq.enable_x64()` first.
 
     !!! example
@@ -173,6 +182,9 @@ def fit(
     Source: docs/identification.md; Eq. (14) of the paper, as corrected in docs/equations.md.
     """
     require_x64("a fit")
+    inputs = Inputs(model, frf, conditions, priors)
+    if traced := is_traced(inputs):
+        model, frf, conditions, priors = concrete_values(inputs, "jq.fit")
     require_model("fit", model)
     frfs = require_responses(frf)
     if conditions is None:
@@ -181,20 +193,33 @@ def fit(
     options = Options(
         free, tied, cost, conditions, priors, band, min_coherence, starts, solver, max_steps
     )
-    return fit_with(model, frfs, options)
+    descents: list[Descent] = []
+    fit = fit_with(model, frfs, options, descents=descents)
+    return with_derivatives(fit, descents, inputs, cost) if traced else fit
 
 
 def fit_with(
-    model: PyTree, frfs: Sequence[FrequencyResponse], options: Options, *, rounds: int = 3
+    model: PyTree,
+    frfs: Sequence[FrequencyResponse],
+    options: Options,
+    *,
+    rounds: int = 3,
+    descents: list[Descent] | None = None,
 ) -> Fit:
     """Fit as `jq.fit` does, and up to `rounds` times more with what the model leaves unexplained as
-    a floor on the random error; without, costs compare structures."""
+    a floor on the random error; without, costs compare structures. `descents` gets all of them."""
     small = all(np.size(frf.omega) <= _SMALL for frf in frfs)
     with one_blas_thread() if small else contextlib.nullcontext():
-        return _fit(with_arrays(model), frfs, options, rounds)
+        return _fit(with_arrays(model), frfs, options, rounds, [] if descents is None else descents)
 
 
-def _fit(model: PyTree, frfs: Sequence[FrequencyResponse], options: Options, rounds: int) -> Fit:
+def _fit(
+    model: PyTree,
+    frfs: Sequence[FrequencyResponse],
+    options: Options,
+    rounds: int,
+    descents: list[Descent],
+) -> Fit:
     # The problem: points, parameters, priors.
     cost, band, solver, max_steps = options.cost, options.band, options.solver, options.max_steps
     parameters = select_parameters(model, options.free, options.tied)
@@ -259,13 +284,21 @@ def _fit(model: PyTree, frfs: Sequence[FrequencyResponse], options: Options, rou
         starts = spread_starts(parameters, options.starts, fastest=fastest)
         solution, minima = solve_from_many(problem, starts, solver, max_steps)
         solution = solve_within_bounds(problem, solution, solver, max_steps)
-    solve_from = lambda problem, z: solve_within_bounds(problem, z, solver, max_steps)
+
+    def solve_from(problem: Problem, z: Numbers) -> Solved:
+        end = solve_within_bounds(problem, np.asarray(z), solver, max_steps)
+        local = linearise(problem, end)
+        return Solved(end, end.z, local.cost, local.jacobian.T @ local.jacobian)
+
     if delays:
-        problem, solution = find_samples(problem, solution, delays, solve_from)
+        problem, sampled = find_samples(problem, solution.z, delays, solve_from)
+        solution = sampled.solution
+    descents.append(Descent(problem, points, solution))
     again = weigh(points, solution)
     if not are_close(weights, again, 1e-4):
         problem = weighted(points, again)
         solution = solve_within_bounds(problem, solution.z, solver, max_steps)
+        descents.append(Descent(problem, points, solution))
     _check_finite(solution)
     check_priors(problem, solution)
     # Again with what the model leaves unexplained as a floor on the random error, where it does
@@ -279,12 +312,14 @@ def _fit(model: PyTree, frfs: Sequence[FrequencyResponse], options: Options, rou
             break
         problem, lifted = weighted(raised, weights), True
         solution = solve_within_bounds(problem, solution.z, solver, max_steps)
+        descents.append(Descent(problem, raised, solution))
         _check_finite(solution)
         weighting = weighting_at(problem, points, solution)
-    limits, within = sample_limits(problem, solution, delays, solve_from)
+    limits, z = sample_limits(problem, solution.z, delays, solve_from)
     if limits:
         problem = limited(problem, limits)
-        solution = solve_from(problem, within.z)
+        descents.clear()  # what limits a delay to its sample has no derivative
+        solution = solve_from(problem, z).solution
         weighting = weighting_at(problem, points, solution)
     if lifted:
         weighting = weighting._replace(by_noise=weighted(points, weigh(points, solution)))

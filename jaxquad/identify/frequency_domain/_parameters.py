@@ -12,6 +12,7 @@ from jaxtyping import Array, Float, PyTree
 
 from jaxquad._core import (
     is_concrete,
+    is_traced,
     pytree_node,
     require_finite,
     require_float64,
@@ -118,7 +119,7 @@ class Parameters:
         return model
 
 
-def namespace_of(x: Numbers):
+def namespace_of(x: Numbers) -> Any:
     """The module whose functions take `x`: NumPy, or `jax.numpy`."""
     return np if isinstance(x, np.ndarray) else jnp
 
@@ -348,13 +349,14 @@ class Changed:
 
     def __post_init__(self):
         for name in ("plus", "times"):  # arrays: other numbers run the same program
-            number = np.asarray(getattr(self, name), dtype=float)
+            number = getattr(self, name)
+            number = (np if is_concrete(number) else jnp).asarray(number, dtype=float)
             if number.ndim:
                 raise ValueError(f"{name} has the shape {number.shape}: give one number")
             object.__setattr__(self, name, number)
         require_finite("plus", self.plus)
         require_positive("times", self.times)
-        if self.plus == 0.0 and self.times == 1.0:
+        if not is_traced(self) and self.plus == 0.0 and self.times == 1.0:
             raise ValueError(f"{self.parameter} is not changed: give plus= or times=")
 
     def __call__(self, model: PyTree) -> PyTree:

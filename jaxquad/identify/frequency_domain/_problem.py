@@ -11,7 +11,14 @@ import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, PyTree
 
 from jaxquad._compile import evaluate_once, FEW, no_fuse
-from jaxquad._core import Message, Normal, normal_equations, on_host, pytree_node
+from jaxquad._core import (
+    is_traced,
+    Message,
+    Normal,
+    normal_equations,
+    on_host,
+    pytree_node,
+)
 from jaxquad.models import evaluate_response, LaggedIntegrator, StateSpace, TransferFunction
 from jaxquad.spectra import FrequencyResponse
 
@@ -46,10 +53,12 @@ class Prior(eqx.Module):
     """
 
     quantity: str | Callable[[PyTree], Float[Array, ""]] = eqx.field(static=True)
-    value: float = eqx.field(static=True)
-    standard_error: float = eqx.field(static=True)
+    value: float | Float[Numbers, ""]
+    standard_error: float | Float[Numbers, ""]
 
     def __check_init__(self):
+        if is_traced(self):  # by a derivative
+            return
         if not (0 < self.standard_error < np.inf and np.isfinite(self.value)):
             raise ValueError(
                 f"a prior of {self.value} with standard error {self.standard_error}: give a finite "

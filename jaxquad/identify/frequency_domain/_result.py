@@ -2,6 +2,7 @@
 
 import functools as ft
 from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -9,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Complex, Float, Key, PyTree
 
-from jaxquad._core import Message, plain_content, pytree_node
+from jaxquad._core import concrete_values, is_traced, Message, plain_content, pytree_node
 from jaxquad.records import Record
 
 from ..output_error._noise import NoiseModel
@@ -35,7 +36,7 @@ from ..uncertainty._verdict import (
     USUAL,
     Verdict,
 )
-from ._parameters import Parameters
+from ._parameters import Numbers, Parameters
 from ._refits import Bands, explain_misfit, Explanation, fit_bands, Origin
 from ._solve import Minimum
 
@@ -59,12 +60,13 @@ class Fit:
     standard errors are large, or infinite where some change of parameters leaves the responses
     exactly as they are. `cramer_rao` and `insensitivity` are CIFER's, in per cent
     (2 sqrt((H^-1)_ii) and 1/sqrt(H_ii) of the cost's Hessian); `standard_errors` and `covariance`
-    are calibrated by the measured noise.
+    are calibrated by the measured noise. Within `jax.grad` and its like, `model`, `values` and
+    `fit[name]` have derivatives; all else counts as constant.
     """
 
     model: PyTree
     names: tuple[str, ...] = eqx.field(static=True)
-    values: Float[np.ndarray, " parameters"]
+    values: Float[Numbers, " parameters"]
     standard_errors: Float[np.ndarray, " parameters"]
     covariance: Float[np.ndarray, "parameters parameters"]
     noise_covariance: Float[np.ndarray, "parameters parameters"]
@@ -117,7 +119,7 @@ class Fit:
         unbounded = np.isinf(self.standard_errors)
         return np.where(unbounded, np.inf, np.sqrt(np.diagonal(self.noise_covariance)))
 
-    def __getitem__(self, name: str) -> float:
+    def __getitem__(self, name: str) -> Any:  # a float, or what a derivative traces
         """The value of one parameter: `fit["gain"]`; `fit.interval(name)` has its error.
 
         **Raises:** KeyError for a name that the fit does not have, UndeterminedError (a ValueError)
@@ -130,7 +132,7 @@ class Fit:
                 f"{name} has no value of its own: {self.verdict.summary}; {left} is "
                 f"fit.values[{k}], for comparison alone"
             )
-        return float(self.values[k])
+        return self.values[k] if is_traced(self.values) else float(self.values[k])
 
     def _place(self, name: str) -> int:
         if name not in self.names:
@@ -337,7 +339,7 @@ class Fit:
     def __str__(self) -> str:
         lines = [] if self.identifiable else [str(self.verdict)]
         if self.verdict.fitted:
-            lines += [*_parameter_lines(self), *_quality_lines(self)]
+            lines += [*_parameter_lines(concrete_values(self, "str(fit)")), *_quality_lines(self)]
         return "\n".join(lines + [f"! {remark}" for remark in self.remarks])
 
 

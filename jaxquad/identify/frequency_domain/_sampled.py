@@ -50,6 +50,13 @@ class Aliases:
     # Whether the response stays level instead, and the model's kind does not tell its direct part.
     is_level: bool = eqx.field(static=True, default=False)
 
+    @staticmethod
+    def of_direct(hold: float, samples: Float[np.ndarray, "outputs inputs"]) -> "Aliases":
+        """Without frequencies: the direct part alone, as a record in time shows it."""
+        none, row = np.zeros((0, 0)), np.zeros(0)
+        parts = (row.astype(complex), none.astype(complex), none, none, row, np.asarray(hold))
+        return Aliases(*parts, samples=samples)
+
     @property
     def omega(self) -> Float[Numbers, " others"]:
         """All frequencies at which the model is needed beside those of the response, in rad/s."""

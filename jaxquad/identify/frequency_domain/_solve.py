@@ -163,11 +163,11 @@ def evaluate(problem: Problem, *places: Vector) -> list[Sensitivity]:
         if len(parts) != 1:  # all records, one after the other
             all_misfits, slopes = zip(none, *parts, strict=True)
             parts = [(np.concatenate(all_misfits), np.concatenate(slopes, axis=1))]
-        evaluations.append(_by_record(problem, *parts[0]))
+        evaluations.append(by_record(problem, *parts[0]))
     return evaluations
 
 
-def _by_record(problem: Problem, lined_up: np.ndarray, rows: np.ndarray) -> Sensitivity:
+def by_record(problem: Problem, lined_up: Any, rows: Any) -> Sensitivity:
     parts, slopes, start = [], [], 0
     for measured in problem.measured:
         shape, size = (2, *measured.shape[1:], len(measured)), 2 * measured.size
@@ -323,7 +323,7 @@ def solve(problem: Problem, z0: Vector, solver: eqx.Module | None, max_steps: in
             model = take_apart(problem.model)[0].filled(leaves)  # while the program runs
             message, steps = stop.message, int(np.asarray(stop.steps))
             z, values, slopes, *parts, aside = map(np.asarray, (stop.z, *rest))
-            parts = message, steps, _by_record(problem, *parts)
+            parts = message, steps, by_record(problem, *parts)
             return Solution(z, model, values, slopes, *parts, aside=aside)
     return solution_at(problem, np.asarray(stop.z), stop.message, int(np.asarray(stop.steps)))
 

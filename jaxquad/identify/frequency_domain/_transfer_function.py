@@ -246,7 +246,7 @@ class _Orders(NamedTuple):
     def samples(self, points: Points, cost: Cost) -> _Samples:
         """The points that count, in frequencies over the geometric mean of lowest and highest."""
         pair, mask = points.frf, points.used[:, 0, 0]
-        weights = cost.weights(points, np.ones(points.used.shape))[mask, 0, 0]
+        weights = np.asarray(cost.weights(points, np.ones(points.used.shape)))[mask, 0, 0]
         omega = np.asarray(pair.omega)[mask]
         unit = float(np.sqrt(omega[0] * omega[-1]))
         s = 1j * omega / unit

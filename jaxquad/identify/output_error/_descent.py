@@ -4,13 +4,24 @@ import dataclasses
 from collections.abc import Sequence
 from typing import NamedTuple
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
 from jaxquad._core import minimise_on_host, RUNNING, STALLED
 
+from ..frequency_domain._feedthrough import (
+    find_samples,
+    free_delays,
+    limited,
+    sample_limits,
+    SampleLimit,
+    Solved,
+)
+from ..frequency_domain._parameters import UNCHANGED
 from ..frequency_domain._problem import Problem
+from ..frequency_domain._sampled import Aliases, direct_part, whole_samples
 from ..frequency_domain._solve import Solution, solution_at
 from ._filtered import filtered_point, FilteredPoint, is_filtered
 from ._noise import (
@@ -121,10 +132,12 @@ def descend(
     return stop, steps, message
 
 
-def descend_by_turns(problem: OutputError, max_steps: int, tolerance: float = CLOSE) -> Descent:
+def descend_by_turns(
+    problem: OutputError, max_steps: int, z: Vector | None = None, *, tolerance: float = CLOSE
+) -> Descent:
     """Parameters and noise level by turns: the maximum of the likelihood of both."""
     base, steps = problem.base, 0
-    z = _start_of(problem)
+    z = _start_of(problem) if z is None else z
     # A factor common to all residuals moves no minimum.
     common = len(problem.terms) == problem.terms[0].weights.size == 1
     common = common and not base.quantities and not problem.unknown
@@ -138,6 +151,61 @@ def descend_by_turns(problem: OutputError, max_steps: int, tolerance: float = CL
             break
     solution = _solution(base, z, message, steps)
     return Descent(problem, np.asarray(z), solution, stop.evaluation.reweighted(sizes))
+
+
+def descend_within_samples(
+    problem: OutputError, noise: Noise | None, max_steps: int, *, near: bool
+) -> tuple[Descent, list[SampleLimit]]:
+    """The descent; where a held input passes directly after a free delay, at its best sample.
+
+    With what the sample tells of a delay of which the rest of the record tells less.
+    """
+    base, count = problem.base, problem.base.parameters.count
+    sampled = dataclasses.replace(base, conditions=(UNCHANGED,) * len(problem.terms), aliases=())
+    linear = all(term.motions is not None for term in problem.terms)
+    if linear and eqx.filter_eval_shape(direct_part, base.model) is not None:
+        direct = direct_part(base.model)
+        assert direct is not None
+        samples = [whole_samples(direct[1], term.dt) for term in problem.terms]
+        parts = [
+            Aliases.of_direct(term.dt, np.asarray(n)) if term.hold == "zero" else None
+            for term, n in zip(problem.terms, samples, strict=True)
+        ]
+        sampled = dataclasses.replace(sampled, aliases=tuple(parts))
+    delays = free_delays(sampled)
+
+    def descend_from(
+        sampled: Problem, z: Vector | None, noise: Noise | None, near: bool = True
+    ) -> Descent:
+        these = problem
+        if delays:
+            terms = [
+                term if part is None else dataclasses.replace(term, direct_samples=part.samples)
+                for term, part in zip(problem.terms, sampled.aliases, strict=True)
+            ]
+            limited = dataclasses.replace(base, quantities=sampled.quantities, prior=sampled.prior)
+            these = dataclasses.replace(problem, base=limited, terms=tuple(terms))
+        if noise is None:
+            return descend_by_turns(these, max_steps, z)
+        return descend_with_noise(these, noise, max_steps, z, near=near)
+
+    def solve(sampled: Problem, z: Vector, noise: Noise | None = noise) -> Solved:
+        end = descend_from(sampled, z, noise)
+        rows = [np.asarray(part)[..., :count].reshape(-1, count) for part in end.evaluation.slopes]
+        rows.append(np.asarray(end.solution.sensitivity.prior_slopes)[:, :count])
+        misfit = sum(float(np.sum(np.asarray(part) ** 2)) for part in end.evaluation.misfits)
+        terms = end.problem.terms
+        level = sum(len(term.y) * float(np.sum(np.log(np.asarray(term.weights)))) for term in terms)
+        information = sum((row.T @ row for row in rows), np.zeros((count, count)))
+        return Solved(end, np.asarray(end.z)[:count], misfit - 2 * level, information)
+
+    if not delays:
+        return descend_from(sampled, None, noise, near), []
+    # Which sample it is shows without a noise model.
+    by_level = lambda sampled, z: solve(sampled, z, None)
+    sampled, solved = find_samples(sampled, _start_of(problem)[:count], delays, by_level)
+    limits, z = sample_limits(sampled, solved.z, delays, solve)
+    return descend_from(limited(sampled, limits) if limits else sampled, z, noise), limits
 
 
 def _start_of(problem: OutputError) -> Vector:
@@ -182,7 +250,7 @@ class _End(NamedTuple):
 
 
 def descend_with_noise(
-    problem: OutputError, noise: Noise, max_steps: int, *, near: bool
+    problem: OutputError, noise: Noise, max_steps: int, start: Vector | None = None, *, near: bool
 ) -> Descent:
     """Parameters and noise models by turns: the least mean square of one-step prediction errors.
 
@@ -204,11 +272,12 @@ def descend_with_noise(
 
     def begin(after_output_error: bool) -> Begin:
         if not after_output_error:
-            evaluation = evaluate_misfits(z := _start_of(problem), problem)
+            z = _start_of(problem) if start is None else start
+            evaluation = evaluate_misfits(z, problem)
             if all(np.all(np.isfinite(misfit)) for misfit in evaluation.misfits):
                 sizes = sizes_of(problem, evaluation)
                 return problem.reweighted(sizes), z, evaluation.reweighted(sizes), 0
-        first = descend_by_turns(problem, max_steps, _NEAR)
+        first = descend_by_turns(problem, max_steps, start, tolerance=_NEAR)
         return first.problem, np.asarray(first.z), first.evaluation, first.solution.steps
 
     ends: list[_End] = []

@@ -79,6 +79,8 @@ def is_filtered(problem: OutputError) -> bool:
     base = problem.base
     if problem.unknown or any(term.motions is None for term in problem.terms):
         return False
+    if any(term.direct_samples is not None for term in problem.terms):
+        return False
     plant = linear_model(base.model)
     rational = isinstance(plant, TransferFunction) and 2 <= plant.denominator.size <= _MOST + 1
     plain = (term.whitener is None and term.feedback is None for term in problem.terms)

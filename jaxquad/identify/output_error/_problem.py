@@ -103,7 +103,13 @@ def feedback_response(
     return command
 
 
-def close_loop(plant: Plant, x: Columns, feedback: Series, dt: float) -> Columns:
+def close_loop(
+    plant: Plant,
+    x: Columns,
+    feedback: Series,
+    dt: float,
+    direct_samples: Float[Numbers, "outputs inputs"] | None,
+) -> Columns:
     """What a disturbance `x` of the output becomes in the loop, which rested before: S x.
 
     S = 1 / (1 - G C) as a series in the delay, with the sampled plant G and C from the output to
@@ -114,7 +120,8 @@ def close_loop(plant: Plant, x: Columns, feedback: Series, dt: float) -> Columns
     samples = len(x)
     pulse = jnp.zeros(samples).at[0].set(1.0)
     inputs = pulse if isinstance(plant, TransferFunction) else pulse[:, None]
-    response = jnp.asarray(simulate_linear(plant, inputs, dt)).reshape(samples)
+    response = simulate_linear(plant, inputs, dt, direct_samples=direct_samples)
+    response = jnp.asarray(response).reshape(samples)
     sensitivity = invert_series(pulse - convolve(response, feedback))
     return convolve(sensitivity, x)
 
@@ -155,6 +162,8 @@ class RecordTerm(eqx.Module):
     hold: str = eqx.field(static=True)
     whitener: Whitener | None = None  # of the noise, where it has a model
     feedback: Float[Numbers, " samples"] | None = None  # of a known loop, after a unit of output
+    # After how many samples a held input passes directly, where a free delay would change it.
+    direct_samples: Float[Numbers, "outputs inputs"] | None = None
 
     def weighted(self, x: Float[Numbers, "samples outputs *columns"]) -> Columns:
         """What counts of outputs: within the band, unpredicted by the noise, in units of it."""
@@ -216,12 +225,13 @@ def misfit_and_columns(
         columns = jnp.broadcast_to(shifts, (*term.y.shape, term.y.shape[1]))
     else:
         plant = linear_model(model)
-        simulated = forced_response(plant, term.u, term.dt, term.hold)
+        direct = term.direct_samples
+        simulated = forced_response(plant, term.u, term.dt, term.hold, direct)
         motions = Motions(*term.motions, ())
         columns = free_response(plant, motions, len(term.u), term.dt)
         if term.feedback is not None:
             feedback = jnp.asarray(term.feedback)
-            closed = lambda x: term.weighted(close_loop(plant, x, feedback, term.dt))
+            closed = lambda x: term.weighted(close_loop(plant, x, feedback, term.dt, direct))
             return closed(term.y - simulated), closed(columns)
     return jnp.asarray(term.measured) - term.weighted(simulated), term.weighted(columns)
 

@@ -16,6 +16,7 @@ from jaxquad._core import Message, one_blas_thread, require_x64
 from jaxquad.models import with_arrays
 from jaxquad.records import Record
 
+from ..frequency_domain._feedthrough import DirectDelay, remarks_on_samples
 from ..frequency_domain._fit import check_priors
 from ..frequency_domain._parameters import Free, select_parameters, Tie
 from ..frequency_domain._problem import make_problem, Prior, require_model, require_priors
@@ -40,7 +41,7 @@ from ..uncertainty._error_budget import (
     units_of,
 )
 from ..uncertainty._verdict import identifiability_of, Information, NO_MINIMUM, Verdict
-from ._descent import descend_by_turns, descend_with_noise, Descent, with_fixed_slopes
+from ._descent import descend_within_samples, Descent, with_fixed_slopes
 from ._noise import ARMA, AutoRegressive, Noise, orthonormal, projected_noise
 from ._problem import (
     evaluate_misfits,
@@ -175,12 +176,9 @@ def refine(
         still = [k for k, leaf in enumerate(leaves) if not np.any(np.asarray(leaf))]
         zeros = tuple(k for k in still if k not in changed)
         problem = _with_units(OutputError(base, terms, zeros))
-        if noise is None:
-            descent = descend_by_turns(problem, max_steps)
-        else:
-            descent = descend_with_noise(problem, noise, max_steps, near=near)
+        descent, limits = descend_within_samples(problem, noise, max_steps, near=near)
         check_priors(base, descent.solution)
-        return assess_output_error(descent, records)
+        return assess_output_error(descent, records, remarks_on_samples(base, limits, records))
 
 
 def _term(
@@ -265,7 +263,9 @@ class Reduced(NamedTuple):
     output: Vector  # measured output
 
 
-def assess_output_error(descent: Descent, records: Sequence[Record]) -> Fit:
+def assess_output_error(
+    descent: Descent, records: Sequence[Record], remarks: Sequence[Message] = ()
+) -> Fit:
     """Costs, bounds, covariance and identifiability at the solution."""
     problem, solution = descent.problem, descent.solution
     base, parameters, count = problem.base, problem.base.parameters, problem.base.parameters.count
@@ -301,6 +301,8 @@ def assess_output_error(descent: Descent, records: Sequence[Record]) -> Fit:
         verdict = by_data = no_model(parameters.names, 1 - explained)
     else:
         verdict, by_data = _verdict(descent, reduced, prior, covariance, units)
+    by_user = sum(not isinstance(quantity, DirectDelay) for quantity in base.quantities)
+    pulls = np.asarray(prior.misfit)[:by_user]
     fitted = count + sum(one.nuisance.shape[2] for one in projected)
     samples = sum(one.misfit.size for one in projected)
     fitted_to_noise = taken + sum(sum(m.order) for one in descent.noise for m in one.models)
@@ -325,7 +327,8 @@ def assess_output_error(descent: Descent, records: Sequence[Record]) -> Fit:
         remarks=(
             *_remarks_on_output_error(descent, records, decrement, taken, verdict),
             *_remarks_on_colour(descent, bread, covariance),
-            *remarks_on_priors(prior.misfit, verdict, by_data),
+            *(remarks_on_priors(pulls, verdict, by_data) if pulls.size else ()),
+            *remarks,
         ),
         noise_models=tuple(noise.models for noise in descent.noise),
     )

@@ -237,13 +237,18 @@ def check_plant(plant: Plant, record: Record) -> None:
 
 
 def forced_response(
-    plant: Plant, u: Float[Numbers, "samples inputs"], dt: float | Float[Array, ""], hold: str
+    plant: Plant,
+    u: Float[Numbers, "samples inputs"],
+    dt: float | Float[Array, ""],
+    hold: str,
+    direct_samples: Float[Numbers, "outputs inputs"] | None = None,
 ) -> Float[Array, "samples outputs"]:
     """The outputs under inputs that stood at their first values before the record, from rest."""
     u = u - u[:1]
+    options = {"hold": hold, "direct_samples": direct_samples}
     if isinstance(plant, TransferFunction):
-        return simulate_linear(plant, u[:, 0], dt, hold=hold)[:, None]
-    return simulate_linear(plant, u, dt, hold=hold)
+        return simulate_linear(plant, u[:, 0], dt, **options)[:, None]
+    return simulate_linear(plant, u, dt, **options)
 
 
 def unknown_motions(plant: Plant, duration: float) -> Motions:

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Complex, Float, Inexact, PyTree
 
 from jaxquad._compile import hasty_options, Jit
-from jaxquad._core import as_array
+from jaxquad._core import as_array, concrete_values
 from jaxquad.models import evaluate_response, simulate_linear, TransferFunction
 
 from ..frequency_domain._parameters import Parameters
@@ -373,7 +373,8 @@ def draw_models(
     check_drawable(fit, hold_undetermined)
     covariance = known_covariance(fit)
     logarithmic = np.array(fit.parameters.logarithmic[: len(fit.names)])
-    here, units = np.asarray(fit.values), np.asarray(fit.units)
+    here = np.asarray(concrete_values(fit.values, "Fit.ensemble"))
+    units = np.asarray(fit.units)
     at_zero = [fit.names.index(bound.name) for bound in fit.verdict.bounds]
     along = covariance[at_zero] / np.diagonal(covariance)[at_zero, None]
     # In other units than its value a parameter is mixed up with others near zero.
@@ -385,7 +386,7 @@ def draw_models(
     logarithmic[at_zero] = False
     variances, directions = np.linalg.eigh(covariance)
     root = directions * np.sqrt(np.maximum(variances, 0.0))
-    spread = _Spread(root, tuple(at_zero), along, here, units, logarithmic)
+    spread = _Spread(root, tuple(at_zero), along, fit.values, units, logarithmic)
     drawn = jax.tree.leaves(_drawn(fit.parameters, fit.model, spread, as_array(scores)))
     places = (*fit.parameters.places[: len(fit.names)], *(p for p, _ in fit.parameters.ties))
     leaves, structure = jax.tree.flatten(fit.model)
@@ -401,7 +402,7 @@ class _Spread(NamedTuple):
     root: Matrix  # of the covariance of relative changes
     at_zero: tuple[int, ...]  # parameters at or near their bound
     along: Float[np.ndarray, "bounds parameters"]  # what changes with each of these
-    here: Float[np.ndarray, " parameters"]
+    here: Float[Array | np.ndarray, " parameters"]
     units: Float[np.ndarray, " parameters"]
     logarithmic: Bool[np.ndarray, " parameters"]
 

@@ -17,6 +17,7 @@ from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Complex, Float
 
@@ -24,6 +25,7 @@ from jaxquad._core import pytree_node
 from jaxquad.spectra import FrequencyResponse
 
 from ..frequency_domain._cost import expected_cost, mix, Mixing, Points
+from ..frequency_domain._parameters import namespace_of, Numbers
 from ..frequency_domain._problem import Problem
 from ..frequency_domain._solve import Solution
 
@@ -81,6 +83,13 @@ class Noise(NamedTuple):
 
 def scaled_inverse(matrix: Matrix) -> Matrix:
     """Pseudo-inverse after unit scaling of the diagonal."""
+    return _scaled_inverse(matrix.tobytes(), len(matrix))
+
+
+@ft.lru_cache(maxsize=64)
+def _scaled_inverse(elements: bytes, count: int) -> Matrix:
+    # Ten parts of an assessment ask for the inverse of the same matrix.
+    matrix = np.frombuffer(elements).reshape(count, count)
     scale = np.sqrt(np.diagonal(matrix))
     scale = np.where(scale > 0, scale, 1.0)
     unit = matrix / np.outer(scale, scale)
@@ -96,11 +105,11 @@ def calibrated_covariance(bread: Matrix, noise: Noise) -> Matrix:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class ResponseTerm:
-    """One frequency response as the fit sees it."""
+    """One frequency response as the fit sees it; of JAX for what a derivative needs."""
 
     frf: FrequencyResponse
-    misfit: Float[np.ndarray, "frequencies outputs inputs 2"]
-    slopes: Float[np.ndarray, "frequencies outputs inputs 2 all"]
+    misfit: Float[Numbers, "frequencies outputs inputs 2"]
+    slopes: Float[Numbers, "frequencies outputs inputs 2 all"]
     weights: Float[np.ndarray, "frequencies outputs inputs 2"]
     mixing: Mixing | None
     count: int  # of free parameters, the first of all
@@ -132,19 +141,21 @@ class ResponseTerm:
         return self.weights[..., None] * mix(self.mixing, rows, twice=True)
 
     @ft.cached_property
-    def ratio(self) -> Complex[np.ndarray, "frequencies outputs inputs"]:
+    def ratio(self) -> Complex[Numbers, "frequencies outputs inputs"]:
         """Measurement over model."""
-        return np.exp(-self.misfit[..., 0] - 1j * self.misfit[..., 1])
+        exp = namespace_of(self.misfit).exp
+        return exp(-self.misfit[..., 0] - 1j * self.misfit[..., 1])
 
     @ft.cached_property
-    def measured_error(self) -> Float[np.ndarray, "frequencies outputs inputs"]:
+    def measured_error(self) -> Float[Numbers, "frequencies outputs inputs"]:
         """Random error relative to the model."""
-        return np.asarray(self.frf.random_error) * np.abs(self.ratio) ** self.frf.error_exponent
+        xp, power = namespace_of(self.misfit), self.frf.error_exponent
+        return xp.asarray(self.frf.random_error) * xp.abs(self.ratio) ** power
 
     @ft.cached_property
-    def error(self) -> Float[np.ndarray, "frequencies outputs inputs"]:
+    def error(self) -> Float[Numbers, "frequencies outputs inputs"]:
         """The same, but never 0: an exact response would have infinite weight."""
-        return np.maximum(self.measured_error, 1e-7)
+        return namespace_of(self.misfit).maximum(self.measured_error, 1e-7)
 
 
 @pytree_node
@@ -170,7 +181,7 @@ class Discrepancy:
 class Mixture(NamedTuple):
     """A posterior mean of squared amplitudes by length, and the probability of none."""
 
-    powers: Float[np.ndarray, " lengths"]
+    powers: Float[Numbers, " lengths"]
     none: float
 
     @property
@@ -364,68 +375,79 @@ def find_discrepancy(
 ) -> tuple[Mixture, Mixture]:
     """The discrepancy of a fit, under the prior and under one of a larger mean. `moving` are the
     parameters that can take up a misfit: not those that a bound holds against it."""
-    columns = np.asarray(moving, int)
-    rows = np.concatenate([prior.slopes[:, columns], prior.misfit[:, None]], axis=1)
-    # Products of slopes and misfit under noise alone; along the components of the kernels, gains of
-    # unit amplitude over the noise, and these products.
-    products, gains, along, errors = rows.T @ rows, [], [], []
+    columns, xp = np.asarray(moving, int), namespace_of(prior.misfit)
+    # `np.median` takes ten times as long for few values.
+    error = xp.sort(xp.concatenate([record.error[record.used] for record in records]))
+    typical = 0.5 * (error[error.size // 2] + error[-(error.size // 2) - 1])
+    lowest = xp.log(0.1 * typical)
+    amplitudes = xp.exp(xp.linspace(lowest, xp.maximum(0.0, lowest + 1.4), _AMPLITUDES))
+    power = xp.concatenate([np.zeros(1), amplitudes])[:, None] ** 2
+    # Products of slopes and misfit under noise alone; what a discrepancy takes of them, and the
+    # logarithm of the power that it adds, by length and amplitude.
+    rows = xp.concatenate([prior.slopes[:, columns], prior.misfit[:, None]], axis=1)
+    products, damped, grown = rows.T @ rows, 0.0, 0.0
     for record, counted in zip(records, points, strict=True):
-        used, error = record.used, record.error
-        inverse = np.where(used, error**-2 / counted.shared, 0.0)
-        rows = np.concatenate([record.slopes[..., columns], record.misfit[..., None]], axis=-1)
-        rows = np.where(used[..., None, None], rows, 0.0)
+        inverse = xp.where(record.used, record.error**-2 / counted.shared, 0.0)
+        rows = xp.concatenate([record.slopes[..., columns], record.misfit[..., None]], axis=-1)
+        rows = xp.where(record.used[..., None, None], rows, 0.0)
         weighted = (inverse[..., None, None] * rows).reshape(-1, len(products))
         products += weighted.T @ rows.reshape(-1, len(products))
-        parts = _components(np.asarray(record.frf.omega), used, inverse, rows)
-        gains.append(parts[0])
-        along.append(parts[1])
-        errors.append(error[used])
-    gains, along = np.concatenate(gains, axis=1), np.concatenate(along, axis=1)
-    error = np.sort(np.concatenate(errors))  # `np.median` takes ten times as long for few values
-    typical = float(0.5 * (error[error.size // 2] + error[-(error.size // 2) - 1]))
-    lowest = np.log(0.1 * typical)
-    amplitudes = np.exp(np.linspace(lowest, max(0.0, lowest + 1.4), _AMPLITUDES))
+        omega = np.asarray(counted.frf.omega)
+        taken, added = _damping(omega, record.used, inverse, rows, power)
+        damped, grown = damped + taken, grown + added
     # Restricted likelihoods by length and amplitude: the parameters' own changes are projected out.
-    power, width = np.concatenate([[0.0], amplitudes])[None, :, None] ** 2, len(products)
-    damped = power / (1 + power * gains[:, None, :])
-    left = products - np.reshape(damped @ along, (*damped.shape[:2], width, width))
-    scale = np.sqrt(np.maximum(np.diagonal(products), 1e-300))
-    left = left / np.outer(scale, scale) + 1e-11 * np.eye(width)
+    scale = xp.sqrt(xp.maximum(xp.diagonal(products), 1e-300))
+    left = (products - damped) / xp.outer(scale, scale) + 1e-11 * np.eye(len(products))
     slopes, misfit = left[..., :-1, :-1], left[..., :-1, -1]
-    step = np.linalg.solve(slopes, misfit[..., None])[..., 0]
-    rest = (left[..., -1, -1] - np.sum(misfit * step, axis=-1)) * scale[-1] ** 2
-    volume = np.linalg.slogdet(slopes)[1]
-    grown = np.sum(np.log1p(power * gains[:, None, :]), axis=-1)
+    step = xp.linalg.solve(slopes, misfit[..., None])[..., 0]
+    rest = (left[..., -1, -1] - xp.sum(misfit * step, axis=-1)) * scale[-1] ** 2
+    volume = xp.linalg.slogdet(slopes)[1]
     likelihoods = -0.5 * (grown + volume + rest)
-    relative = np.exp(likelihoods - np.max(likelihoods))
+    relative = xp.exp(likelihoods - xp.max(likelihoods))
 
     def mix(mean: float) -> Mixture:
         """The posterior under a mass at zero, and a gamma distribution above it."""
-        cell = amplitudes * np.log(amplitudes[1] / amplitudes[0])
-        density = cell * amplitudes ** (_SHAPE - 1) * np.exp(-_SHAPE * amplitudes / mean)
-        density *= (1 - _NONE) / max(float(np.sum(density)), 1e-300) / len(relative)
+        cell = amplitudes * xp.log(amplitudes[1] / amplitudes[0])
+        density = cell * amplitudes ** (_SHAPE - 1) * xp.exp(-_SHAPE * amplitudes / mean)
+        density *= (1 - _NONE) / xp.maximum(xp.sum(density), 1e-300) / len(relative)
         none, some = _NONE * relative[0, 0], relative[:, 1:] * density
-        total = none + np.sum(some)
-        return Mixture(np.sum(some * amplitudes**2, axis=1) / total, float(none / total))
+        total = none + xp.sum(some)
+        return Mixture(xp.sum(some * amplitudes**2, axis=1) / total, none / total)
 
     return mix(MEAN), mix(_OTHER * MEAN)
 
 
-def _components(
-    omega: np.ndarray, used: np.ndarray, inverse: np.ndarray, columns: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Components of the kernels in which noise and discrepancy are both diagonal."""
-    pairs = np.any(used, axis=0)
-    inverse, columns = inverse[:, pairs].T, np.moveaxis(columns[:, pairs], 0, 1)
+def _damping(
+    omega: np.ndarray, used: np.ndarray, inverse: Numbers, columns: Numbers, power: Numbers
+) -> tuple[Numbers, Numbers]:
+    """What discrepancies of each length and `power` take of products of columns, and add to noise.
+
+    `columns` have the two parts of the misfit, and then the products' rows, on their last axes.
+    """
+    pairs, xp = np.any(used, axis=0), namespace_of(columns)
+    inverse, columns = inverse[:, pairs].T, xp.moveaxis(columns[:, pairs], 0, 1)
     basis = kernel_basis(omega.tobytes())[:, None]  # length pair frequency rank
-    weighted = np.swapaxes(basis * inverse[:, :, None], 2, 3)
-    gains, turned = np.linalg.eigh(weighted @ basis)
-    along = weighted @ columns.reshape(*columns.shape[:2], -1)
+    weighted = xp.swapaxes(basis * inverse[:, :, None], 2, 3)
+    kernel, along = weighted @ basis, weighted @ columns.reshape(*columns.shape[:2], -1)
+    if xp is not np:  # eigenvectors have no derivatives where values are equal
+        along = along.reshape(*along.shape[:3], *columns.shape[2:]) * SHARES[:, None]
+        along = jnp.swapaxes(along, 2, 3)  # length pair part rank column
+        power = power[:, :, None, None, None]
+        shares = (SHARES**2)[:, None, None]
+        grown = np.eye(len(kernel[0, 0])) + power * shares * kernel[:, None, :, None]
+        shape = (*grown.shape[:-1], along.shape[-1])
+        solved = jnp.linalg.solve(grown, jnp.broadcast_to(along[:, None], shape))
+        taken = power[:, 0, 0] * jnp.einsum("lpsrv,lapsrw->lavw", along, solved)
+        return taken, jnp.sum(jnp.linalg.slogdet(grown)[1], axis=(2, 3))
+    # Components in which noise and discrepancy are both diagonal.
+    gains, turned = np.linalg.eigh(kernel)
     along = (np.swapaxes(turned, 2, 3) @ along).reshape(*gains.shape, *columns.shape[2:])
     along = along * SHARES[:, None]
     products = along[..., :, None] * along[..., None, :]
-    gains = np.maximum(gains, 0.0)[..., None] * SHARES**2
-    return gains.reshape(len(basis), -1), products.reshape(len(basis), -1, columns.shape[-1] ** 2)
+    gains = (np.maximum(gains, 0.0)[..., None] * SHARES**2).reshape(len(basis), 1, -1)
+    damped, width = power / (1 + power * gains), columns.shape[-1]
+    taken = damped @ products.reshape(len(basis), -1, width**2)
+    return taken.reshape(*taken.shape[:2], width, width), np.sum(np.log1p(power * gains), axis=-1)
 
 
 @ft.lru_cache(maxsize=16)

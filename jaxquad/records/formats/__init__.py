@@ -20,17 +20,26 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .._errors import located, printable, ReadError, warn
 from .._firmwares import registered_logs
-from .._log import allowance, check_size, flattened, Log as Log, Signals, Table as Table
+from .._log import (
+    allowance,
+    check_size,
+    flattened,
+    located,
+    Log as Log,
+    printable,
+    ReadError,
+    Signals,
+    Table as Table,
+    warn,
+)
 from . import (
-    _arrays,
     _betaflight,
     _betaflight_columns,
     _by_library,
     _crazyflie,
-    _csv,
     _dataflash,
+    _tables,
     _ulog,
 )
 
@@ -111,9 +120,9 @@ class Reader(NamedTuple):
 
 READERS: Mapping[str, Reader] = {
     "npz": Reader(
-        "a NumPy archive", _arrays.sniff_numpy, _arrays.load_numpy, (".npz", ".npy")
+        "a NumPy archive", _tables.sniff_numpy, _tables.load_numpy, (".npz", ".npy")
     ),
-    "mat": Reader("a MATLAB file", _arrays.sniff_matlab, _arrays.load_matlab, (".mat",)),
+    "mat": Reader("a MATLAB file", _tables.sniff_matlab, _tables.load_matlab, (".mat",)),
     "dataflash": Reader(
         "an ArduPilot DataFlash log", _dataflash.sniff, _dataflash.load, (".bin",)
     ),
@@ -140,7 +149,7 @@ READERS: Mapping[str, Reader] = {
         "a ROS 2 bag", _by_library.sniff_bag, ft.partial(_in_child, "rosbag", 2.0),
         (".mcap", ".db3"),
     ),
-    "csv": Reader("a text table", _csv.sniff, _csv.load, (".csv", ".tsv", ".txt")),
+    "csv": Reader("a text table", _tables.sniff_text, _tables.load_text, (".csv", ".tsv", ".txt")),
 }  # fmt: skip
 
 

@@ -11,8 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int, Integer
 
-from .._errors import ReadError
-from .._log import Log, Table
+from .._log import Log, ReadError, Table
 from ._betaflight_columns import scaled, with_derived, with_mixed_axes
 from ._betaflight_frames import (
     ADJUSTMENT,
@@ -132,11 +131,9 @@ def _log(data: bytes, header: Header) -> tuple[dict[str, Table], list[str]]:
 
 
 def _table(
-    values: Int[np.ndarray, "samples fields"],
-    letter: str,
-    time: Float[np.ndarray, " samples"],
+    values: Int[np.ndarray, "samples fields"], letter: str, time: Float[np.ndarray, " samples"],
     header: Header,
-) -> Table:
+) -> Table:  # fmt: skip
     """Views of the decoded columns with the units that the header gives them."""
     frame = header.frames[letter]
     columns = {

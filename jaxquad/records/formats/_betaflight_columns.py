@@ -15,8 +15,7 @@ import numpy as np
 from jaxtyping import Float, UInt
 
 from .._channel import unwrap
-from .._errors import ReadError
-from .._log import Log, number_in, Table
+from .._log import Log, number_in, ReadError, Table
 
 
 Columns = Mapping[str, np.ndarray]

@@ -12,8 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Int
 
-from .._errors import ReadError
-from .._log import check_size
+from .._log import check_size, ReadError
 
 
 MARKER = b"H Product:Blackbox flight data recorder by Nicholas Sherlock\n"

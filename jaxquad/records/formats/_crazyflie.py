@@ -14,8 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from .._channel import unwrap
-from .._errors import ReadError
-from .._log import Log, Table
+from .._log import Log, ReadError, Table
 
 
 _WINDOW = 60  # s: the most between the two events with which reading goes on

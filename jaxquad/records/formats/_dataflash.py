@@ -14,8 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .._errors import ReadError
-from .._log import changes_of, describe_skips, Log, number_in, Table
+from .._log import changes_of, describe_skips, Log, number_in, ReadError, Table
 
 
 _FORMAT_TYPE = 128
@@ -73,14 +72,9 @@ _FIRMWARE = re.compile(r"\b[A-Z][\w:]*\w V\d+\.\d+[^\0,]*")
 
 
 def _log(
-    logged: Iterable[tuple[_Format, Mapping[str, np.ndarray]]],
-    scaling: _Scaling,
-    remarks: list[str],
-    stamped: Stamped,
-    texts: Iterable[str],
-    *,
-    applied: bool,
-) -> Log:
+    logged: Iterable[tuple[_Format, Mapping[str, np.ndarray]]], scaling: _Scaling,
+    remarks: list[str], stamped: Stamped, texts: Iterable[str], *, applied: bool,
+) -> Log:  # fmt: skip
     """The messages of each type with a time stamp as a table, or one per instance: `IMU[0]`.
 
     Their columns have their own scale `applied` or not; `texts` of VER and MSG name the firmware.

@@ -9,8 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from .._errors import ReadError
-from .._log import changes_of, describe_skips, Log, Table
+from .._log import changes_of, describe_skips, Log, ReadError, Table
 
 
 _LARGEST = 65_535  # bytes of a message: its length is a 16-bit number

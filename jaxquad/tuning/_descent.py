@@ -1,12 +1,30 @@
-"""L-BFGS for many problems at once: each evaluation serves all of them."""
+"""Two descents: L-BFGS, where an evaluation serves many problems, and Levenberg-Marquardt."""
 
 import functools as ft
 from collections.abc import Callable, Generator, Sequence
 from typing import NamedTuple
 
 import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, PyTree
+
+from jaxquad.simulation import SampleResult, scan_loop
+
+from ._cost import SMOOTHING
+from ._objective import (
+    is_gated,
+    Limit,
+    Mean,
+    Objective,
+    Penalty,
+    QUANTITIES,
+    risk_text,
+    split_quantities,
+    stability_gate,
+)
+from ._problem import Coordinates, Problem
 
 
 Vector = Float[np.ndarray, " n"]
@@ -83,14 +101,11 @@ _Searching = Generator[Vector, tuple[float, Vector], tuple[_Point | None, int]]
 
 
 def minimise(
-    evaluate: Evaluate,
-    start: Float[np.ndarray, "problems n"],
-    method: LBFGS,
-    *,
+    evaluate: Evaluate, start: Float[np.ndarray, "problems n"], method: LBFGS, *,
     on: Bool[np.ndarray, " problems"] | None = None,
     enough: Callable[[int, float], bool] = lambda problem, value: False,
     pairs: Sequence[Pairs] | None = None,
-) -> Descent:
+) -> Descent:  # fmt: skip
     """Run all problems in lockstep: `evaluate(z, on)` gives values and gradients of those `on`.
 
     `enough(problem, value)` ends a problem early. `pairs` are those of a descent before.
@@ -211,3 +226,134 @@ def _within(low: tuple[float, float], slope: float, high: tuple[float, float]) -
     bend = (high[1] - low[1] - slope * width) / width**2
     share = -slope / (2 * bend * width) if bend > 0 else 0.5
     return low[0] + width * float(np.clip(share, 0.1, 0.9))
+
+
+_LEAST = 1e-12
+
+
+class GaussNewton(eqx.Module):
+    """Least squares on the tracking errors of all members, by Levenberg-Marquardt.
+
+    Residuals are sqrt(t) times the errors, so tracking counts as ITSE, the integral of t error^2;
+    ITAE itself is no sum of squares. Each member's errors are in units of their size at the start,
+    which stands for the logarithm, and penalties enter by their square roots.
+
+    **Arguments:**
+
+    - `steps`: the most steps.
+    - `tolerance`: relative, of cost and parameters.
+    - `stride`: samples that share a residual.
+
+    **Raises:**
+
+    - `ValueError`: `steps` or `stride` is below 1. A tune raises it for terms other than ITAE, for
+        risks other than the mean and for limits, none of which are sums of squares.
+    """
+
+    steps: int = 30
+    tolerance: float = 1e-4
+    stride: int = 10
+
+    def __check_init__(self):
+        if self.steps < 1 or self.stride < 1:
+            raise ValueError(f"steps is {self.steps} and stride {self.stride}: give 1 or more")
+
+
+class _Squares(eqx.Module):
+    coordinates: Coordinates
+    problem: Problem
+    penalties: Sequence[Penalty]
+    scale: Float[Array, "axes members"]  # of the squared errors' sums
+    stride: int = eqx.field(static=True)
+
+
+def require_squares(objective: Objective, limits: Sequence[Limit]) -> None:
+    """Raise ValueError for what is no sum of squares."""
+    odd = [name for name in objective.terms if name != "itae"]
+    odd += [f"limit on {limit.quantity}" for limit in limits]
+    if not isinstance(objective.risk, Mean):
+        odd.append(f"risk {risk_text(objective.risk)}")
+    if odd:
+        raise ValueError(
+            f"GaussNewton cannot minimise {', '.join(odd)}: no sum of squares. Take LBFGS(), "
+            "or the term itae with penalties and the mean risk"
+        )
+
+
+def minimise_squares(
+    coordinates: Coordinates, problem: Problem, objective: Objective,
+    start: Float[np.ndarray, " n"], method: GaussNewton,
+) -> tuple[Float[np.ndarray, " n"], int, bool]:  # fmt: skip
+    """Where the descent ended, its steps, and whether it converged."""
+    import lineax as lx
+    import optimistix as optx
+
+    units = jnp.ones((problem.linear.assumed_inertia.shape[0], problem.members))
+    squares = _Squares(coordinates, problem, objective.penalties, units, method.stride)
+    size = jnp.sum(_errors(jnp.asarray(start), squares) ** 2, axis=0)
+    squares = eqx.tree_at(
+        lambda s: s.scale, squares, jnp.sum(size, axis=0, keepdims=True) + 0 * size
+    )
+    solver = optx.LevenbergMarquardt(
+        rtol=method.tolerance, atol=method.tolerance, linear_solver=lx.Normal(lx.Cholesky())
+    )
+    with jax.numpy_dtype_promotion("standard"):
+        solution = optx.least_squares(
+            _linearised, solver, jnp.asarray(start), squares, max_steps=method.steps, throw=False
+        )
+    done = bool(solution.result == optx.RESULTS.successful)
+    return np.asarray(solution.value), int(solution.stats["num_steps"]), done
+
+
+def _residuals(z: Float[Array, " n"], squares: _Squares) -> tuple[Array, Array]:
+    members = squares.problem.members
+    tracking = _errors(z, squares) / jnp.sqrt(squares.scale + _LEAST)[None]
+    controller = squares.coordinates.controller_at(z)
+    flights, linear = split_quantities({p.quantity for p in squares.penalties} | {"abscissa"})
+    numbers = squares.problem.linear.numbers(controller, linear, SMOOTHING)
+    if flights:
+        numbers |= squares.problem.in_time(controller, flights)
+    gate = stability_gate(numbers["abscissa"])
+    costs = [
+        p(
+            QUANTITIES[p.quantity].combine_axes(numbers[p.quantity]),
+            gate if is_gated(p.quantity) else gate + 1,
+        )
+        for p in squares.penalties
+    ]
+    bounds = jnp.sqrt(jnp.stack(costs) + _LEAST) if costs else jnp.zeros((0, members))
+    # ITSE goes as the square of ITAE: half of it, for the same change of the cost.
+    return tracking / np.sqrt(2 * members), bounds / np.sqrt(members)
+
+
+_linearised = eqx.filter_custom_jvp(_residuals)
+
+
+@_linearised.def_jvp
+def _with_columns(primals: PyTree, tangents: PyTree) -> PyTree:
+    # A column for each parameter, one flight after the other: linearised, the loop would store all.
+    (z, _), run = primals, lambda z: _residuals(z, primals[1])
+    column = lambda unit: jax.jvp(run, (z,), (unit,))[1]
+    columns = jax.lax.map(column, jnp.eye(z.size, dtype=z.dtype))
+    return run(z), jax.tree.map(lambda c: jnp.tensordot(tangents[0], c, 1), columns)
+
+
+class _Errors(eqx.Module):
+    """Stores the error of every sample, rad."""
+
+    def begin(self, like: Array) -> None:
+        return None
+
+    def update(self, total: None, now: SampleResult) -> tuple[None, Array]:
+        return total, now.reference - now.angle
+
+
+def _errors(z: Float[Array, " n"], squares: _Squares) -> Float[Array, "points axes members"]:
+    """sqrt(t) error every few samples, t from the last event."""
+    problem, stride = squares.problem, squares.stride
+    loop = problem.loop_around(squares.coordinates.controller_at(z))
+    stored = scan_loop(loop, problem.flight, _Errors())[1]
+    index = np.arange(int(problem.window.first), int(problem.window.last) + 1, stride)
+    since = np.min([np.where(index >= a, index - a, np.inf) for a, _ in problem.parts], axis=0)
+    weight = np.sqrt(since * loop.dt * loop.dt * stride)
+    return stored[index] * weight[:, None, None]

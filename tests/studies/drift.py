@@ -1,0 +1,108 @@
+"""How often a clock that drifts, a battery that falls and an uneven motor are remarked.
+
+    python tests/studies/drift.py --draws 50
+
+A rate axis (gain 40, lag .03 s, delay .01 s) flies a sweep of 60 s, in gusts and with a noisy gyro,
+without feedback or under a controller. Then the outputs' stamps gain some ppm, the gain falls by
+15 % over the record, or the motor has .02 s up and .05 s down. One table, no file; seeds from 0.
+"""
+
+import argparse
+from typing import NamedTuple
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+from systems import Chirp, coloured
+
+import jaxquad as jq
+
+
+jq.enable_x64()
+CONTROLLERS = {"P": (0.15, 0, 0), "PID": (0.15, 0.05, 0.004), "none": (0, 0, 0)}
+DT, FINE, TRUE = 0.004, 4, {"gain": 40.0, "lag": 0.03, "delay": 0.01}
+
+
+class Setting(NamedTuple):
+    """How a record is made; the noise is that of the gyro, in rad/s."""
+
+    name: str
+    ppm: float = 0.0
+    fall: float = 0.0  # of the gain, over the record
+    lags: tuple[float, float] = (0.03, 0.03)  # s, of a motor that speeds up, and that slows down
+    controller: str = "P"  # or PID, or none
+    quantum: float = 0.0  # of the command
+    noise: float = 0.05
+    gust: float = 0.1
+
+
+SETTINGS = [
+    Setting("healthy, P"),
+    Setting("healthy, PID, command of 50 steps", controller="PID", quantum=0.02),
+    Setting("clock 50 ppm, P", ppm=50),
+    Setting("clock 20 ppm, P, calm", ppm=20, noise=0.01, gust=0.02),
+    Setting("clock -50 ppm, PID", ppm=-50, controller="PID"),
+    Setting("clock 50 ppm, PID, command of 50 steps", ppm=50, controller="PID", quantum=0.02),
+    Setting("clock 50 ppm, open loop", ppm=50, controller="none", noise=0.5),
+    Setting("gain -15 %, P", fall=0.15),
+    Setting("motor .02 s up, .05 s down, P", lags=(0.02, 0.05)),
+]
+
+
+def fly(setting: Setting, draws: int) -> tuple[np.ndarray, ...]:
+    """Time (samples), reference (samples), inputs and outputs (draws, samples)."""
+    rng, time = np.random.default_rng(0), np.arange(round(66 / DT)) * DT
+    gust = setting.gust * np.stack([coloured(rng, time.size, DT, 2.0) for _ in range(draws)])
+    noise = setting.noise * rng.standard_normal((draws, time.size))
+    kp, ki, kd = CONTROLLERS[setting.controller]
+    reference = Chirp(0.5, 60.0, 60.0)(time) * 0.3
+    gain = TRUE["gain"] * (1 - setting.fall * (time / time[-1] - 0.5))
+    ago, step = int(np.ceil(TRUE["delay"] / DT)), DT / FINE
+    late = ago * DT - TRUE["delay"]
+    motor, rate, whole, slope, before = np.zeros((5, draws))
+    u, y = np.zeros((2, draws, time.size))
+    for k in range(time.size):
+        y[:, k] = rate + noise[:, k]
+        error = (reference[k] / kp if kp else 0.0) - y[:, k]
+        whole, slope = whole + ki * DT * error, 0.8 * slope + 0.2 * (y[:, k] - before) / DT
+        before = y[:, k].copy()
+        u[:, k] = kp * error + whole - kd * slope if kp else reference[k]
+        if setting.quantum:
+            u[:, k] = setting.quantum * np.round(u[:, k] / setting.quantum)
+        for part in range(FINE):  # the held command of `delay` ago; exact steps of the lag
+            place = k - ago + (part >= FINE * (1 - late / DT))
+            command = u[:, place] if place >= 0 else np.zeros(draws)
+            up, down = setting.lags
+            share = step / np.where(command > motor, up, down)
+            rate += step * gain[k] * (command - (motor - command) * np.expm1(-share) / share)
+            motor = command + (motor - command) * np.exp(-share)
+        rate += DT * TRUE["gain"] * gust[:, k] * (kp > 0)
+    if setting.ppm:
+        there = np.clip(time * (1 - 1e-6 * setting.ppm), 0, time[-1])
+        y = CubicSpline(time, y, axis=1)(there)
+    return time, reference, u, y
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--draws", type=int, default=50)
+    draws = parser.parse_args().draws
+    print("setting | clock remarked, % | anything remarked, % | coverage of gain, lag, delay, %")
+    for setting in SETTINGS:
+        time, reference, inputs, outputs = fly(setting, draws)
+        clock, every, inside = 0, 0, np.zeros(3)
+        for u, y in zip(inputs, outputs, strict=True):
+            references = None if setting.controller == "none" else reference
+            record = jq.Record(time, u, y, references, hold=DT)
+            frf = jq.frequency_response(record, np.geomspace(0.6, 50.0, 60))
+            fit = jq.fit(jq.LaggedIntegrator(30.0, lag=0.05, delay=0.005), frf)
+            kinds = [remark.kind for remark in (*frf.remarks, *fit.remarks)]
+            clock, every = clock + ("clock" in kinds), every + bool(kinds)
+            for k, (name, value) in enumerate(TRUE.items()):
+                low, high = fit.interval(name)
+                inside[k] += low <= value <= high
+        shares = [f"{100 * x / draws:.0f}" for x in (clock, every, *inside)]
+        print(f"{setting.name} | {shares[0]} | {shares[1]} | {' '.join(shares[2:])}", flush=True)
+
+
+if __name__ == "__main__":
+    main()
