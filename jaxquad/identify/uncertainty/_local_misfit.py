@@ -52,36 +52,40 @@ def find_local_misfit(
     budget: ErrorBudget, points: Sequence[Points], floor: float, least: float
 ) -> LocalMisfit | None:
     """Where the misfit is more than `least` random errors, beyond chance; a discrepancy of the
-    amplitude `floor` counts as noise. None where the noise explains it everywhere."""
+    amplitude `floor` wide as noise. None where the noise explains it everywhere."""
     from scipy.special import chdtrc, fdtrc
 
-    tried, found, inverse = 0, [], scaled_inverse(budget.bread)
+    tried, candidates, inverse = 0, [], scaled_inverse(budget.bread)
     for number, (record, counted) in enumerate(zip(budget.records, points, strict=True)):
         omega, covariance = np.asarray(record.frf.omega), record.frf.log_noise_covariance
         for _, o, i in record.pairs:
             some = np.flatnonzero(record.used[:, o, i])
             some = some[np.argsort(omega[some], kind="stable")]
-            own = 1 / np.asarray(counted.shared)[some, o, i]
+            independent = 1 / np.asarray(counted.shared)[some, o, i]
             errors = record.error[some, o, i, None] ** 2 + (floor * SHARES) ** 2
-            squares = own * np.sum(np.asarray(record.misfit)[some, o, i] ** 2 / errors, axis=1)
+            squares = independent * np.sum(
+                np.asarray(record.misfit)[some, o, i] ** 2 / errors, axis=1
+            )
             rows = record.rows[some, o, i, :, : budget.count]
             taken = np.sum((rows @ inverse) * rows, axis=(1, 2))
             starts, ends = _windows(np.log2(omega[some]))
-            sums = [np.append(0.0, np.cumsum(x)) for x in (squares, own, taken)]
+            sums = [np.append(0.0, np.cumsum(x)) for x in (squares, independent, taken)]
             total, count, taken = (x[ends] - x[starts] for x in sums)
             freedom = np.maximum(2 * count - taken, count)
             if covariance is None:
                 chances = chdtrc(freedom, total)
             else:
-                shared = own[:, None] * np.asarray(covariance)[np.ix_(some, some)] * own
+                shared = (
+                    independent[:, None] * np.asarray(covariance)[np.ix_(some, some)] * independent
+                )
                 area = np.pad(shared.cumsum(axis=0).cumsum(axis=1), ((1, 0), (1, 0)))
                 doubt = area[ends, ends] - area[starts, ends] - area[ends, starts]
                 of_noise = 2 * count**2 / np.maximum(doubt + area[starts, starts], 1e-9)
                 chances = fdtrc(freedom, of_noise, total / freedom)
-            kept = 2 * count >= _FEWEST
-            kept[0] = True
-            tried += int(np.sum(kept))
-            clear = kept & (total > least**2 * freedom)
+            wide = 2 * count >= _FEWEST
+            wide[0] = True
+            tried += int(np.sum(wide))
+            clear = wide & (total > least**2 * freedom)
             if not np.any(clear):
                 continue
             # The narrowest window that holds most of the misfit.
@@ -91,8 +95,8 @@ def find_local_misfit(
             edges = float(omega[some[starts[k]]]), float(omega[some[ends[k] - 1]])
             ratio = float(np.sqrt(total[k] / freedom[k]))
             local = LocalMisfit(ratio, *edges, bool(k), (number, o, i))
-            found.append((float(np.min(chances[clear])), -float(np.max(beyond)), local))
-    chance, _, clearest = min(found, key=lambda each: each[:2], default=(1.0, 0.0, None))
+            candidates.append((float(np.min(chances[clear])), -float(np.max(beyond)), local))
+    chance, _, clearest = min(candidates, key=lambda one: one[:2], default=(1.0, 0.0, None))
     return clearest if tried * chance < _CHANCE else None
 
 
@@ -129,8 +133,8 @@ def with_resonance(budget: ErrorBudget, local: LocalMisfit | None) -> ErrorBudge
     number, o, i = local.place
     record, inverse = budget.records[number], scaled_inverse(budget.bread)
     used, s = record.used[:, o, i], 1j * np.asarray(record.frf.omega)
-    each = (0, 1, 2, 3)
-    dot = lambda one, other: np.tensordot(one, other, axes=(each, each))
+    axes = (0, 1, 2, 3)
+    dot = lambda one, other: np.tensordot(one, other, axes=(axes, axes))
     lowered, moves = [0.0], [np.zeros((budget.count, budget.count))] * 2
     for place in np.geomspace(local.low / _OUTSIDE, local.high * _OUTSIDE, _PLACES).tolist():
         for damping in _DAMPINGS:
@@ -140,9 +144,9 @@ def with_resonance(budget: ErrorBudget, local: LocalMisfit | None) -> ErrorBudge
             parts = np.zeros((*record.misfit.shape, 2))
             parts[used, o, i] = np.stack([np.real(logs), np.imag(logs)], axis=1)[used]
             rows = np.asarray(mix(record.mixing, record.weights[..., None] * parts))
-            along, own = dot(record.rows[..., : budget.count], rows), dot(rows, rows)
-            left = own - along.T @ inverse @ along
-            if np.linalg.eigvalsh(left)[0] <= _DISTINCT * np.trace(own):
+            along, size_of_rows = dot(record.rows[..., : budget.count], rows), dot(rows, rows)
+            left = size_of_rows - along.T @ inverse @ along
+            if np.linalg.eigvalsh(left)[0] <= _DISTINCT * np.trace(size_of_rows):
                 continue
             pull = dot(rows, record.residual) - along.T @ inverse @ budget.gradient
             size = np.linalg.solve(left, pull)
