@@ -200,7 +200,9 @@ def in_loop(
         slope = share / dt * (error - smooth)
         u = kp * error + ki * integral + kd * slope + (w[0] if at_input else 0.0)
         moved = advance(held, x[:n], np.array([u]), np.zeros(1))
-        return np.append(moved, [integral + dt * error, smooth + share * (error - smooth)]), [u, y]
+        return np.append(
+            moved, [integral + dt * error, smooth + share * (error - smooth)]
+        ), np.array([u, y])
 
     return linear(step, n + 2, 2)
 
@@ -274,10 +276,11 @@ def _draw(rng: np.random.Generator) -> Setting | None:
     def record() -> jq.Record:
         time = dt * np.arange(samples)
         if not closed:
-            if smooth:
+            if smooth and wave is not None:
+                drive = wave
                 fine = step / 6  # of Simpson's rule: the input's mean over a step
                 mean = lambda t: (
-                    (wave(t - fine / 2) + 4 * wave(t) + wave(t + fine / 2))[:, None] / 6
+                    (drive(t - fine / 2) + 4 * drive(t) + drive(t + fine / 2))[:, None] / 6
                 )
                 y = respond_smoothly(plant, mean, step * np.arange(samples), fine)[:, 0]
             else:
