@@ -1,4 +1,4 @@
-"""Imports go from higher subjects to lower ones, and through their faces."""
+"""Imports go from higher subjects to lower ones, and through their faces; names say something."""
 
 import ast
 from collections.abc import Iterator
@@ -77,6 +77,49 @@ def test_the_file_format_of_a_firmware_of_the_package_is_among_the_formats():
         log = firmware_log(name)
         assert log is not None, f"enter {name} in _LOGS of jaxquad/__init__.py"
         assert log.reader is None, f"enter the reader of {name} in READERS of records/formats"
+
+
+TESTS = ROOT / "tests"
+LOCAL = {path.stem: path for path in TESTS.glob("*.py")}
+MEASURED = sorted(
+    path for name in ("benchmarks", "studies") for path in (TESTS / name).glob("*.py")
+)
+
+
+def reached(path: Path, seen: frozenset[Path] = frozenset()) -> frozenset[Path]:
+    """A file of the tests, and the files of the tests that it imports."""
+    local = LOCAL | {other.stem: other for other in path.parent.glob("*.py")}
+    for name in imports(path) if path not in seen else ():
+        if len(name) == 1 and name[0] in local:
+            seen = reached(local[name[0]], seen | {path})
+    return seen | {path}
+
+
+@pytest.mark.parametrize("path", MEASURED, ids=lambda path: path.name)
+def test_what_pages_quote_is_measured_through_public_calls(path):
+    for file in reached(path):
+        names = [*imports(file), *names_of_imports(file), *attributes(file)]
+        private = [".".join(name) for name in names if is_private(name)]
+        line = f"{path.relative_to(ROOT)} needs {private} in {file.relative_to(ROOT)}"
+        assert not private, f"{line}: measure what a user calls"
+
+
+def names_of_imports(path: Path) -> Iterator[tuple[str, ...]]:
+    for node in ast.walk(parsed(path)):
+        if isinstance(node, ast.ImportFrom) and not node.level:
+            yield from ((*(node.module or "").split("."), name.name) for name in node.names)
+
+
+def attributes(path: Path) -> Iterator[tuple[str, ...]]:
+    """As `jq.room._file`."""
+    for node in ast.walk(parsed(path)):
+        if isinstance(node, ast.Attribute):
+            name = ast.unparse(node).split(".")
+            yield ("jaxquad", *name[1:]) if name[0] == "jq" else tuple(name)
+
+
+def is_private(name: tuple[str, ...]) -> bool:
+    return name[0] == "jaxquad" and any(part.startswith("_") for part in name[1:])
 
 
 VAGUE = {

@@ -100,7 +100,6 @@ from .output_error._verify import (
     Verification as Verification,
     verify as verify,
 )
-from .uncertainty._assess import MISFIT as MISFIT
 from .uncertainty._derived import (
     check_drawable as check_drawable,
     draw_models as draw_models,
@@ -115,6 +114,7 @@ from .uncertainty._derived import (
     Tied as Tied,
 )
 from .uncertainty._error_budget import Discrepancy as Discrepancy
+from .uncertainty._local_misfit import MISFIT as MISFIT
 from .uncertainty._verdict import (
     Bound as Bound,
     Combination as Combination,

@@ -7,6 +7,7 @@ from ._estimators import (
     DOMINATED as DOMINATED,
     EARLY as EARLY,
     Estimator as Estimator,
+    in_hertz as in_hertz,
     JointInputOutput as JointInputOutput,
     LocalPolynomial as LocalPolynomial,
     Periodic as Periodic,

@@ -42,18 +42,18 @@ PAIRS = (
         "scipy's solve alone",
     ),
     Pair(
-        "the same, the minimisation alone",
-        "test_fit_speed.py",
-        "test_solve",
-        "test_scipy_least_squares",
-        "scipy",
+        "1000 of these fits by `fit_batch`, values alone",
+        "test_batch_speed.py",
+        "test_ours",
+        "test_scipy",
+        "scipy's solves",
     ),
     Pair(
-        "state-space fit, 20 parameters",
+        "state-space fit, 20 parameters, with covariance and verdict",
         "test_state_space_speed.py",
-        "test_solve",
+        "test_fit_with_all_its_doubts",
         "test_scipy_least_squares",
-        "scipy",
+        "scipy's solve alone",
     ),
     Pair(
         "output error, 22,500 samples, 4 parameters, with all doubts",
@@ -99,31 +99,34 @@ PAIRS = (
         "C, two threads, a simpler model",
     ),
     Pair(
-        "tune of 3 gains over 64 members, compiled",
+        "tune of wc, wo and a map of six knots over 64 members, compiled",
         "test_tune_speed.py",
         "test_tune_with_everything_compiled",
-        "test_scipy_with_the_same_gradient",
-        "scipy L-BFGS-B, the same gradient",
+        "test_scipy_with_the_same_objective",
+        "scipy L-BFGS-B, the same objective by `jq.simulate`",
     ),
 )
 PRINTED = (
     "test_ensemble_speed.py",
     "test_device_speed.py",
-    "test_lbfgs_speed.py",
     "test_batch_of_logs.py",
 )
 HEAD = """\
 # Performance
 
 Made by `python tests/benchmarks/page.py` on an idle machine: {machine}.
-Peers run in the same minutes on the same machine, so read ratios; seconds move from machine to
-machine.
+Ours are public calls as the documents show them. Peers run in the same minutes on the same machine,
+so read ratios; seconds move from machine to machine.
 
 ## Time to the first answer
 
 Whole processes, the median of {rounds}: without compiled programs on disk (`JAXQUAD_CACHE=off`),
 and the second time, with those that the first has left (the command line's default).
 
+"""
+ENGINE = """\
+The first two lines are a loop written for `jq.simulation.run_ensemble` beside the same in C: the
+engine alone, on one thread.
 """
 TAIL = """
 ## On a GPU
@@ -152,7 +155,7 @@ def main() -> None:
     text += "\n## Beside others\n\nMedians, warm.\n\n"
     heads = ["job", "here", "beside", "there", "there / here"]
     text += _table(heads, [row for pair in PAIRS if (row := _compared(pair))])
-    text += "\n## Ensembles, devices, the tuner's own steps\n\n```text\n"
+    text += f"\n## Ensembles, devices, logs\n\n{ENGINE}\n```text\n"
     text += "\n".join(line for file in PRINTED for line in _printed(file))
     hour = f"an hour at 1 kHz, 4 inputs, 6 outputs: {_run_script('long_record.py')}"
     text += f"\n{fill(hour, 110, subsequent_indent='    ')}\n```\n{TAIL}"

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxquad._compile import engine
+from jaxquad import engine
 
 
 STEPS, ROUNDS = 5000, 5

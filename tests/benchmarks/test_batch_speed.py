@@ -13,7 +13,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from airframe import Airframe
-from descent import OneSolve
 from scipy.optimize import least_squares
 
 import jaxquad as jq
@@ -69,7 +68,7 @@ def test_ours(benchmark, case):
     truth, measured, error = case
     model = Airframe(*(jnp.asarray(value) for value in START))
     frfs = [frf_of(*each) for each in zip(measured, error, strict=True)]
-    found = benchmark(lambda: jq.identify.fit_batch(model, frfs, cost=OneSolve()))
+    found = benchmark(lambda: jq.identify.fit_batch(model, frfs))
     benchmark.extra_info["steps"] = float(np.mean(found.steps))
     assert np.all(found.converged)
     assert _good(np.asarray(found.values), truth) > 0.99

@@ -3,11 +3,10 @@
     python -m pytest tests/benchmarks/test_compile_speed.py -o addopts= -s
 
 Ten seconds at 2 ms of a three-axis rig under three LADRC, and of three axes under an adaptive LADRC
-with least squares; one loop and 48 inertias. Nothing is read from a cache. "brief" options are
-those of `jq.tune`, "light" ones those of docs/how_to.md for a `jax.jit` of your own. What was
-traced once is not traced again. Then, in seconds by the clock, an ensemble beside `jax.vmap` of
-single loops, and `jq.evaluate` by itself, which chooses its options, beside the same under XLA's
-own in the same run.
+with least squares; one loop and 48 inertias, under XLA's own options and under "light" ones.
+Nothing is read from a cache. What was traced once is not traced again. Then, in seconds by the
+clock, an ensemble beside `jax.vmap` of single loops, and `jq.evaluate` by itself, which chooses its
+options, beside the same under XLA's own in the same run.
 """
 
 import time
@@ -18,7 +17,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxquad._compile import brief_options, compiler_options
 from jaxquad.control import AdaptiveLADRC, certainty_equivalence, LADRC, RecursiveInertia
 from jaxquad.loops import Loop
 from jaxquad.models import DecoupledAxes, quanser_hover
@@ -59,7 +57,7 @@ def test_a_gradient(make, members):
     inertia = jnp.asarray(np.multiply.outer([J0, J0, 2 * J0], spread))
     cost = lambda gains, inertia: jnp.mean(evaluate(make(gains, inertia), HAPPENS).itae)
     functions = {"value": cost, "gradient": jax.value_and_grad(cost)}
-    for name, options in (("XLA's own", None), ("brief", brief_options()), ("light", LIGHT)):
+    for name, options in (("XLA's own", None), ("light", LIGHT)):
         for what, function in functions.items():
             program = jax.jit(function, compiler_options=options)
             tracing, lowered = spent(lambda p=program: p.lower(GAINS, inertia))
@@ -108,7 +106,7 @@ def test_an_evaluation_that_chooses_its_options(members):
     took = time.perf_counter() - began
     arrays, rest = eqx.partition((loop, HAPPENS), eqx.is_array)
     whole = lambda arrays: evaluate(*eqx.combine(arrays, rest))
-    program = jax.jit(whole, compiler_options=compiler_options())
+    program = jax.jit(whole)
     plain = lambda: jax.block_until_ready(program(arrays))
     np.testing.assert_allclose(plain().itae, first.itae, rtol=1e-9)
     own, other = (1e3 * min(timed(call) for _ in range(8)) for call in (run, plain))

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxquad._compile import compiler_options
+from jaxquad import engine
 
 
 jax.config.update("jax_enable_x64", True)
@@ -38,7 +38,9 @@ def given(baseline, dtype, members=MEMBERS, steps=STEPS):
 
 
 def compiled(function, args) -> Any:
-    return jax.jit(function, compiler_options=compiler_options()).lower(*args).compile()
+    width = {"xla_cpu_prefer_vector_width": engine().vector_bits}
+    options = {name: bits for name, bits in width.items() if bits is not None}
+    return jax.jit(function, compiler_options=options).lower(*args).compile()
 
 
 def mean(tuning, inertia, load):

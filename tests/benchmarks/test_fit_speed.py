@@ -3,8 +3,9 @@
     python -m pytest tests/benchmarks/test_fit_speed.py -o addopts= --benchmark-columns=min,median
 
 Both start from the same values on the same response, fit logarithms of five parameters (gain,
-lag, damping, natural frequency, delay) under the same weights, and must agree. Ours also gives
-covariance, identifiability and remarks; `descend` is the minimisation alone, as scipy's call is.
+lag, damping, natural frequency, delay) and must agree within a fifth of a standard error. Ours is
+`jq.fit` as it is called: it solves again with the model's own weights, and gives covariance,
+identifiability and remarks.
 """
 
 import jax
@@ -12,7 +13,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from airframe import Airframe
-from descent import descend, OneSolve, problem_of
 from scipy.optimize import least_squares
 
 import jaxquad as jq
@@ -77,13 +77,6 @@ def test_scipy_least_squares(benchmark, frf):
 
 
 @pytest.mark.benchmark(group="fit")
-def test_solve(benchmark, frf):
-    problem = problem_of(_model(), None, frf, ERROR)
-    found = benchmark(lambda: descend(problem))
-    np.testing.assert_allclose(np.exp(found), _peer(frf), rtol=1e-5)
-
-
-@pytest.mark.benchmark(group="fit")
 def test_fit_with_all_its_doubts(benchmark, frf):
-    fit = benchmark(lambda: jq.fit(_model(), frf, cost=OneSolve()))
-    np.testing.assert_allclose(fit.values, _peer(frf), rtol=1e-5)
+    fit = benchmark(lambda: jq.fit(_model(), frf))
+    assert np.all(np.abs(fit.values - _peer(frf)) < 0.2 * fit.standard_errors)

@@ -21,9 +21,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxquad._core import align, per_member
 from jaxquad.control import LADRC
-from jaxquad.loops import Loop
+from jaxquad.loops import align, Loop, per_member
 from jaxquad.models import Allocation, Attitude, MotorLag, Multirotor, QUANSER_HOVER
 from jaxquad.simulation import MotorDrive, Saturation, Scenario, simulate
 

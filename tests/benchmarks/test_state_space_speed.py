@@ -4,15 +4,14 @@
 
 Eight states of a helicopter near hover, six outputs, three inputs, 40 frequencies. The peer solves
 all frequencies in one call of `numpy.linalg.solve` and differentiates numerically, as MINPACK does.
-Timed is the descent alone, which is all that scipy's call does: what a fit needs beside it, the
-slopes by all parameters, free or fixed, comes once per fit.
+Ours is `jq.fit` as it is called: it solves again with the model's own weights, and gives
+covariance, identifiability and remarks, for which it takes the slopes by all parameters.
 """
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from descent import descend, OneSolve, problem_of
 from scipy.optimize import least_squares
 
 import jaxquad as jq
@@ -107,11 +106,11 @@ def test_scipy_least_squares(benchmark):
 
 
 @pytest.mark.benchmark(group="state-space fit")
-def test_solve(benchmark):
-    made = problem_of(model(START), NAMES, frf_of(MEASURED), ERROR)
-    found = benchmark(lambda: descend(made))
-    values = np.asarray(made.parameters.values(found))
-    np.testing.assert_allclose(values, peer(), rtol=1e-4, atol=1e-6)
+def test_fit_with_all_its_doubts(benchmark):
+    frf = frf_of(MEASURED)
+    fit = benchmark(lambda: jq.fit(model(START), frf, free=NAMES))
+    # The model's weights in place of the measurement's move each by less than half its error.
+    assert np.all(np.abs(fit.values - peer()) < 0.5 * fit.standard_errors)
 
 
 FITS = 200
@@ -129,9 +128,9 @@ def test_batch_of_200(benchmark):
     noise = rng.standard_normal((2, FITS, *truth.shape))
     responses = truth * (1 + ERROR * (noise[0] + 1j * noise[1]))
     responses[0] = MEASURED
-    frfs, options = [frf_of(each) for each in responses], {"free": NAMES, "cost": OneSolve()}
-    found = benchmark(lambda: jq.identify.fit_batch(model(START), frfs, **options))
-    np.testing.assert_allclose(found.values[0], peer(), rtol=1e-4, atol=1e-6)
+    frfs = [frf_of(each) for each in responses]
+    found = benchmark(lambda: jq.identify.fit_batch(model(START), frfs, free=NAMES))
+    np.testing.assert_allclose(found.values[0], peer(), rtol=0.01, atol=1e-3)
     assert np.all(found.converged)
 
 

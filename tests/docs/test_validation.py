@@ -90,3 +90,29 @@ def test_a_study_continues_where_it_stopped_and_makes_its_tables(tmp_path):
     # Most of an error is the records' own noise.
     assert np.all(np.abs(errors - best) < 3 * bound)
     assert len(by_parameter["rows"]) == plant.truth.size
+
+
+def test_a_plant_of_new_ground_is_repeated_by_its_seed_and_number():
+    from new_ground_plants import draw, true_combination  # pyright: ignore
+
+    one, same, other = draw(5, 3), draw(5, 3), draw(6, 3)
+    assert one.labels == same.labels != other.labels
+    np.testing.assert_array_equal(one.record().outputs, same.record().outputs)
+    truth = {"lag": 0.5, "delay": 0.25, "gain": -2.0}
+    assert true_combination("lag + delay", ("lag", "delay"), truth) == 0.75
+    assert true_combination("- lag + delay", ("lag", "delay"), truth) == -0.25
+    assert true_combination("gain^2 / (lag delay)", (), truth) == 32.0
+
+
+@pytest.mark.slow
+def test_new_ground_continues_where_it_stopped_and_makes_its_tables(tmp_path):
+    from new_ground import run, table  # pyright: ignore
+
+    path = tmp_path / "drawn.jsonl"
+    with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):  # as a user's
+        run(5, range(1), 0, 1, path)
+        run(5, range(3), 0, 1, path)
+    rows = [json.loads(line) for line in path.read_text().splitlines()]
+    assert [row["plant"] for row in rows] == [0, 1, 2]
+    plants, _ = table(rows, 5)
+    assert plants["rows"][0][:2] == ["all", 3] and "--seed 5" in plants["command"]

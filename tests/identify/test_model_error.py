@@ -1,7 +1,10 @@
 """What a model leaves unexplained: intervals that count it, halves of the band, further terms."""
 
 import dataclasses
+import types
 
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -146,3 +149,74 @@ def test_many_frequencies_may_hold_one_twice():
     omega = np.append(np.geomspace(0.6, 60.0, 299), 60.0)
     for root in _error_budget.kernel_basis(omega.tobytes()):
         np.testing.assert_allclose(root[-2], root[-1], atol=1e-9)
+
+
+class Notched(eqx.Module):
+    """A model behind a notch."""
+
+    model: jq.LaggedIntegrator
+    frequency: float  # rad/s
+    quality: float
+
+    def frequency_response(self, omega):
+        s = jax.lax.complex(jnp.zeros_like(omega), omega) / self.frequency
+        factor = (s**2 + 1) / (s**2 + s / self.quality + 1)
+        return self.model.frequency_response(omega) * factor[:, None, None]
+
+
+def flown_notch(seed):
+    """Sharp where it is slow, as a sweep through an integrator in white noise."""
+    omega = np.geomspace(2.0, 70.0, 60)
+    plant = Notched(jq.LaggedIntegrator(40.0, 0.03, 0.01), 90.0, 3.0)
+    error = (0.09 * (omega / 70) ** 2)[:, None, None]
+    frf = response_of(plant, omega=omega)
+    exact, white = np.asarray(frf.response), np.random.default_rng(seed).standard_normal((2, 60))
+    response = exact * (1 + error * (white[0] + 1j * white[1])[:, None, None])
+    errors = jq.spectra.independent_errors(frf.omega, 2 * (error * np.abs(exact)) ** 2)
+    return dataclasses.replace(
+        frf, response=jnp.asarray(response), random_error=jnp.asarray(error), errors=errors
+    )
+
+
+def test_a_notch_is_remarked_where_it_is_and_intervals_hold_what_it_moves():
+    for seed in range(4):
+        fit = jq.fit(jq.LaggedIntegrator(48.0, 0.024, 0.011), flown_notch(seed))
+        assert fit.discrepancy is not None
+        assert fit.discrepancy.none > 0.05, "a stationary discrepancy does not see it"
+        (text,) = (text for text in fit.remarks if text.kind == "misfit")
+        assert " times from " in text and " to 70 rad/s" in text
+        low, high = fit.interval("delay")
+        assert low < 0.01 < high, (seed, low, high)
+        assert fit.interval("delay", model_error=False)[0] > 0.01
+
+
+def test_a_right_model_has_no_local_misfit(right):
+    assert not any(remark.kind == "misfit" for fit in right for remark in fit.remarks)
+
+
+def refitted(fit, **found):
+    """The fit, with refits that end with these misfits by the number of the term's parameters."""
+
+    def run(model, frfs, options, rounds):
+        extra = getattr(model, "extra", np.zeros(0))
+        chi_squared = found.get(f"of_{len(extra)}", fit.chi_squared)
+        values, cost = np.concatenate([fit.values, extra]), chi_squared * 2 * fit.points
+        return types.SimpleNamespace(model=model, values=values, cost=cost, chi_squared=chi_squared)
+
+    origin = dataclasses.replace(fit.origin, run=run)
+    return dataclasses.replace(fit, origin=origin, cost=fit.chi_squared * 2 * fit.points)
+
+
+def test_no_further_term_is_named_whose_misfit_is_larger():
+    """Refits that end in a poorer minimum, as does the refit without a term."""
+    fit = jq.fit(START, response_of(DAMPED, seed=1))
+    worse = refitted(fit, of_0=9e4, of_1=8e4, of_2=7e4, of_3=6e4).explain()
+    assert worse.best is None and "None of" in worse.summary
+
+
+def test_the_simplest_of_terms_that_explain_a_misfit_alike_is_named():
+    """Without noise, the costs of those that explain all of it differ by rounding."""
+    fit = jq.fit(START, response_of(DAMPED, error=1e-7))
+    alike = refitted(fit, of_1=1.0, of_2=0.9, of_3=0.1).explain()
+    assert len(alike.best.model.term.names) == 1, str(alike)
+    assert "to 1.0 random errors" in alike.summary

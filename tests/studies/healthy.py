@@ -113,9 +113,11 @@ def drawn(path: Path) -> list[dict]:
     return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
 
 
-def state_of_sources() -> str:
+def state_of_sources(*studies: str) -> str:
     """The folder of draws: those of another package, or of other flights, do not count."""
-    return _digest([*sorted((ROOT / "jaxquad").rglob("*.py")), *_own("healthy", "bounds")])
+    return _digest(
+        [*sorted((ROOT / "jaxquad").rglob("*.py")), *_own(*(studies or ("healthy", "bounds")))]
+    )
 
 
 def of_scipy() -> str:

@@ -14,6 +14,7 @@ from pathlib import Path
 HERE = Path(__file__).parent
 STEPS = (
     ["healthy.py", "--draws", "400", "--workers", "2"],
+    ["new_ground.py", "--plants", "1000"],
     ["coverage_short.py", "--draws", "200"],
     ["ringdown.py", "--draws", "40"],
     ["nonlinearity.py", "--draws", "100"],

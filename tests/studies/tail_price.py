@@ -9,7 +9,6 @@ Each optimum is flown by 1024 members that no tune saw, and 65,536 others tell h
 
 import argparse
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -24,14 +23,13 @@ sys.path.append(str(Path(__file__).parents[1]))
 jax.config.update("jax_enable_x64", True)
 
 from tuning_case import (  # noqa: E402
-    coordinates_of,
     cost_at,
     ensemble,
     flight,
-    linear_members,
     loop,
     objective,
-    pose,
+    peaks_at,
+    start_of,
     STARTS,
 )
 
@@ -39,10 +37,7 @@ import jaxquad as jq  # noqa: E402
 
 
 PEAK, SLICE = 3.6, 2048
-SMOOTHING = 1e-6  # 1/s, of the abscissa
-FREE = ["ladrc.wc", "ladrc.wo", "map.values"]
 START = loop(STARTS["certainty equivalence"])
-COORDINATES = coordinates_of(START.controller, FREE)
 ACTIVE, CYCLES = 256, 12  # members that the limit is kept on at once; how often others join them
 SETTINGS = {  # the limit, and the slices of 2048 members that it is kept on
     "no limit": (PEAK, 0),
@@ -53,63 +48,63 @@ SETTINGS = {  # the limit, and the slices of 2048 members that it is kept on
 }
 
 
-def cost_of(members) -> Callable:
-    """The objective of flights: value, gradient, and the numbers of each member."""
-    posed = pose(START.controller, members)
-    return lambda z: cost_at(jnp.asarray(z)[None], COORDINATES, posed)
+@eqx.filter_jit
+def fly(z, members, happens):
+    """The objective of flights, and the ITAE of each member."""
+    return cost_at(z, START.controller, members, happens)
 
 
 @eqx.filter_jit
-def peaks(z, coordinates, loops):
+def value_and_slope(z, members, happens):
+    cost = lambda z: cost_at(z, START.controller, members, happens)[0]
+    return jax.value_and_grad(cost)(z)
+
+
+@eqx.filter_jit
+def peaks(z, members):
     """ln Ms of every member."""
-    found = loops.numbers(coordinates.controller_at(z), ["sensitivity_peak"], SMOOTHING)
-    return jnp.log(jnp.max(found["sensitivity_peak"], axis=0))
+    return jnp.log(peaks_at(z, START.controller, members)["sensitivity_peak"][0])
 
 
 @eqx.filter_jit
-def slopes(z, coordinates, loops):
-    return jax.jacfwd(peaks)(z, coordinates, loops)
+def slopes(z, members):
+    return jax.jacfwd(peaks)(z, members)
 
 
 def of_all(z, slices) -> np.ndarray:
-    return np.stack([np.asarray(peaks(jnp.asarray(z), COORDINATES, x)) for x in slices])
+    return np.concatenate([np.asarray(peaks(jnp.asarray(z), x)) for x in slices])
 
 
-def solve(cost, z, bound: float, drawn, slices, others) -> np.ndarray:
+def sliced(members) -> list:
+    return [members.take(range(k, k + SLICE)) for k in range(0, members.size, SLICE)]
+
+
+def solve(cost, z, bound: float, drawn, slices) -> np.ndarray:
     """SLSQP, until no member of the slices is beyond the bound by more than 0.05 %."""
-    known: list[tuple[int, int]] = []
+    active: list[int] = []
     for _ in range(CYCLES if slices else 3):
-        level = of_all(z, slices) - np.log(bound) if slices else np.full((1, 1), -np.inf)
-        near = [(int(s), int(k)) for s, k in zip(*np.nonzero(level > -0.07), strict=True)]
-        if known and level.max() < 5e-4:
+        level = of_all(z, slices) - np.log(bound) if slices else np.full(1, -np.inf)
+        near = [int(k) for k in np.argsort(-level)[:60] if level[k] > -0.07]
+        if active and level.max() < 5e-4:
             break
-        near = sorted(near, key=lambda at: -level[at])[:60]
-        known = list(dict.fromkeys([*known, *near]))[-ACTIVE:]
-        z = _minimise(cost, z, np.log(bound), known, put_into(others, drawn, known))
+        active = list(dict.fromkeys([*active, *near]))[-ACTIVE:]
+        z = _minimise(cost, z, np.log(bound), len(active), drawn.take(filled(active)))
     return z
 
 
-def put_into(others, drawn, places):
-    """The members at the places (slice, member) instead of the first of the others."""
-    for s in sorted({s for s, _ in places}):
-        rows = [k for k, (number, _) in enumerate(places) if number == s]
-        worst = drawn[s].take([places[k][1] for k in rows])
-        others = others.replaced(np.array(rows), linear_members(worst))
-    return others
+def filled(places: list[int]) -> list[int]:
+    """So many that one compiled program does for all."""
+    return [*places, *[0] * (ACTIVE - len(places))]
 
 
-def _minimise(cost, z, bound: float, known, loops) -> np.ndarray:
-    def value(z):
-        found = cost(z)
-        return float(found.value[0]), np.asarray(found.gradient[0])
-
-    constraints, count = [], len(known)
+def _minimise(cost, z, bound: float, count: int, members) -> np.ndarray:
+    constraints = []
     if count:
-        level = lambda z: bound - np.asarray(peaks(jnp.asarray(z), COORDINATES, loops))[:count]
-        slope = lambda z: -np.asarray(slopes(jnp.asarray(z), COORDINATES, loops))[:count]
+        level = lambda z: bound - np.asarray(peaks(jnp.asarray(z), members))[:count]
+        slope = lambda z: -np.asarray(slopes(jnp.asarray(z), members))[:count]
         constraints = [{"type": "ineq", "fun": level, "jac": slope}]
     return minimize(
-        value, z, jac=True, method="SLSQP", constraints=constraints,
+        cost, z, jac=True, method="SLSQP", constraints=constraints,
         bounds=[(x - 0.25, x + 0.25) for x in z], options={"ftol": 1e-9, "maxiter": 100},
     ).x  # fmt: skip
 
@@ -126,22 +121,22 @@ class Row(NamedTuple):
         return f"{numbers} | {self.beyond:.3g}"
 
 
-def row_of(z, cost, fresh, test) -> Row:
-    found = fresh(z)
-    itae = np.degrees(np.asarray(found.numbers["itae"][0]))
+def row_of(z, members, fresh, test) -> Row:
+    own = float(fly(jnp.asarray(z), *members)[0])
+    cost, itae = fly(jnp.asarray(z), *fresh)
+    itae = np.degrees(np.asarray(itae[0]))
     beyond = int(np.sum(of_all(z, test) > np.log(PEAK)))
-    own = float(cost(z).cost[0])
-    return Row(own, float(found.cost[0]), float(itae.mean()), float(itae.max()), beyond)
+    return Row(own, float(cost), float(itae.mean()), float(itae.max()), beyond)
 
 
 def tuned(key) -> np.ndarray:
     """z of a tune."""
     found = jq.tune(
-        START, ensemble(), flight(), free=FREE, objective=objective(), key=key, fresh=None,
+        START, ensemble(), flight(), objective=objective(), key=key, fresh=None,
         limits=[jq.Limit("sensitivity_peak", at_most=PEAK)], progress=False,
     )  # fmt: skip
     print(f"{found.tail}, {found.evaluations} gradients", flush=True)
-    return coordinates_of(found.controller, FREE).start
+    return start_of(found.controller)
 
 
 def main() -> None:
@@ -149,22 +144,27 @@ def main() -> None:
     parser.add_argument("--keys", type=int, default=4)
     count = parser.parse_args().keys
     draw = lambda key, n: ensemble().fresh(START, n, key)
+    with_flight = lambda members: (members, members.flight(flight()))
     far = jax.random.key(4242)
     fold = jax.random.fold_in
-    test = [linear_members(draw(fold(far, k), SLICE)) for k in range(32)]
-    fresh = cost_of(draw(far, 1024))
+    test = sliced(draw(fold(far, 1), 32 * SLICE))
+    fresh = with_flight(draw(far, 1024))
     rows: dict[str, list[Row]] = {}
     for key in map(jax.random.key, range(count)):
-        cost = cost_of(ensemble().draw(START, 64, key))
-        drawn = [draw(fold(key, 2 + k), SLICE) for k in range(32)]
-        searched = [linear_members(members) for members in drawn]
-        others = linear_members(ensemble().draw(START, ACTIVE, fold(key, 1)))
+        members = with_flight(ensemble().draw(START, 64, key))
+
+        def cost(z, members=members):
+            value, slope = value_and_slope(jnp.asarray(z), *members)
+            return float(value), np.asarray(slope)
+
+        drawn = draw(fold(key, 2), 32 * SLICE)
+        searched = sliced(drawn)
         first = tuned(key)
         ends = {"`jq.tune`": first}
         for name, (bound, slices) in SETTINGS.items():
-            ends[name] = solve(cost, first, bound, drawn[:slices], searched[:slices], others)
+            ends[name] = solve(cost, first, bound, drawn, searched[:slices])
         for name, z in ends.items():
-            rows.setdefault(name, []).append(row_of(z, cost, fresh, test))
+            rows.setdefault(name, []).append(row_of(z, members, fresh, test))
             print(name, rows[name][-1], flush=True)
     print("| limit kept on | ITAE mean / worst | cost | on fresh members | of 65,536 beyond |")
     for name, found in rows.items():

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 from scipy.optimize import minimize
-from tuning_case import minimise
 
 from jaxquad.tuning import LBFGS
+from jaxquad.tuning._descent import minimise
 
 
 ROUGH = LBFGS(evaluations=200, tolerance=1e-12, gradient_tolerance=1e-8, longest_step=10.0)

@@ -6,13 +6,14 @@ import jax
 import numpy as np
 import pytest
 from html_pages import tuned_by_hand
-from tuning_case import ensemble, equivalent, flight, linear_members, loop, objective
+from tuning_case import ensemble, equivalent, flight, loop, objective
 
 from jaxquad.loops import loop_numbers
 from jaxquad.models import DecoupledAxes
 from jaxquad.simulation import scenario
 from jaxquad.tuning import LBFGS, Limit, Tail, tune
 from jaxquad.tuning._cost import take_members
+from jaxquad.tuning._problem import linear_loops
 
 
 pytestmark = pytest.mark.usefixtures("compiled_quickly")
@@ -21,8 +22,8 @@ pytestmark = pytest.mark.usefixtures("compiled_quickly")
 def test_the_worst_take_the_places_of_others():
     drawn = [ensemble().draw(loop(), 6, jax.random.key(seed)) for seed in range(3)]
     worst = take_members(drawn[1:], [(1, 4), (0, 0), (1, 2)])
-    mine, first, second = map(linear_members, drawn)
-    found = mine.replaced(np.array([5, 1, 0]), linear_members(worst))
+    mine, first, second = (linear_loops(members, None) for members in drawn)
+    found = mine.replaced(np.array([5, 1, 0]), linear_loops(worst, None))
     for pick in (lambda x: x.assumed_inertia[0], lambda x: x.axes.lag[0], lambda x: x.delay):
         a, b, c = map(pick, (mine, first, second))
         np.testing.assert_array_equal(pick(found), [c[2], b[0], a[2], a[3], a[4], c[4]])

@@ -3,12 +3,13 @@
 import functools as ft
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from tuning_case import (
     ensemble,
     equivalent,
-    evaluator,
+    EVENTS,
     flight,
     ladrc,
     loop,
@@ -21,6 +22,8 @@ from jaxquad.control import LADRC, PD
 from jaxquad.ensembles import Uniform
 from jaxquad.simulation import scenario, Step
 from jaxquad.tuning import LBFGS, Limit, Objective, tune
+from jaxquad.tuning._cost import count_members, evaluate_cost, stack_copies, Subproblem
+from jaxquad.tuning._problem import make_problem, select_coordinates, TimeSpan
 
 
 MEMBERS, KEY = 16, jax.random.key(0)
@@ -33,6 +36,28 @@ def run(controller, members=None, **options):
     drawn = ensemble().draw(loop(), MEMBERS, KEY) if members is None else members
     given = {"objective": objective(), "fresh": None, "progress": False} | options
     return tune(loop(controller), drawn, flight(), **given)
+
+
+def evaluator(controller, free, limits=(), multiplier=0.0):
+    """The cost of a tune and its gradient by z, and the z of the controller.
+
+    `multiplier` is that of every limit and member.
+    """
+    drawn, coordinates = ensemble().draw(loop(), MEMBERS, KEY), select_coordinates(controller, free)
+    problem = make_problem(controller, drawn, flight(), span=TimeSpan(EVENTS))
+    subproblem = Subproblem(
+        stack_copies(objective(), 1), stack_copies(tuple(limits), 1),
+        tuple(jnp.full((1, count_members(problem, x)), multiplier) for x in limits),
+        jnp.full((1, len(limits)), 4.0), jnp.ones(1, bool), jnp.full(1, -0.75),
+    )  # fmt: skip
+
+    def cost(z):
+        found = evaluate_cost(
+            jnp.asarray(z)[None], jnp.ones(1, bool), coordinates, problem, subproblem
+        )
+        return float(found.value[0]), np.asarray(found.gradient[0])
+
+    return cost, coordinates.start
 
 
 HALF_GAIN = ["ladrc.wc", "ladrc.wo", *HALVED, "map.values"]
@@ -54,7 +79,7 @@ CASES = {
 @pytest.mark.parametrize("case", CASES)
 def test_the_gradient_is_that_of_differences_for_every_parameter(case):
     controller, free, limits = CASES[case]
-    cost, start = evaluator(controller, free, members=MEMBERS, limits=limits, multiplier=0.1)
+    cost, start = evaluator(controller, free, limits, multiplier=0.1)
     _, gradient = cost(start)
     assert gradient.shape == start.shape and np.all(np.isfinite(gradient))
     for k in range(len(start)):
@@ -102,7 +127,7 @@ def test_the_optimum_is_the_one_that_scipy_finds():
     from scipy.optimize import minimize
 
     name, free = "slow", ["ladrc.wc", "ladrc.wo", "map.values"]
-    cost, start = evaluator(STARTS[name], free, members=MEMBERS)
+    cost, start = evaluator(STARTS[name], free)
     scipys = minimize(cost, start, jac=True, method="L-BFGS-B", options={"maxfun": 60})
     assert tuned(name).cost == pytest.approx(scipys.fun, abs=2e-3)
     assert tuned(name).evaluations <= 1.5 * scipys.nfev

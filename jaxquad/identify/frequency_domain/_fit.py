@@ -26,8 +26,9 @@ from jaxquad._core import (
 from jaxquad.models import LaggedIntegrator, with_arrays
 from jaxquad.spectra import FrequencyResponse
 
-from ..uncertainty._assess import assess, DOUBT, unfitted
+from ..uncertainty._assess import assess, unfitted
 from ..uncertainty._error_budget import weighting_at
+from ..uncertainty._local_misfit import DOUBT
 from ..uncertainty._verdict import without_numbers
 from ..uncertainty._zero_bounds import linearise, solve_within_bounds
 from ._cost import (

@@ -21,6 +21,7 @@ from ._problem import on_device, Prior
 _MISFIT = 1.5  # ratio of misfit to random error from which the model's structure is in doubt
 _FAR = 20.0  # times the edges of the band
 _GAIN = 6.0  # of BIC, from which one structure is strongly preferred (Kass & Raftery, 1995)
+_ROUNDING = 1e-9  # of BIC's fall: without noise, structures that differ by less are equal
 
 
 class Options(NamedTuple):
@@ -240,12 +241,12 @@ class Candidate(NamedTuple):
 class Explanation(eqx.Module):
     """Structures that were tried on a misfit, and the one that the responses want, if any.
 
-    `best` is a `jq.identify.Fit` of it, whose model is an `Extended` one; None where no term lowers
-    BIC by 6 or more.
+    `best` is a `jq.identify.Fit` of it, whose model is an `Extended` one: of the simplest of those
+    within 6 of the lowest BIC. None where no term lowers BIC by 6 and the misfit.
     """
 
     fit: PyTree  # the one that was to be explained
-    candidates: tuple[Candidate, ...]  # what was tried, the best first
+    candidates: tuple[Candidate, ...]  # what was tried, by gain, but `best` first
     best: PyTree
 
     @property
@@ -301,20 +302,36 @@ def explain_misfit(fit: PyTree) -> Explanation:
             if term.names[0] == "T" or low / _FAR < place < high * _FAR:
                 fits.append(other)
         tried.append((term, min(fits, key=lambda other: other.cost, default=None)))
-    # A misfit that is left in all of them counts as noise here.
+    # A misfit that is left in all of them counts as noise here. The refit may end in a poorer
+    # minimum than the fit did.
+    before = plain.cost
+    if isinstance(origin.options.cost, MaximumLikelihood):
+        before = min(before, fit.cost)
     left = min((other.chi_squared for _, other in tried if other is not None), default=1.0)
     left, price, candidates = max(1.0, left), np.log(2 * origin.independent_points), []
     for term, other in tried:
         gain = -np.inf
         if other is not None:
-            gain = (plain.cost - other.cost) / left - len(term.names) * price
+            gain = (before - other.cost) / left - len(term.names) * price
         candidates.append(Candidate(term.title, term.formula, other, float(gain)))
     candidates.sort(key=lambda candidate: -candidate.gain)
-    if not candidates[0].gain > _GAIN:
+    better = [
+        candidate
+        for candidate in candidates
+        if candidate.gain > _GAIN and candidate.fit.chi_squared < fit.chi_squared
+    ]
+    if not better:
         return Explanation(fit, tuple(candidates), None)
-    best = candidates[0].fit
+    # The simplest of those that explain it equally well is named first.
+    least = better[0].gain - max(_GAIN, _ROUNDING * better[0].gain)
+    equal = [candidate for candidate in better if candidate.gain >= least]
+    first = min(equal, key=lambda candidate: len(candidate.fit.model.term.names))
+    candidates.sort(key=lambda candidate: candidate is not first)
+    best = first.fit
     again = origin.fit_again(best.model, _options(fit, origin, best.model.term), 3)
-    return Explanation(fit, tuple(candidates), best if again is None else again)
+    if again is not None and again.chi_squared < fit.chi_squared:
+        best = again
+    return Explanation(fit, tuple(candidates), best)
 
 
 def _options(fit: PyTree, origin: Origin, term: _Term | None) -> Options:

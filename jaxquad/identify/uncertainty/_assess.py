@@ -37,6 +37,7 @@ from ._error_budget import (
     units_of,
     Weighting,
 )
+from ._local_misfit import DOUBT, local_misfits, MISFIT, with_resonance
 from ._verdict import (
     identifiability_of,
     Information,
@@ -49,8 +50,6 @@ from ._verdict import (
 from ._zero_bounds import bounds_among, near_zeros, one_sided, without_bounds
 
 
-MISFIT = 1.5  # ratio of misfit to random error from which the model's structure is in doubt
-DOUBT = 0.05  # probability that the model is right, below which a misfit is remarked
 _NO_MINIMUM = 1e-2  # Newton decrement over cost, above which no number counts as determined
 _NO_MODEL = 0.5  # discrepancy in rad, above which nothing counts as determined
 _STILL = 0.25  # standard errors: a bias of that size leaves a 95 % interval at 94.3 %
@@ -97,8 +96,11 @@ def assess(
     def up_to_limits(units: Units) -> ErrorBudget:
         """With slopes that hold up to the limits of parameters near zero."""
         again = error_budget(problem, weighting.points, solution, units, changes)
-        return dataclasses.replace(again, mixtures=weighting.budget.mixtures)
+        again = dataclasses.replace(again, mixtures=weighting.budget.mixtures)
+        return with_resonance(again, beyond)
 
+    local, beyond = local_misfits(budget, weighting.points)
+    budget = with_resonance(budget, beyond)
     if near:
         budget = up_to_limits(units)
         bounds, mixed = bounds_among(near, budget, solution, units)
@@ -162,9 +164,9 @@ def assess(
     parts = [frf.remarks_about(mine) for frf, mine in zip(frfs, used, strict=True) if frf.remarks]
     remarks = list(dict.fromkeys(remark for part in parts for remark in part))
     remarks += remarks_on_hold(frfs, used)
-    # Few points of independent noise reach a large misfit by chance: the discrepancy has to say so,
-    # too.
-    doubted = misfit if budget.discrepancy.none < DOUBT else min(misfit, 1.0)
+    # Few points of independent noise reach a large misfit by chance: the discrepancy, or the search
+    # for a local misfit, has to say so, too.
+    doubted = misfit if local or budget.discrepancy.none < DOUBT else min(misfit, 1.0)
 
     def remark(kind: str, text: str) -> None:
         remarks.append(Message(text, kind))
@@ -184,13 +186,13 @@ def assess(
                 f"{2 * decrement:.3g}; {more}«try other starting values»"
                 f"{turned if _is_opposite(problem, solution) else ''}",
             )
-        if doubted > MISFIT**2:
-            ratio = np.sqrt(doubted)
-            local = ", or this is a local minimum: «try other starting values»"
+        if doubted > MISFIT**2 or local:
+            ratio, where = np.sqrt(doubted), f", and {local}" if local and local.within else ""
+            minimum = ", or this is a local minimum: «try other starting values»"
             remark(
                 "misfit",
-                f"the misfit is {ratio:.1f} times the random error: the model's structure does not "
-                f"explain the whole response{local if ratio > _POOR else ''}",
+                f"the misfit is {ratio:.1f} times the random error{where}: the model's structure "
+                f"does not explain the whole response{minimum if ratio > _POOR else ''}",
             )
         drifts = [] if stopped or near else drifts_in(alone)
         clear = lambda drift: abs(drift.rate) / drift.standard_error

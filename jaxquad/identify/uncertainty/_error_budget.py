@@ -201,6 +201,7 @@ class ErrorBudget:
     prior: PriorRows
     count: int  # of free parameters, the first of all
     mixtures: tuple[Mixture, Mixture] = (_NO_DISCREPANCY, _NO_DISCREPANCY)
+    moved: Matrix | float = 0.0  # covariance by what may explain a local misfit
 
     @ft.cached_property
     def products(self) -> tuple[Matrix, Float[np.ndarray, " parameters"]]:
@@ -314,8 +315,10 @@ class ErrorBudget:
             along = (np.swapaxes(basis, 1, 2) @ pulls).reshape(len(LENGTHS), -1, self.count)
             effect += np.swapaxes(along, 1, 2) @ along
         inverse, (one, other) = scaled_inverse(self.bread), self.mixtures
-        added = lambda mixture: inverse @ np.tensordot(mixture.powers, effect, axes=1) @ inverse
-        return added(one), added(other)
+        effect_of = lambda mixture: np.tensordot(mixture.powers, effect, axes=1)
+        parts = (inverse @ effect_of(mixture) @ inverse for mixture in (one, other))
+        by_one, by_other = (part + self.moved for part in parts)
+        return by_one, by_other
 
     @ft.cached_property
     def discrepancy(self) -> Discrepancy:

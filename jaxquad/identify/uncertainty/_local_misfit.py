@@ -1,0 +1,160 @@
+"""A misfit that is local in frequency: where it is, and what it may move.
+
+A stationary discrepancy hardly sees a notch or a mode of the plant: beside many points that fit,
+it is improbable. So windows from half an octave to the whole band are searched, overlapping by
+half. In each, the squares of misfit over random error, each divided by the number of points that
+share its noise, sum to chi-squared; degrees of freedom are 2 for each point of independent noise,
+less what the parameters take off. The noise is an estimate, so this is an F of these degrees and
+its own (`log_noise_covariance`). The least probability of all windows, times their number, bounds
+that of a false alarm (Bonferroni).
+Source: Glaz, Naus & Wallenstein (2001), Scan Statistics.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxquad.spectra import in_hertz
+
+from ..frequency_domain._cost import mix, Points
+from ._error_budget import ErrorBudget, scaled_inverse, SHARES
+
+
+MISFIT = 1.5  # ratio of misfit to random error from which the model's structure is in doubt
+DOUBT = 0.05  # probability that the model is right, below which a misfit is remarked
+_CHANCE = 0.01  # of a local misfit somewhere, where the model is right
+_WIDTHS = (0.5, 1.0, 2.0)  # octaves
+_MOST = 0.5  # share of the misfit beyond the noise
+_FEWEST = 2.0  # degrees of freedom of a window
+_PLACES, _DAMPINGS = 24, (0.1, 0.2, 0.4)  # of the resonances that are tried
+_OUTSIDE = 1.3  # times the window's ends: resonances up to there show within it
+_DISTINCT = 1e-8  # share of a resonance that the parameters do not take up
+
+
+class LocalMisfit(NamedTuple):
+    """The window of the clearest misfit."""
+
+    ratio: float  # of misfit to random error
+    low: float  # rad/s
+    high: float
+    within: bool  # a part of the band, and not the whole of it
+    place: tuple[int, int, int]  # of the response, and its output and input
+
+    def __str__(self) -> str:
+        where = in_hertz(np.array([self.low, self.high]))
+        return f"{self.ratio:.1f} times from {where}"
+
+
+def find_local_misfit(
+    budget: ErrorBudget, points: Sequence[Points], floor: float, least: float
+) -> LocalMisfit | None:
+    """Where the misfit is more than `least` random errors, beyond chance; a discrepancy of the
+    amplitude `floor` wide as noise. None where the noise explains it everywhere."""
+    from scipy.special import chdtrc, fdtrc
+
+    tried, candidates, inverse = 0, [], scaled_inverse(budget.bread)
+    for number, (record, counted) in enumerate(zip(budget.records, points, strict=True)):
+        omega, covariance = np.asarray(record.frf.omega), record.frf.log_noise_covariance
+        for _, o, i in record.pairs:
+            some = np.flatnonzero(record.used[:, o, i])
+            some = some[np.argsort(omega[some], kind="stable")]
+            independent = 1 / np.asarray(counted.shared)[some, o, i]
+            errors = record.error[some, o, i, None] ** 2 + (floor * SHARES) ** 2
+            squares = independent * np.sum(
+                np.asarray(record.misfit)[some, o, i] ** 2 / errors, axis=1
+            )
+            rows = record.rows[some, o, i, :, : budget.count]
+            taken = np.sum((rows @ inverse) * rows, axis=(1, 2))
+            starts, ends = _windows(np.log2(omega[some]))
+            sums = [np.append(0.0, np.cumsum(x)) for x in (squares, independent, taken)]
+            total, count, taken = (x[ends] - x[starts] for x in sums)
+            freedom = np.maximum(2 * count - taken, count)
+            if covariance is None:
+                chances = chdtrc(freedom, total)
+            else:
+                shared = (
+                    independent[:, None] * np.asarray(covariance)[np.ix_(some, some)] * independent
+                )
+                area = np.pad(shared.cumsum(axis=0).cumsum(axis=1), ((1, 0), (1, 0)))
+                doubt = area[ends, ends] - area[starts, ends] - area[ends, starts]
+                of_noise = 2 * count**2 / np.maximum(doubt + area[starts, starts], 1e-9)
+                chances = fdtrc(freedom, of_noise, total / freedom)
+            wide = 2 * count >= _FEWEST
+            wide[0] = True
+            tried += int(np.sum(wide))
+            clear = wide & (total > least**2 * freedom)
+            if not np.any(clear):
+                continue
+            # The narrowest window that holds most of the misfit.
+            beyond = np.where(clear, total - freedom, 0.0)
+            most = np.flatnonzero(beyond >= _MOST * np.max(beyond))
+            k = most[np.argmin(np.log(omega[some[ends[most] - 1]] / omega[some[starts[most]]]))]
+            edges = float(omega[some[starts[k]]]), float(omega[some[ends[k] - 1]])
+            ratio = float(np.sqrt(total[k] / freedom[k]))
+            local = LocalMisfit(ratio, *edges, bool(k), (number, o, i))
+            candidates.append((float(np.min(chances[clear])), -float(np.max(beyond)), local))
+    chance, _, clearest = min(candidates, key=lambda one: one[:2], default=(1.0, 0.0, None))
+    return clearest if tried * chance < _CHANCE else None
+
+
+def _windows(place: Float[np.ndarray, " points"]) -> tuple[np.ndarray, np.ndarray]:
+    """First points of windows, and those behind their last; the whole band is the first."""
+    low, high = place[0], place[-1]
+    starts, ends = [np.array([low])], [np.array([high])]
+    for width in _WIDTHS:
+        if width < high - low:
+            begin = np.linspace(low, high - width, int(np.ceil(2 * (high - low) / width)))
+            starts, ends = [*starts, begin], [*ends, begin + width]
+    first = np.searchsorted(place, np.concatenate(starts) - 1e-9)
+    last = np.searchsorted(place, np.concatenate(ends) + 1e-9)
+    return first[last > first], last[last > first]
+
+
+def local_misfits(
+    budget: ErrorBudget, points: Sequence[Points]
+) -> tuple[LocalMisfit | None, LocalMisfit | None]:
+    """Beyond the noise, and beyond noise and discrepancy. Neighbours share a discrepancy, which
+    only a larger misfit exceeds beyond chance."""
+    local = find_local_misfit(budget, points, 0.0, MISFIT)
+    if local is None or budget.discrepancy.none >= DOUBT:
+        return local, local
+    floor = budget.mixtures[0].amplitude
+    return local, find_local_misfit(budget, points, floor, MISFIT**2)
+
+
+def with_resonance(budget: ErrorBudget, local: LocalMisfit | None) -> ErrorBudget:
+    """With what a resonance in the place of a local misfit would move: a notch or a mode bends the
+    phase far below its frequency, as a delay does."""
+    if local is None:
+        return budget
+    number, o, i = local.place
+    record, inverse = budget.records[number], scaled_inverse(budget.bread)
+    used, s = record.used[:, o, i], 1j * np.asarray(record.frf.omega)
+    axes = (0, 1, 2, 3)
+    dot = lambda one, other: np.tensordot(one, other, axes=(axes, axes))
+    lowered, moves = [0.0], [np.zeros((budget.count, budget.count))] * 2
+    for place in np.geomspace(local.low / _OUTSIDE, local.high * _OUTSIDE, _PLACES).tolist():
+        for damping in _DAMPINGS:
+            # Of a pair of zeros beside its poles, by the first order.
+            pole = place**2 / (s**2 + 2 * damping * place * s + place**2)
+            logs = np.stack([s / place * pole, pole - 1], axis=1)
+            parts = np.zeros((*record.misfit.shape, 2))
+            parts[used, o, i] = np.stack([np.real(logs), np.imag(logs)], axis=1)[used]
+            rows = np.asarray(mix(record.mixing, record.weights[..., None] * parts))
+            along, size_of_rows = dot(record.rows[..., : budget.count], rows), dot(rows, rows)
+            left = size_of_rows - along.T @ inverse @ along
+            if np.linalg.eigvalsh(left)[0] <= _DISTINCT * np.trace(size_of_rows):
+                continue
+            pull = dot(rows, record.residual) - along.T @ inverse @ budget.gradient
+            size = np.linalg.solve(left, pull)
+            lowered.append(float(pull @ size))
+            moves.append(inverse @ along @ np.outer(size, size) @ along.T @ inverse)
+    # Each as probable as it explains the misfit.
+    points = 2 * sum(np.count_nonzero(one.used) for one in budget.records)
+    scale = max(budget.data_cost - max(lowered), budget.noise.cost) / points
+    shares = np.exp((np.array(lowered) - max(lowered)) / (2 * scale))
+    moved = np.tensordot(shares / np.sum(shares), np.array(moves[1:]), axes=1)
+    return dataclasses.replace(budget, moved=moved)
