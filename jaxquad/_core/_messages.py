@@ -62,7 +62,7 @@ Value = Number | ArrayLike  # of NumPy or JAX
 _PLAIN = float | int | np.ndarray | np.generic
 
 
-def is_concrete(x: Value) -> bool:
+def is_concrete(x: object) -> bool:
     """Whether `x` has values to check, which a tracer under jit, vmap or grad has not."""
     if isinstance(x, _PLAIN):
         return True

@@ -108,7 +108,7 @@ def close_loop(
     x: Columns,
     feedback: Series,
     dt: float,
-    direct_samples: Float[Numbers, "outputs inputs"] | None,
+    direct_samples: Float[Numbers, "outputs inputs"] | None = None,
 ) -> Columns:
     """What a disturbance `x` of the output becomes in the loop, which rested before: S x.
 
