@@ -42,8 +42,11 @@ _HARMONICS = (2, 3)
 _CHANCE = 5e-3  # of a remark on a linear record
 _SMALLEST_BIAS = 0.02  # bias of the gain from which a remark is made
 # Change of the gain over the third harmonic, by Fourier series: 2.4 to 2.9 for a deadband of 5 to
-# 20 %, 3 for friction and for a cubic; 1.1 to 1.4 where the peaks are cut off by 5 to 30 %.
-_BROKEN, _CLIPPED = 2.8, 1.3
+# 20 %, 3 for friction and for a cubic.
+_BROKEN = 2.8
+# The third harmonic, and the loss of gain, where peaks are cut off at 1 to .4 of the amplitude.
+_THIRDS = 0.0, 0.033, 0.082, 0.133, 0.182, 0.226, 0.264
+_LOSSES = 0.0, 0.037, 0.104, 0.188, 0.285, 0.391, 0.505
 _CONCENTRATED = 0.9  # share of a sweep's power at its own frequency
 _CYCLES = 6.0  # cycles of a sweep
 _ACTIVE = 0.1  # of the largest amplitude
@@ -366,7 +369,8 @@ def _say_harmonics(
     evidence = np.sum([weight * np.abs(factor) ** 2 for factor, weight in parts], axis=0)
     size = np.where(evidence > gammainccinv(len(parts), chance), np.abs(factor), 0.0)
     flattened = factor[1].real < -0.5 * np.abs(factor[1])
-    bias = max((_CLIPPED if flattened else _BROKEN) * size[1], size[0])
+    change = float(np.interp(size[1], _THIRDS, _LOSSES)) if flattened else _BROKEN * size[1]
+    bias = max(change, size[0])
     if not bias > _SMALLEST_BIAS:
         return ""
     harmonics = [

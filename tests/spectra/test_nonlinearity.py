@@ -88,6 +88,14 @@ def test_the_bias_that_the_remark_names_is_that_of_the_gain(share):
     assert named == pytest.approx(truth, rel=0.35)
 
 
+@pytest.mark.parametrize("level", [0.8, 0.6, 0.5])
+def test_the_bias_that_the_remark_names_is_that_of_a_saturated_gain(level):
+    truth = 1 - 2 / np.pi * (np.arcsin(level) + level * np.sqrt(1 - level**2))
+    (remark,) = remarks(open_loop(lambda u: np.clip(u, -level, level), 0, noise=0.01))
+    named = float(remark.split("biased by about ")[1].split(" %")[0]) / 100
+    assert named == pytest.approx(truth, rel=0.15)
+
+
 def test_a_signal_that_is_no_sweep_has_no_phase():
     rng = np.random.default_rng(0)
     lines = np.zeros(SAMPLES // 2 + 1, complex)
