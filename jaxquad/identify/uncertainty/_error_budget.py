@@ -372,8 +372,8 @@ class Drift(NamedTuple):
             )
         return (
             f"the residual changes along the sweep, as if {what} in {self.seconds:.3g} s, which "
-            "the intervals do not include; or the model lacks a term. A sweep in the other "
-            "direction tells which"
+            "the intervals do not include; or the model lacks a term. A sweep in the other direction "
+            "tells which"
         )
 
 
