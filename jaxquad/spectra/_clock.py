@@ -12,7 +12,7 @@ from jaxtyping import Complex, Float
 
 from jaxquad.records import Record
 
-from ._estimators import COHERENT, Grid, Method, Remark, sums_between
+from ._estimators import COHERENT, Grid, Remark
 from ._frequency_response import Estimate
 from ._linearity import fast_length
 
@@ -23,7 +23,6 @@ _BLOCK, _POWERS = 24, 3  # bins for each signal, over which A and C are smooth; 
 _DISTINCT = 1e-5  # share of the signal looked for that no controller explains
 _MOST = 0.01  # drift of a clock, as a share of the time
 _FEWEST = 8  # points of the response
-_NEAR = 0.05  # of a frequency, over which the time of its power is averaged
 _FLOOR = 1e-20  # of the input's power: below it lies rounding
 
 Columns = Complex[np.ndarray, "bins columns"]
@@ -106,27 +105,6 @@ def _compare(record: Record, low: float, high: float) -> list[tuple[np.ndarray, 
         columns_of = left / noise, drift / noise, np.abs(added / noise) ** 2
         parts.append((*map(np.ravel, columns_of), np.repeat(leverage, inputs.shape[1])))
     return parts
-
-
-def mean_times(
-    records: Sequence[Record], method: Method, omega: Grid
-) -> Float[np.ndarray, "frequencies inputs"]:
-    """When each input has each frequency, in s from the middle of its record, by power."""
-    moment = power = 0.0
-    for record in records:
-        count = fast_length(record.samples)
-        moving = (record.inputs if method == "direct" else record.references)[:count]
-        moving = moving - np.mean(moving, axis=0)
-        time = np.linspace(-0.5, 0.5, count)[:, None] * count * record.dt
-        plain, later = (np.fft.rfft(x.T) for x in (moving, time * moving))
-        place = omega * count * record.dt / (2 * np.pi)
-        reach = np.maximum(_NEAR * place, 1.0)
-        low = np.clip(np.rint(place - reach).astype(int), 0, plain.shape[1] - 1)
-        high = np.clip(np.rint(place + reach).astype(int) + 1, low + 1, plain.shape[1])
-        near = lambda x, low=low, high=high: np.stack([sums_between(r, low, high) for r in x], 1)
-        moment = moment + near(np.real(later * np.conj(plain)))
-        power = power + near(np.abs(plain) ** 2)
-    return moment / np.maximum(power, 1e-300)
 
 
 def _transform(columns: Float[np.ndarray, "samples columns"]) -> Columns:

@@ -134,7 +134,6 @@ class FrequencyResponse:
     distortion: Distortion | None = None  # of a periodic excitation
     log_noise_covariance: Square | None = None
     divided: Pairs | Array | None = None  # 0 to 1; 0 without
-    excited_at: Float[np.ndarray | Array, "frequencies inputs"] | None = None  # s from mid-record
     dt: float = eqx.field(static=True, default=0.0)  # s; 0 where nothing was sampled
     hold: float | None = eqx.field(static=True, default=None)  # s
     fed_back: bool = eqx.field(static=True, default=False)  # the records had references: a loop
@@ -390,7 +389,6 @@ def frequency_response(
         ```
     """
     from ._average import average_windows
-    from ._clock import mean_times
     from ._local_polynomial import estimate_local_polynomial
     from ._periodic import estimate_periodic
 
@@ -445,7 +443,6 @@ def frequency_response(
         distortion=estimate.distortion,
         log_noise_covariance=estimate.log_noise_covariance,
         divided=estimate.divided,
-        excited_at=mean_times(records, method, estimate.omega),
         dt=first.dt,
         hold=first.hold,
         fed_back=bool(first.reference_names),

@@ -28,7 +28,6 @@ from ..output_error._noise import NoiseModel
 from ..output_error._simulated import HasStateSpace, HasTransferFunction, linear_model
 from ._error_budget import (
     Discrepancy,
-    drifts_in,
     error_budget,
     ErrorBudget,
     Matrix,
@@ -59,8 +58,6 @@ _POOR = 10.0  # ratio above which a local minimum is likely
 _EXACT = 1e-9  # cost of a response without noise: no step lowers what rounding has left
 _FAR = 7.0  # in ln: a parameter that moved by a factor of 1000 ran for zero or infinity
 _BEYOND = 4.0  # random errors that a parameter at zero is pulled beyond it
-_DRIFTS = 3.3  # standard errors of a drift from which a remark is made: a chance of 0.2 % in two
-_EXPLAINED = 0.1  # of a large misfit, which a drift may leave
 _RIVAL = 1.5  # ratio of costs within which another minimum is a rival
 _FEEDBACK = "feedback"  # kind of a reason
 
@@ -194,15 +191,6 @@ def assess(
                 f"the misfit is {ratio:.1f} times the random error{where}: the model's structure "
                 f"does not explain the whole response{minimum if ratio > _POOR else ''}",
             )
-        drifts = [] if stopped or near else drifts_in(alone)
-        clear = lambda drift: abs(drift.rate) / drift.standard_error
-        drift = max(drifts, key=clear, default=None)
-        if (
-            drift
-            and clear(drift) > _DRIFTS
-            and drift.misfit_ratio < max(MISFIT**2, _EXPLAINED * misfit)
-        ):
-            remark("drift", str(drift))
         # Parameters at zero that the data want to have the other sign, by random errors.
         unbounded, steps = without_bounds(budget.by_noise, budget, zeros)
         pulls = {k: -x / float(np.sqrt(max(unbounded[k, k], 1e-300))) for k, x in steps.items()}

@@ -34,7 +34,6 @@ LENGTHS = (1.0, 3.0, 9.0)  # in ln(omega); 2.3 is a decade
 MEAN = 0.05  # of the prior of the amplitude, neper
 _SHAPE = 1.5  # of that prior, a gamma distribution: errors far below its mean are few
 SHARES = np.array([0.5, 1.0])  # of the amplitude, in magnitude and in phase
-_DRIFTS = 3.0  # standard errors from which a drift is looked at
 _NONE = 0.85  # the prior's mass at a discrepancy of zero
 _AMPLITUDES = 16
 _RANK = 16  # of a kernel over a band of two decades: 1 to 6 % of its variance is left, the fastest
@@ -351,62 +350,6 @@ def error_budget(
         parts = one.frf, np.asarray(misfit), slopes, np.asarray(weights), mixing
         terms.append(ResponseTerm(*parts, problem.parameters.count))
     return ErrorBudget(terms, prior_rows(solution, units), problem.parameters.count)
-
-
-class Drift(NamedTuple):
-    """What a sweep says of a plant, or a clock, that changes while it lasts."""
-
-    kind: str  # "gain" or "clock"
-    rate: float  # of the gain, relative, per s; of the clock, a share of the time
-    standard_error: float
-    seconds: float  # that the sweep lasts
-    misfit_ratio: float  # with it
-
-    def __str__(self) -> str:
-        change, error = self.rate * self.seconds, self.standard_error * self.seconds
-        what = f"the gain changes by {100 * change:+.2g} % (standard error {100 * error:.1g} %)"
-        if self.kind == "clock":
-            what = (
-                f"the output's time stamps drift by {1e6 * self.rate:+.2g} ppm (standard error "
-                f"{1e6 * self.standard_error:.1g} ppm), {1e3 * change:+.2g} ms,"
-            )
-        return (
-            f"the residual changes along the sweep, as if {what} in {self.seconds:.3g} s, which "
-            "the intervals do not include; or the model lacks a term. A sweep in the other direction "
-            "tells which"
-        )
-
-
-def drifts_in(budget: ErrorBudget) -> list[Drift]:
-    """Those that the residual shows, by the next step with one as a further parameter.
-
-    A sweep passes its frequencies one after the other: a gain that changes, or a delay, does so
-    along frequency.
-    """
-    if any(record.frf.excited_at is None for record in budget.records):
-        return []
-    drifts, count = [], budget.count
-    slopes = np.pad(budget.prior.slopes[:, :count], ((0, 0), (0, 1)))
-    for kind in ("gain", "clock"):
-        records = []
-        for record in budget.records:
-            time, omega = np.asarray(record.frf.excited_at), np.asarray(record.frf.omega)[:, None]
-            part, along = (0, time) if kind == "gain" else (1, -omega * time)
-            column = np.zeros((*record.misfit.shape, 1))
-            column[..., part, 0] = along[:, None]
-            columns = np.concatenate([record.slopes[..., :count], column], axis=-1)
-            fields = dict(slopes=columns, count=count + 1)
-            records.append(dataclasses.replace(record, **fields))
-        more = ErrorBudget(records, PriorRows(budget.prior.misfit, slopes), count + 1)
-        inverse = scaled_inverse(more.bread)
-        step = inverse @ more.gradient
-        if step[-1] ** 2 > _DRIFTS**2 * inverse[-1, -1]:  # as if no points shared their noise
-            left = more.data_cost - float(more.gradient @ step)
-            ratio = left / max(more.noise.cost - more.fitted_noise, 1e-300)
-            error = float(np.sqrt(more.by_noise[-1, -1]))
-            seconds = max(float(np.ptp(np.asarray(r.frf.excited_at))) for r in records)
-            drifts.append(Drift(kind, -float(step[-1]), error, seconds, ratio))
-    return drifts
 
 
 class Weighting(NamedTuple):
