@@ -45,7 +45,7 @@ def write_file(path: str | Path, content: str | bytes) -> Path:
         draft.replace(path)
     except BaseException as error:
         draft.unlink(missing_ok=True)
-        if isinstance(error, OSError):  # a full disk names no file
+        if isinstance(error, OSError) and error.errno:  # a full disk names no file
             error.filename = str(path)
         raise
     if os.name != "nt":  # a new name is on the disk only once its folder is
@@ -74,7 +74,7 @@ def staged_files(folder: Path) -> Iterator[Path]:
         for path in new:
             with contextlib.suppress(OSError):  # it holds something else
                 path.rmdir()
-        if isinstance(error, OSError):
+        if isinstance(error, OSError) and error.errno:
             error.filename = str(folder)
         raise
 
@@ -86,7 +86,7 @@ def readable(text: str) -> str:
     try:
         return text.encode("utf-8", "surrogateescape").decode("utf-8", "replace")
     except UnicodeEncodeError:
-        return text.encode("utf-8", "replace").decode()
+        return "".join("\ufffd" if "\ud800" <= x <= "\udfff" else x for x in text)
 
 
 def plain_content(value: object) -> Any:
