@@ -125,10 +125,10 @@ def test_an_interval_of_another_level_reaches_as_far_as_students_t(freedom, mode
     fit = dataclasses.replace(fit, degrees_of_freedom=np.full(4, freedom))
     errors = fit.standard_errors if model_error else fit.noise_standard_errors
     for level in (0.5, 0.9, 0.99):
-        reach = student_t(freedom).ppf(0.5 + level / 2) * errors[0]
-        wanted = fit["gain"] - reach, fit["gain"] + reach
-        assert fit.interval("gain", level=level, model_error=model_error) == pytest.approx(wanted)
-    derived = fit.derived(lambda model: model.gain, model_error=model_error)
+        reach = student_t(freedom).ppf(0.5 + level / 2) * errors[3]
+        wanted = fit["wn"] - reach, fit["wn"] + reach
+        assert fit.interval("wn", level=level, model_error=model_error) == pytest.approx(wanted)
+    derived = fit.derived(lambda model: model.wn, model_error=model_error)
     assert derived.interval_at(0.99) == pytest.approx(wanted, rel=1e-6)
 
 

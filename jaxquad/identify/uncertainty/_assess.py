@@ -144,9 +144,11 @@ def assess(
     elif amplitude > _NO_MODEL:
         verdict = by_data = no_model(names, amplitude)
     else:
+        # A resonance widens intervals; it makes no direction of the parameters a null one.
+        stationary = dataclasses.replace(budget, moved=0.0)
         information = Information(
             root=budget.root,
-            covariance=covariance,
+            covariance=cut(stationary.covariance),
             by_noise=by_noise,
             places=parameters.places,
             values=np.asarray(solution.values),

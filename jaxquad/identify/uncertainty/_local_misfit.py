@@ -25,7 +25,7 @@ from ._error_budget import ErrorBudget, scaled_inverse, SHARES
 
 MISFIT = 1.5  # ratio of misfit to random error from which the model's structure is in doubt
 DOUBT = 0.05  # probability that the model is right, below which a misfit is remarked
-_CHANCE = 0.01  # of a local misfit somewhere, where the model is right
+_CHANCE = 0.002  # of a local misfit somewhere, where the model is right
 _WIDTHS = (0.5, 1.0, 2.0)  # octaves
 _MOST = 0.5  # share of the misfit beyond the noise
 _FEWEST = 2.0  # degrees of freedom of a window
