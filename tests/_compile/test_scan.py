@@ -247,6 +247,7 @@ def test_all_derivatives_pass_through_a_queue(waits):
         close(found, expected, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_no_sample_of_a_reverse_pass_adds_up_a_whole_queue():
     """It would cost the delay's length in every sample, and be too wide for a kernel."""
     late = lambda gain: Loop(rig(INERTIA[:, :2]), LADRC(gain, 30.0, 0.85), delay=0.1)

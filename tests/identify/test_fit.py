@@ -88,10 +88,8 @@ def _smooth_cost(values, frf):
     return weight * jnp.sum(scale[0] * jnp.real(log) ** 2 + scale[1] * jnp.imag(log) ** 2)
 
 
-@pytest.mark.parametrize(
-    "cost",
-    [pytest.param(COSTS[0], id="eq14", marks=pytest.mark.slow), pytest.param(COSTS[1], id="ml")],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("cost", COSTS, ids=["eq14", "ml"])
 def test_standard_errors_are_the_scatter_even_of_correlated_noise(cost):
     frfs = [response_of(TRUTH, error=0.01, correlation=0.7, seed=k) for k in range(200)]
     fits = [jq.fit(START, frf, cost=cost) for frf in frfs]

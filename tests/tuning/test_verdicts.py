@@ -92,6 +92,7 @@ def test_one_lost_member_is_one_too_many():
     assert not found.holds and "1 of 12 members are lost" in found.performance.text
 
 
+@pytest.mark.slow
 def test_every_limit_says_what_its_own_count_proves():
     limits = [Limit("sensitivity_peak", at_most=2.2), Limit("activity_rate", at_most=1e6)]
     found = flown(jq.LADRC(4.0, 20.0, 1.0), limit=10.0, limits=limits)
