@@ -41,7 +41,6 @@ from .frequency_domain._cost import (
     usable,
 )
 from .frequency_domain._feedthrough import free_delays
-from .frequency_domain._fit import check_options
 from .frequency_domain._parameters import (
     Free,
     Numbers,
@@ -52,6 +51,7 @@ from .frequency_domain._parameters import (
     UNCHANGED,
 )
 from .frequency_domain._problem import make_problem, Problem, problem_normal
+from .frequency_domain._refits import check_options
 from .frequency_domain._result import Fit
 from .frequency_domain._sampled import behind_hold, direct_part, hold_of
 from .frequency_domain._solve import solution_at, stopped_early

@@ -66,7 +66,7 @@ from ._problem import (
     require_priors,
     residuals,
 )
-from ._refits import Options, Origin
+from ._refits import check_options, Options, Origin, require_responses
 from ._result import Fit
 from ._solve import (
     FLAT,
@@ -340,42 +340,6 @@ def _fit(
             remarks.append(Message(text, "no response"))
     origin = Origin(fit_with, tuple(points), options)
     return assess(problem, weighting, solution, minima, further=remarks, origin=origin)
-
-
-def require_responses(frf: object) -> list[FrequencyResponse]:
-    """One response or several, as a list. Raise ValueError for anything else, and for repeats."""
-    items = list(frf) if isinstance(frf, Sequence) else [frf]
-    frfs = [one for one in items if isinstance(one, FrequencyResponse)]
-    if not items or len(frfs) < len(items):
-        kinds = ", ".join(sorted({type(one).__name__ for one in items})) or "nothing"
-        raise ValueError(
-            f"a fit needs a jq.spectra.FrequencyResponse or a list of them, not {kinds}: make one "
-            "with jq.frequency_response(record), and call jq.fit(model, response)"
-        )
-    for k, one in enumerate(frfs):
-        for other in frfs[:k]:
-            if np.array_equal(np.asarray(one.response), np.asarray(other.response)):
-                raise ValueError(f"response {k} of {len(frfs)} is given twice: leave it out once")
-    return frfs
-
-
-def check_options(cost: PyTree, band: PyTree, min_coherence: float | None, max_steps: int) -> None:
-    """Check `cost`, `band`, `min_coherence` and `max_steps`; raise ValueError."""
-    if isinstance(cost, type) or not isinstance(cost, Cost):
-        raise ValueError(
-            f"cost={cost!r}: pass an object, jq.identify.MaximumLikelihood() or "
-            "jq.identify.CoherenceWeighted()"
-        )
-    for limits in band.values() if isinstance(band, Mapping) else [band]:
-        if limits is not None and np.shape(limits) != (2,):
-            raise ValueError(f"band={limits!r}: give two frequencies in rad/s, (low, high)")
-    if min_coherence is not None and not 0 < min_coherence < 1:
-        raise ValueError(
-            f"min_coherence is {min_coherence}: give a number between 0 and 1, or None for what "
-            "goes with the cost"
-        )
-    if max_steps < 1:
-        raise ValueError(f"max_steps is {max_steps}: give at least 1")
 
 
 def _check_finite(solution: Solution) -> None:

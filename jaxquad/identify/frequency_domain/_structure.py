@@ -14,9 +14,16 @@ from jaxquad.spectra import FrequencyResponse
 
 from ..uncertainty._error_budget import FOLLOWS
 from ._cost import Band, Cost, MaximumLikelihood
-from ._fit import check_options, fit_with, require_responses
+from ._fit import fit_with
 from ._parameters import Free, Parameters, Positive, select_parameters, Tie
-from ._refits import free_again, model_to_start_from, Options, require_origin
+from ._refits import (
+    check_options,
+    free_again,
+    model_to_start_from,
+    Options,
+    require_origin,
+    require_responses,
+)
 from ._result import counted, Fit
 
 

@@ -26,8 +26,9 @@ from ._cost import (
     points_of,
     usable,
 )
-from ._fit import check_options, fit, require_responses
+from ._fit import fit
 from ._parameters import name_places, Parameters, Real
+from ._refits import check_options, require_responses
 from ._result import Fit
 
 
