@@ -22,6 +22,7 @@ pytestmark = pytest.mark.usefixtures("compiled_quickly")
 def test_the_worst_take_the_places_of_others():
     drawn = [ensemble().draw(loop(), 6, jax.random.key(seed)) for seed in range(3)]
     worst = take_members(drawn[1:], [(1, 4), (0, 0), (1, 2)])
+    assert worst is not None
     mine, first, second = (linear_loops(members, None) for members in drawn)
     found = mine.replaced(np.array([5, 1, 0]), linear_loops(worst, None))
     for pick in (lambda x: x.assumed_inertia[0], lambda x: x.axes.lag[0], lambda x: x.delay):

@@ -36,7 +36,7 @@ from ..uncertainty._verdict import (
     USUAL,
     Verdict,
 )
-from ._parameters import Numbers, Parameters
+from ._parameters import Parameters
 from ._refits import Bands, explain_misfit, Explanation, fit_bands, Origin
 from ._solve import Minimum
 
@@ -66,7 +66,7 @@ class Fit:
 
     model: PyTree
     names: tuple[str, ...] = eqx.field(static=True)
-    values: Float[Numbers, " parameters"]
+    values: Float[Any, " parameters"]
     standard_errors: Float[np.ndarray, " parameters"]
     covariance: Float[np.ndarray, "parameters parameters"]
     noise_covariance: Float[np.ndarray, "parameters parameters"]
