@@ -138,6 +138,7 @@ def test_a_loop_that_may_be_closed_is_spoken_of():
     fit = refined(CLEAN + 0.05 * noise(3), references=U)
     assert any("output error is biased where feedback" in remark for remark in fit.remarks)
     assert fit.chi_squared == pytest.approx(1, abs=0.02)
+    assert not any("any model" in remark for remark in fit.remarks)  # of every fit: no remark
 
 
 @pytest.mark.slow

@@ -79,7 +79,9 @@ def test_what_is_there_is_kept_and_the_protocol_says_so():
     assert found.dropped == ()
     assert len(found.steps) == 4
     assert all(step.change > 0 for step in found.steps)
-    assert {"gain", "lag"} <= {step.parameter for step in found.steps}
+    gone = {step.parameter: step.verdict for step in found.steps}
+    assert gone["gain"] == "kept: no fit without it"
+    assert gone["lag"] == "kept: needed"
 
 
 def test_a_rise_that_is_allowed_drops_what_the_criterion_would_keep():

@@ -124,10 +124,12 @@ def test_an_interval_of_another_level_reaches_as_far_as_students_t(freedom, mode
     fit = fitted(0, Zero(6.0, 0.5, 0.7, 5.0))
     fit = dataclasses.replace(fit, degrees_of_freedom=np.full(4, freedom))
     errors = fit.standard_errors if model_error else fit.noise_standard_errors
-    for level in (0.5, 0.9, 0.99):
-        reach = student_t(freedom).ppf(0.5 + level / 2) * errors[3]
-        wanted = fit["wn"] - reach, fit["wn"] + reach
-        assert fit.interval("wn", level=level, model_error=model_error) == pytest.approx(wanted)
+    for name, error in (("gain", errors[0]), ("wn", errors[3])):
+        for level in (0.5, 0.9, 0.99):
+            reach = student_t(freedom).ppf(0.5 + level / 2) * error
+            wanted = max(fit[name] - reach, 0.0), fit[name] + reach  # both keep their sign
+            interval = fit.interval(name, level=level, model_error=model_error)
+            assert interval == pytest.approx(wanted)
     derived = fit.derived(lambda model: model.wn, model_error=model_error)
     assert derived.interval_at(0.99) == pytest.approx(wanted, rel=1e-6)
 

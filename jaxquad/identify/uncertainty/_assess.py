@@ -144,11 +144,12 @@ def assess(
     elif amplitude > _NO_MODEL:
         verdict = by_data = no_model(names, amplitude)
     else:
-        # A resonance widens intervals; it makes no direction of the parameters a null one.
-        stationary = dataclasses.replace(budget, moved=0.0)
+        without = covariance
+        if beyond:  # a resonance widens intervals, and makes no direction a null one
+            without = cut(dataclasses.replace(budget, moved=0.0).covariance)
         information = Information(
             root=budget.root,
-            covariance=cut(stationary.covariance),
+            covariance=without,
             by_noise=by_noise,
             places=parameters.places,
             values=np.asarray(solution.values),

@@ -57,7 +57,7 @@ def find_local_misfit(
 
     tried, candidates, inverse = 0, [], scaled_inverse(budget.bread)
     for number, (record, counted) in enumerate(zip(budget.records, points, strict=True)):
-        omega, covariance = np.asarray(record.frf.omega), record.frf.log_noise_covariance
+        omega = np.asarray(record.frf.omega)
         for _, o, i in record.pairs:
             some = np.flatnonzero(record.used[:, o, i])
             some = some[np.argsort(omega[some], kind="stable")]
@@ -72,6 +72,13 @@ def find_local_misfit(
             sums = [np.append(0.0, np.cumsum(x)) for x in (squares, independent, taken)]
             total, count, taken = (x[ends] - x[starts] for x in sums)
             freedom = np.maximum(2 * count - taken, count)
+            wide = 2 * count >= _FEWEST
+            wide[0] = True
+            tried += int(np.sum(wide))
+            clear = wide & (total > least**2 * freedom)
+            if not np.any(clear):
+                continue
+            covariance = record.frf.log_noise_covariance
             if covariance is None:
                 chances = chdtrc(freedom, total)
             else:
@@ -82,12 +89,6 @@ def find_local_misfit(
                 doubt = area[ends, ends] - area[starts, ends] - area[ends, starts]
                 of_noise = 2 * count**2 / np.maximum(doubt + area[starts, starts], 1e-9)
                 chances = fdtrc(freedom, of_noise, total / freedom)
-            wide = 2 * count >= _FEWEST
-            wide[0] = True
-            tried += int(np.sum(wide))
-            clear = wide & (total > least**2 * freedom)
-            if not np.any(clear):
-                continue
             # The narrowest window that holds most of the misfit.
             beyond = np.where(clear, total - freedom, 0.0)
             most = np.flatnonzero(beyond >= _MOST * np.max(beyond))
