@@ -264,14 +264,14 @@ def remarks_on_samples(
     """Say which sample is all that is known of a delay, and which direct part nobody knows."""
     remarks = list[Message]()
     for delay, low, high, _, _, narrowed in limits:
-        of, extent = data[delay.record], "the interval is"
+        of, extent = data[delay.record], "the interval is that sample"
         if narrowed:
-            extent = "the rest of the response narrows the interval within"
+            extent = "the rest of the response narrows the interval"
         text = (
             f"{of.input_names[delay.input]} passes directly to {of.output_names[delay.output]}, "
             "which shows in whole samples of the held input: its delay lies between "
-            f"{1e3 * low:.4g} and {1e3 * high:.4g} ms, and {extent} "
-            "that sample; record at a higher rate to know it better"
+            f"{1e3 * low:.4g} and {1e3 * high:.4g} ms, and {extent}; "
+            "record at a higher rate to know it better"
         )
         remarks.append(Message(text, "sampled delay"))
     if any(aliases is not None and aliases.is_level for aliases in problem.aliases):
