@@ -34,8 +34,10 @@ class OtherInput(NamedTuple):
 def compare_with_input(
     records: Sequence[Record], frf: FrequencyResponse, signals: Sequence[Samples]
 ) -> OtherInput | None:
-    """One of the `signals` for each record, sampled as this is, beside the input and output of the
-    response. None where the response has too few coherent points, or the records too few bins."""
+    """Compare another signal, sampled as each record is, with the first input of a response.
+
+    None where the response has too few coherent points, or the records too few bins.
+    """
     omega, method = np.asarray(frf.omega), frf.method
     response, coherence = (np.asarray(x)[:, 0, :1] for x in (frf.response, frf.coherence))
     used = (np.isfinite(response) & (coherence >= COHERENT))[:, 0]
