@@ -134,6 +134,7 @@ class FrequencyResponse:
     distortion: Distortion | None = None  # of a periodic excitation
     log_noise_covariance: Square | None = None
     divided: Pairs | Array | None = None  # 0 to 1; 0 without
+    swept_at: Float[Array | np.ndarray, "frequencies inputs"] | None = None  # s, of a sweep
     dt: float = eqx.field(static=True, default=0.0)  # s; 0 where nothing was sampled
     hold: float | None = eqx.field(static=True, default=None)  # s
     fed_back: bool = eqx.field(static=True, default=False)  # the records had references: a loop
@@ -389,6 +390,7 @@ def frequency_response(
         ```
     """
     from ._average import average_windows
+    from ._clock import sweep_times
     from ._local_polynomial import estimate_local_polynomial
     from ._periodic import estimate_periodic
 
@@ -443,6 +445,7 @@ def frequency_response(
         distortion=estimate.distortion,
         log_noise_covariance=estimate.log_noise_covariance,
         divided=estimate.divided,
+        swept_at=sweep_times(records, method, estimate.omega),
         dt=first.dt,
         hold=first.hold,
         fed_back=bool(first.reference_names),

@@ -354,6 +354,7 @@ def _usable_pair(
         divided=pick(measured.divided),
         direct_coherence=pick(measured.direct_coherence),
         multiple_coherence=measured.multiple_coherence[:, o : o + 1],
+        swept_at=None if measured.swept_at is None else measured.swept_at[:, i : i + 1],
         input_names=measured.input_names[i : i + 1],
         output_names=measured.output_names[o : o + 1],
     )
