@@ -274,20 +274,7 @@ def _usable_pair(
             raise ValueError(
                 f"{role}={wanted!r}: the response has {role}s 0 to {len(names) - 1}, {names}"
             )
-    o, i = places
-    pick = lambda values: None if values is None else values[:, o : o + 1, i : i + 1]
-    pair = dataclasses.replace(
-        measured,
-        response=pick(measured.response),
-        coherence=pick(measured.coherence),
-        random_error=pick(measured.random_error),
-        errors=measured.errors.pair(o, i),
-        divided=pick(measured.divided),
-        direct_coherence=pick(measured.direct_coherence),
-        multiple_coherence=measured.multiple_coherence[:, o : o + 1],
-        input_names=measured.input_names[i : i + 1],
-        output_names=measured.output_names[o : o + 1],
-    )
+    pair = measured.pair(*places)
     least = least_coherence(min_coherence, cost, pair)
     used = usable(pair, band, least) & (np.abs(np.asarray(pair.response)) > 0)
     count, needed, reason = int(used.sum()), orders.unknowns + 2, None
