@@ -135,6 +135,7 @@ class FrequencyResponse:
     distortion: Distortion | None = None  # of a periodic excitation
     log_noise_covariance: Square | None = None
     divided: Pairs | Array | None = None  # 0 to 1; 0 without
+    swept_at: Float[Array | np.ndarray, "frequencies inputs"] | None = None  # s, of a sweep
     dt: float = eqx.field(static=True, default=0.0)  # s; 0 where nothing was sampled
     hold: float | None = eqx.field(static=True, default=None)  # s
     fed_back: bool = eqx.field(static=True, default=False)  # the records had references: a loop
@@ -308,6 +309,7 @@ class FrequencyResponse:
             random_error=pick(self.random_error),
             errors=self.errors.pair(output, input),
             divided=pick(self.divided),
+            swept_at=None if self.swept_at is None else self.swept_at[:, i],
             direct_coherence=pick(self.direct_coherence),
             multiple_coherence=self.multiple_coherence[:, o],
             input_names=self.input_names[i],
@@ -412,6 +414,7 @@ def frequency_response(
         ```
     """
     from ._average import average_windows
+    from ._clock import sweep_times
     from ._local_polynomial import estimate_local_polynomial
     from ._periodic import estimate_periodic
 
@@ -466,6 +469,7 @@ def frequency_response(
         distortion=estimate.distortion,
         log_noise_covariance=estimate.log_noise_covariance,
         divided=estimate.divided,
+        swept_at=sweep_times(records, method, estimate.omega),
         dt=first.dt,
         hold=first.hold,
         fed_back=bool(first.reference_names),

@@ -299,8 +299,9 @@ class Fit:
     def explain(self) -> Explanation:
         """Which further term the responses want, where the model does not explain them.
 
-        The model is fitted again with one more pole or zero, a pair of them, rate damping, or the
-        slow pair of a hovering vehicle; the lowest information criterion (BIC) decides.
+        The model is fitted again with one more pole or zero, a pair of them, rate damping, the slow
+        pair of a hovering vehicle, or, of a sweep, a gain that drifts with time; the lowest
+        information criterion (BIC) decides.
 
         **Raises:** ValueError where the fit is not one of `jq.fit`.
         """
