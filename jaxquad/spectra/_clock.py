@@ -123,7 +123,8 @@ def sweep_times(
     moments = np.zeros((3, omega.size, records[0].inputs.shape[1]))
     for record in records:
         count = fast_length(record.samples)
-        moving = (record.inputs if method == "direct" else record.references)[:count]
+        moving = record.inputs if method == "direct" else record.references
+        moving = moving[:count, : record.inputs.shape[1]]  # further references are of no input
         moving = moving - np.mean(moving, axis=0)
         time = np.linspace(-0.5, 0.5, count)[:, None] * count * record.dt
         plain, later = (np.fft.rfft(x.T).T for x in (moving, time * moving))
