@@ -120,11 +120,11 @@ def sweep_times(
 ) -> Float[np.ndarray, "frequencies inputs"] | None:
     """When each input sweeps each frequency, in s from the middle of its record, by power; None
     where another excitation moves an input."""
-    moments = np.zeros((3, omega.size, records[0].inputs.shape[1]))
+    inputs = records[0].inputs.shape[1]  # references beyond theirs are other signals
+    moments = np.zeros((3, omega.size, inputs))
     for record in records:
         count = fast_length(record.samples)
-        moving = record.inputs if method == "direct" else record.references
-        moving = moving[:count, : record.inputs.shape[1]]  # further references are of no input
+        moving = (record.inputs if method == "direct" else record.references)[:count, :inputs]
         moving = moving - np.mean(moving, axis=0)
         time = np.linspace(-0.5, 0.5, count)[:, None] * count * record.dt
         plain, later = (np.fft.rfft(x.T).T for x in (moving, time * moving))
