@@ -1,3 +1,4 @@
+from ._actuator import TWO_LAGS as TWO_LAGS, TwoLags as TwoLags
 from ._error_covariance import (
     ErrorCovariance as ErrorCovariance,
     independent_errors as independent_errors,

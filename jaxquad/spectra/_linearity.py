@@ -21,7 +21,7 @@ from ._estimators import COHERENT, Grid, in_hertz, Method, Remark, Response, sum
 from ._frequency_response import Estimate
 
 
-_FEWEST = 8  # points between which the response is interpolated
+FEWEST = 8  # points between which the response is interpolated
 _CLEAR = 6.0  # standard errors from which a remark is made; linear records reached 3.3 and 4.4
 _SMALLEST = 0.05  # change of the gain from which a remark is made
 _DISTINCT_STATIC, _DISTINCT_CHANGE = 0.005, 0.1  # share of a signal that no linear model explains
@@ -69,7 +69,7 @@ def remarks_on_linearity(
     finite = np.isfinite(estimate.response).all(axis=2)
     for i, source in enumerate(first.input_names):
         usable = finite & (estimate.coherence[:, :, i] >= COHERENT)
-        outputs = [o for o in range(usable.shape[1]) if np.sum(usable[:, o]) >= _FEWEST]
+        outputs = [o for o in range(usable.shape[1]) if np.sum(usable[:, o]) >= FEWEST]
         if not outputs:
             continue
         # The input's part at the frequency of a sweep, if all that moves it sweeps.
@@ -82,14 +82,14 @@ def remarks_on_linearity(
                 break
             tones.append(swept[1] if method == "direct" else _at_phase(u, swept[0]))
         scale = float(np.sqrt(np.mean([np.var(record.inputs[:, i]) for record in records])))
-        spectra = [] if tones else [_Spectra.of(record, i, method, scale) for record in records]
+        spectra = [] if tones else [Spectra.of(record, i, method, scale) for record in records]
         for o in outputs:
             pair, used = (first.output_names[o], source), usable[:, o]
             measured = omega[used], estimate.response[used, o], (o, i)
             if tones:
                 chance = _CHANCE / (len(_HARMONICS) * estimate.response[0].size)
                 texts = {"nonlinear": _say_harmonics(records, tones, *measured, chance)}
-            elif left := _left_over(spectra, *measured):
+            elif left := left_over(spectra, *measured):
                 v = np.concatenate([part.input for part in spectra]) / scale
                 static = _say_static(left, v)
                 # `Periodic` suits an excitation that repeats.
@@ -110,7 +110,7 @@ def remarks_on_linearity(
     return tuple(remarks)
 
 
-class _Spectra(NamedTuple):
+class Spectra(NamedTuple):
     """Transforms of one record, and the part of the input that moves it."""
 
     grid: Bins  # rad/s
@@ -121,10 +121,10 @@ class _Spectra(NamedTuple):
     input: Signal  # u, without what noise adds to it in a joint estimate
 
     @classmethod
-    def of(cls, record: Record, i: int, method: Method, scale: float) -> "_Spectra":
+    def of(cls, record: Record, i: int, method: Method, scale: float) -> "Spectra":
         count = fast_length(record.samples)
-        inputs, outputs = _transform(record.inputs[:count]), _transform(record.outputs[:count])
-        moving = inputs if method == "direct" else _transform(record.references[:count])
+        inputs, outputs = transform(record.inputs[:count]), transform(record.outputs[:count])
+        moving = inputs if method == "direct" else transform(record.references[:count])
         u = record.inputs[:count, i] - np.mean(record.inputs[:count, i])
         if method == "joint":  # less what neither the references nor a transient explain
             moved = np.empty_like(inputs[:, i])
@@ -136,10 +136,10 @@ class _Spectra(NamedTuple):
         v, time = u / scale, np.linspace(-1.0, 1.0, count)
         added = np.stack([u * np.abs(v), u * v**2, u * v, u * time]).T
         grid = 2 * np.pi / (count * record.dt) * np.arange(len(inputs))
-        return cls(grid, moving, inputs, outputs, _transform(added), u)
+        return cls(grid, moving, inputs, outputs, transform(added), u)
 
 
-def _transform(columns: Float[np.ndarray, "samples columns"]) -> Columns:
+def transform(columns: Float[np.ndarray, "samples columns"]) -> Columns:
     rows = np.ascontiguousarray(columns.T)
     rows = rows - np.mean(rows, axis=1, keepdims=True)
     return np.fft.rfft(rows).T / np.sqrt(len(columns))
@@ -158,7 +158,7 @@ def _basis(
     return np.linalg.qr(columns / size)[0]
 
 
-class _LeftOver(NamedTuple):
+class LeftOver(NamedTuple):
     """What the local linear model leaves, at the plant's input, of all records and blocks."""
 
     residual: Complex[np.ndarray, " bins"]
@@ -169,9 +169,9 @@ class _LeftOver(NamedTuple):
     slope: Response  # dlnG/dln(omega)
 
 
-def _left_over(
-    spectra: Sequence[_Spectra], omega: Grid, response: OfInputs, pair: tuple[int, int]
-) -> _LeftOver | None:
+def left_over(
+    spectra: Sequence[Spectra], omega: Grid, response: OfInputs, pair: tuple[int, int]
+) -> LeftOver | None:
     """`None` where no block has more bins than the local linear model has coefficients."""
     # dlnG/dln(omega), by straight lines through the points nearby; 0 where there are none.
     place, one, parts = np.log(omega), response[:, pair[1]], []
@@ -216,10 +216,10 @@ def _left_over(
     left, leverage, weight, added = (np.concatenate(part) for part in zip(*rests, strict=True))
     powers = [np.sum(np.abs(part) ** 2, axis=0) for part in (left[:, 1:], added)]
     share = powers[0] / np.maximum(powers[1], 1e-300)
-    return _LeftOver(left[:, 0], left[:, 1:], leverage, weight, share, slope)
+    return LeftOver(left[:, 0], left[:, 1:], leverage, weight, share, slope)
 
 
-def _factors(left: _LeftOver, columns: Columns) -> tuple[np.ndarray, np.ndarray, float]:
+def factors(left: LeftOver, columns: Columns) -> tuple[np.ndarray, np.ndarray, float]:
     """Real factors of columns in the residual, their covariance, and their size in standard errors.
 
     The covariance is that of residuals of any variance (MacKinnon and White, 1985, HC3).
@@ -234,7 +234,7 @@ def _factors(left: _LeftOver, columns: Columns) -> tuple[np.ndarray, np.ndarray,
     return value, covariance, float(np.sqrt(value @ np.linalg.solve(covariance, value)))
 
 
-def _say_static(left: _LeftOver, v: Signal) -> str:
+def _say_static(left: LeftOver, v: Signal) -> str:
     """What functions of the command v, of unit size, say of the gain."""
 
     def gains(columns: list[int], x: Signal, low: int, high: int) -> tuple[float, float, float]:
@@ -242,8 +242,8 @@ def _say_static(left: _LeftOver, v: Signal) -> str:
         if np.min(left.share[columns]) < _DISTINCT_STATIC:
             return 1.0, 1.0, 0.0
         added = left.added[:, columns]
-        value, _, clear = _factors(left, added)
-        if clear < _CLEAR or clear < 2 * _factors(left, 1j * added)[2]:
+        value, _, clear = factors(left, added)
+        if clear < _CLEAR or clear < 2 * factors(left, 1j * added)[2]:
             return 1.0, 1.0, 0.0
         powers = [_POWER[column] for column in columns]
         mean = [np.sum(x**power * v**2) / np.sum(v**2) for power in powers]
@@ -293,7 +293,7 @@ def period_of(signals: Sequence[Float[np.ndarray, "_samples sources"]]) -> int:
     return 0
 
 
-def _say_change(left: _LeftOver, omega: Grid, method: Method) -> str:
+def _say_change(left: LeftOver, omega: Grid, method: Method) -> str:
     """What the input times time says of the response, in magnitude and phase."""
     if left.share[3] < _DISTINCT_CHANGE:
         return ""
@@ -304,7 +304,7 @@ def _say_change(left: _LeftOver, omega: Grid, method: Method) -> str:
     _, strength, turned = np.linalg.svd(real, full_matrices=False)
     distinct = strength > _DEPENDENT * strength[0]
     distinct = turned[distinct].T / strength[distinct]
-    value, covariance, clear = _factors(left, columns @ distinct)
+    value, covariance, clear = factors(left, columns @ distinct)
     if not clear > _CLEAR:
         return ""
     # Of t, from -1 to 1, the mean in the second half is 1 more than that in the first.

@@ -119,7 +119,8 @@ def identify_opened(opened: OpenedLogs) -> Identification:
     bands = explanation = None
     if fit.verdict.fitted and fit.verdict.kind != "no minimum":
         bands = attempt(HALVES, fit.bands)
-        if settings.explain and fit.chi_squared > fitting.MISFIT**2:
+        lags = any(remark.kind == spectra.TWO_LAGS for remark in fit.remarks)
+        if settings.explain and (lags or fit.chi_squared > fitting.MISFIT**2):
             explanation = attempt(EXPLAINED, fit.explain)
     if settings.reference:
         announce("fit to the direct response")
