@@ -6,6 +6,9 @@ m' = |u - m| / T_u or -|u - m| / T_d, which is m' = (u + b |u - m| - m) / T with
 b |u - m| is added. Of this, an even function of the command, a linear model explains nothing. It is
 looked for in what the local linear model leaves, behind lags over the whole band. Then b, or both
 lags, follow by least squares, in which what is linear is that from the added input.
+
+An actuator that moves in steps q adds the rounding error of its command, a sawtooth of period q in
+u. The transform of what is left, over the command and not over time, has a peak there.
 """
 
 import dataclasses
@@ -19,10 +22,20 @@ from jaxquad.records import Record
 
 from ._estimators import COHERENT, Method, Pair, Remark
 from ._frequency_response import Estimate
-from ._linearity import factors, FEWEST, left_over, LeftOver, local_mean, Signal, Spectra, transform
+from ._linearity import (
+    factors,
+    FEWEST,
+    interpolated,
+    left_over,
+    LeftOver,
+    local_mean,
+    Signal,
+    Spectra,
+    transform,
+)
 
 
-TWO_LAGS = "two lags"  # kind of a remark
+TWO_LAGS, STEPS = "two lags", "steps"  # kinds of remarks
 _CLEAR = 4.0  # standard errors from which a remark is made; healthy records reached 3.3
 # What a lag must add to a gain that differs for both signs: standard errors, and share of their
 # square.
@@ -33,6 +46,12 @@ _TABLE, _AROUND = 7, 4.0  # lags for which b is estimated, by which factor aroun
 _MOST = 0.9  # b
 _STEPS, _LONGEST, _DIFFERENCE, _STILL = 8, 0.5, 1e-3, 0.05  # the last in standard errors
 _DETERMINED = 0.3  # relative error of a lag that is printed
+
+_FEWEST_STEPS, _MOST_STEPS = 3.0, 80.0  # over the range of a command
+_PLACES, _PADDED, _PEAKS = 4096, 4, 6  # of the range; its transform's length; peaks that are tried
+_CLEAR_STEPS, _LIKE = 5.0, 0.5  # standard errors; how far a sawtooth may be from a step's size
+_EVERYWHERE, _HALF = 3.0, 0.75  # likewise, for small and for large commands
+_BIASED = 3.0  # random errors of the gain from which a remark is made
 
 Commands = Sequence[Signal]
 
@@ -92,8 +111,8 @@ def input_of_one_lag(u: Signal, up: float, down: float, record: Record) -> Signa
 def remarks_on_actuator(
     records: Sequence[Record], method: Method, estimate: Estimate
 ) -> tuple[tuple[Remark, ...], Sequence[Record], Estimate]:
-    """One for each input whose actuator has clearly two lags, by its most precise output. Records
-    and estimate are those from the input of one lag."""
+    """For each input whose actuator has clearly two lags, or steps, by its most precise output.
+    Records and estimate are those from the input of one lag, without steps."""
     finite, remarks, first = np.isfinite(estimate.response).all(axis=2), [], records[0]
     response = np.array(estimate.response)
     inputs = [record.inputs.copy() for record in records]
@@ -104,6 +123,11 @@ def remarks_on_actuator(
         if np.sum(used := usable[:, o]) >= FEWEST:
             pair = (first.output_names[o], source)
             search = _Search(records, method, estimate, used, (o, i))
+            steps = search.remark_on_steps(pair, error[used, o])
+            if steps is not None:
+                remarks.append(steps)
+                for mine, u in zip(inputs, search.commands, strict=True):
+                    mine[:, i] = u
             remark = search.remark(pair)
             if remark is None:
                 continue
@@ -130,6 +154,7 @@ class _Search:
         o, i = self.place = place
         self.records, self.method, self.grid = records, method, np.asarray(estimate.omega)
         self.omega, self.response = self.grid[used], np.asarray(estimate.response)[used, o]
+        self.covariance = lambda: estimate.errors.between((o, i), (o, i))[np.ix_(used, used)]
         scale = float(np.sqrt(np.mean([np.var(record.inputs[:, i]) for record in records])))
         self.spectra = [Spectra.of(record, i, method, scale) for record in records]
         self.commands = [record.inputs[:, i] for record in records]
@@ -197,6 +222,85 @@ class _Search:
         remark.changes, remark.further, remark.clear = changes, further, float(clear[best])
         return remark
 
+    def remark_on_steps(self, pair: Pair, error: np.ndarray) -> Remark | None:
+        """Where steps bias the gain by more than its random error; then these are the commands."""
+        low = min(float(np.min(u)) for u in self.moved)
+        width = max(float(np.max(u)) for u in self.moved) - low
+        total, i = np.zeros(_PLACES), self.place[1]
+        for part in self.spectra:  # what is left, weighted, over the command
+            ends = np.searchsorted(part.grid, [self.omega[0], self.omega[-1]])
+            band = slice(max(int(ends[0]), 1), int(ends[1]))
+            plant = interpolated(part.grid[band], self.omega, self.response)
+            rest = part.outputs[band, self.place[0]] - np.sum(plant * part.inputs[band], axis=1)
+            rest, weighted = rest / plant[:, i], np.zeros(part.grid.size, complex)
+            weighted[band] = rest / np.maximum(local_mean(np.abs(rest) ** 2, band.start), 1e-280)
+            where = ((part.input - low) / width * (_PLACES - 1)).astype(int)
+            left = np.fft.irfft(weighted, part.input.size)
+            total += np.bincount(where, weights=left, minlength=_PLACES)
+        height = np.abs(np.fft.fft(total, _PADDED * _PLACES))
+        nearby = np.sqrt(local_mean(height**2, 0)) + 1e-280
+        inner = np.arange(int(_PADDED * _FEWEST_STEPS), int(_PADDED * _MOST_STEPS))
+        tops = inner[(height[inner] >= height[inner - 1]) & (height[inner] >= height[inner + 1])]
+        # The highest, and those that rise highest above what is nearby.
+        tops = {k for x in (height, height / nearby) for k in tops[np.argsort(-x[tops])][:_PEAKS]}
+        sizes, offsets = [], []
+        for top in sorted(tops):
+            many = (top + np.linspace(-1, 1, 17)) / _PADDED  # steps over the range
+            waves = np.exp(2j * np.pi * np.outer(many, (np.arange(_PLACES) + 0.5) / _PLACES))
+            sums = waves @ total
+            k = int(np.argmax(np.abs(sums)))
+            sizes.append(width / many[k])
+            offsets.append(low + (np.angle(sums[k]) / (2 * np.pi) + 0.25) * sizes[-1])
+        if not sizes:
+            return None
+        rounding = lambda u, q, at: q * np.round((u - at) / q) - (u - at)
+        steps = list(zip(sizes, offsets, strict=True))
+        added = [np.stack([rounding(u, *one) for one in steps], axis=1) for u in self.moved]
+        left = self.examine(self.commands, added)
+        if left is None:
+            return None
+        single = [factors(left, left.added[:, [k]]) for k in range(len(steps))]
+        factor = np.array([one[0][0] for one in single])
+        like = (np.abs(factor - 1) <= _LIKE) & (left.share[: factor.size] > _DISTINCT)
+        clear = np.where(like, [one[2] for one in single], 0.0)
+        best = int(np.argmax(clear))
+        if clear[best] < _CLEAR_STEPS:
+            return None
+        size, offset = steps[best]
+        # Steps are there at small and at large commands; a saturation or a deadband is not.
+        halves = []
+        for u in self.moved:
+            error_of_steps, outer = rounding(u, size, offset), np.abs(u) > 0.3 * width
+            halves.append(np.stack([error_of_steps * ~outer, error_of_steps * outer], axis=1))
+        left = self.examine(self.commands, halves)
+        if left is None:
+            return None
+        both, covariance, _ = factors(left, left.added[:, :2])
+        if np.any(both < np.maximum(_EVERYWHERE * np.sqrt(np.diagonal(covariance)), 1 - _HALF)):
+            return None
+        moved = [u + rounding(u, size, offset) for u in self.moved]
+        change = np.real(self._change(moved, self.moved))[np.isin(self.grid, self.omega)] - 1
+        shares = error**-2.0 / np.sum(error**-2.0)
+        bias, scaled = float(factor[best] * shares @ change), shares / self.response[:, i]
+        variance = 0.5 * np.real(scaled @ self.covariance() @ np.conj(scaled))
+        if not abs(bias) > _BIASED * np.sqrt(variance):
+            return None
+        shifts = [
+            np.mean(u[: mine.size]) for u, mine in zip(self.commands, self.moved, strict=True)
+        ]
+        self.commands = [
+            u + rounding(u - shift, size, offset)
+            for u, shift in zip(self.commands, shifts, strict=True)
+        ]
+        text = (
+            f"the actuator moves in steps of {size:.3g}, {width / size:.2g} over the range of its "
+            f"command: what the model leaves follows their rounding ({clear[best]:.2g} standard "
+            f"errors). The gain is biased by about {100 * bias:+.2g} %, which the error bars do "
+            "not include, and differs at other amplitudes. Repeat with a larger amplitude, or "
+            "record what the actuator does (its position or rpm) as the input"
+        )
+        return Remark(text, pair=pair, kind=STEPS)
+
     def inputs_of(
         self, lag: float, z: np.ndarray, commands: Commands | None = None
     ) -> list[Signal]:
@@ -231,7 +335,9 @@ class _Search:
                 return z, covariance
         return z, unknown if z.size > 1 else covariance
 
-    def _change(self, inputs: Commands) -> Complex[np.ndarray, " frequencies"]:
+    def _change(
+        self, inputs: Commands, commands: Commands | None = None
+    ) -> Complex[np.ndarray, " frequencies"]:
         """The response of these inputs to the commands, at the frequencies of the estimate."""
 
         def near(
@@ -241,11 +347,11 @@ class _Search:
             return np.asarray(np.interp(self.grid, grid, mean))
 
         i, above, below = self.place[1], 0.0, 0.0
-        for part, u in zip(self.spectra, inputs, strict=True):
+        for part, u, v in zip(self.spectra, inputs, commands or self.commands, strict=True):
             moving = part.moving[:, min(i, part.moving.shape[1] - 1)]
-            changed = transform(u[: part.input.size, None])[:, 0]
+            changed, plain = transform(np.stack([u, v], axis=1)[: part.input.size]).T
             above = above + near(part.grid, changed * np.conj(moving))
-            below = below + near(part.grid, part.inputs[:, i] * np.conj(moving))
+            below = below + near(part.grid, plain * np.conj(moving))
         return np.asarray(above / below)
 
     def _sizes(self, record: Record, u: Signal, lags: Float[np.ndarray, " lags"]) -> np.ndarray:
