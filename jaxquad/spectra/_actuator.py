@@ -48,9 +48,9 @@ _STEPS, _LONGEST, _DIFFERENCE, _STILL = 8, 0.5, 1e-3, 0.05  # the last in standa
 _DETERMINED = 0.3  # relative error of a lag that is printed
 
 _FEWEST_STEPS, _MOST_STEPS = 3.0, 80.0  # over the range of a command
-_PLACES, _PADDED, _PEAKS = 4096, 4, 6  # of the range; its transform's length; peaks that are tried
-_CLEAR_STEPS, _LIKE = 5.0, 0.5  # standard errors; how far a sawtooth may be from a step's size
-_EVERYWHERE, _HALF = 3.0, 0.75  # likewise, for small and for large commands
+_PLACES, _PADDED, _PEAKS = 4096, 32, 6  # of the range; its transform's length; peaks that are tried
+_CLEAR_STEPS, _LIKE = 5.0, (0.45, 1.25)  # standard errors; share of the rounding's size
+_EVERYWHERE, _HALF = 3.0, (0.25, 1.25)  # likewise, for small and for large commands
 _BIASED = 3.0  # random errors of the gain from which a remark is made
 
 Commands = Sequence[Signal]
@@ -237,20 +237,18 @@ class _Search:
             where = ((part.input - low) / width * (_PLACES - 1)).astype(int)
             left = np.fft.irfft(weighted, part.input.size)
             total += np.bincount(where, weights=left, minlength=_PLACES)
-        height = np.abs(np.fft.fft(total, _PADDED * _PLACES))
-        nearby = np.sqrt(local_mean(height**2, 0)) + 1e-280
-        inner = np.arange(int(_PADDED * _FEWEST_STEPS), int(_PADDED * _MOST_STEPS))
+        ends = int(_PADDED * _FEWEST_STEPS), int(_PADDED * _MOST_STEPS)
+        sums = np.conj(np.fft.rfft(total, _PADDED * _PLACES)[: ends[1] + 2])
+        height = np.abs(sums)
+        nearby, inner = np.sqrt(local_mean(height**2, 0)) + 1e-280, np.arange(*ends)
         tops = inner[(height[inner] >= height[inner - 1]) & (height[inner] >= height[inner + 1])]
         # The highest, and those that rise highest above what is nearby.
         tops = {k for x in (height, height / nearby) for k in tops[np.argsort(-x[tops])][:_PEAKS]}
-        sizes, offsets = [], []
-        for top in sorted(tops):
-            many = (top + np.linspace(-1, 1, 17)) / _PADDED  # steps over the range
-            waves = np.exp(2j * np.pi * np.outer(many, (np.arange(_PLACES) + 0.5) / _PLACES))
-            sums = waves @ total
-            k = int(np.argmax(np.abs(sums)))
-            sizes.append(width / many[k])
-            offsets.append(low + (np.angle(sums[k]) / (2 * np.pi) + 0.25) * sizes[-1])
+        sizes = [width * _PADDED / k for k in sorted(tops)]
+        offsets = [
+            low + (np.angle(sums[k]) / (2 * np.pi) + 0.25) * size
+            for k, size in zip(sorted(tops), sizes, strict=True)
+        ]
         if not sizes:
             return None
         rounding = lambda u, q, at: q * np.round((u - at) / q) - (u - at)
@@ -261,7 +259,7 @@ class _Search:
             return None
         single = [factors(left, left.added[:, [k]]) for k in range(len(steps))]
         factor = np.array([one[0][0] for one in single])
-        like = (np.abs(factor - 1) <= _LIKE) & (left.share[: factor.size] > _DISTINCT)
+        like = (factor > _LIKE[0]) & (factor < _LIKE[1]) & (left.share[: factor.size] > _DISTINCT)
         clear = np.where(like, [one[2] for one in single], 0.0)
         best = int(np.argmax(clear))
         if clear[best] < _CLEAR_STEPS:
@@ -276,7 +274,8 @@ class _Search:
         if left is None:
             return None
         both, covariance, _ = factors(left, left.added[:, :2])
-        if np.any(both < np.maximum(_EVERYWHERE * np.sqrt(np.diagonal(covariance)), 1 - _HALF)):
+        least = np.maximum(_EVERYWHERE * np.sqrt(np.diagonal(covariance)), _HALF[0])
+        if np.any(both < least) or np.any(both > _HALF[1]):
             return None
         moved = [u + rounding(u, size, offset) for u in self.moved]
         change = np.real(self._change(moved, self.moved))[np.isin(self.grid, self.omega)] - 1
