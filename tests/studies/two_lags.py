@@ -90,7 +90,10 @@ SETTINGS = [
     DAMPED._replace(name="damped rate, u^2 of 20 %", bend=-0.2),
     Setting("rate, P, 5 steps", steps=5),
     Setting("rate, P, 8 steps", steps=8),
-    DAMPED._replace(name="damped rate, open, 5 steps", steps=5),
+    DAMPED._replace(name="damped rate, open, 5 steps", steps=5, noise=0.05),
+    DAMPED._replace(name="damped rate, open, 4.7 steps", steps=4.7, noise=0.05),
+    DAMPED._replace(name="damped rate, open, 8 steps", steps=8, noise=0.05),
+    DAMPED._replace(name="damped rate, open, 5 steps, noise 4 times", steps=5),
     MODE._replace(name="mode, multisine, 5 steps", steps=5),
     ANGLE._replace(name="angle, PD, 4 steps", steps=4),
 ]
