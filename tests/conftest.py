@@ -20,6 +20,7 @@ import pytest
 import type_checks
 
 
+gc.disable()  # while tests are collected
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")
@@ -30,6 +31,7 @@ QUICKLY = "jax_disable_most_optimizations"
 FLAGS = "--xla_backend_optimization_level=0"
 if version("jaxlib").startswith("0.10."):  # another XLA may not know this one, and would exit
     FLAGS += " --xla_cpu_use_fusion_emitters=false"  # a quarter less of the tests' processor time
+    FLAGS += " --xla_llvm_disable_expensive_passes=true --xla_cpu_parallel_codegen_split_count=1"
 FOLDER, LEAST = "JAX_COMPILATION_CACHE_DIR", "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"
 
 
@@ -70,9 +72,11 @@ def pytest_runtest_setup():
 
 
 def pytest_collection_finish():
-    """Let later collections of garbage pass over what was imported: it stays until the end."""
+    """Let collections of garbage come seldom, and pass over what was imported, which stays."""
     gc.collect()
     gc.freeze()
+    gc.set_threshold(20_000)  # else 1 s of 20
+    gc.enable()
 
 
 @pytest.fixture(scope="module", autouse=True)

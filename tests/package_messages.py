@@ -12,19 +12,22 @@ PACKAGE = ROOT / "jaxquad"
 
 
 @functools.cache
-def parsed(path: Path) -> ast.Module:
-    return ast.parse(path.read_text())
+def nodes(path: Path) -> tuple[ast.AST, ...]:
+    """Of the syntax of a file: to walk all of them takes a second for the package."""
+    return tuple(ast.walk(ast.parse(path.read_text())))
 
 
-def messages() -> Iterator[tuple[str, str]]:
+@functools.cache
+def messages() -> tuple[tuple[str, str], ...]:
     """Every text of four words or more that is neither a docstring nor an annotation."""
+    found = []
     for path in sorted(PACKAGE.rglob("*.py")):
-        tree = parsed(path)
-        silent = {id(node) for each in ast.walk(tree) for node in _silent(each)}
-        for node in ast.walk(tree):
-            text = "" if id(node) in silent else _text(node)
-            if isinstance(node, ast.expr) and len(text.split()) >= 4:
-                yield f"{path.relative_to(ROOT)}:{node.lineno}", text
+        silent = {id(node) for each in nodes(path) for node in _silent(each)}
+        for node in nodes(path):
+            if isinstance(node, ast.expr) and id(node) not in silent:
+                place, text = f"{path.relative_to(ROOT)}:{node.lineno}", _text(node)
+                found += [(place, text)] if len(text.split()) >= 4 else []
+    return tuple(found)
 
 
 def _silent(node: ast.AST) -> Iterator[ast.AST]:

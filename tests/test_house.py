@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 from conftest import ROOT
-from package_messages import PACKAGE, parsed
+from package_messages import nodes, PACKAGE
 
 from jaxquad.records.firmware import firmware_log
 
@@ -28,7 +28,7 @@ def imports(path: Path) -> Iterator[tuple[str, ...]]:
     """The absolute names of the modules of this package that a file imports."""
     own = path.relative_to(ROOT).with_suffix("").parts
     package = own[:-1]
-    for node in ast.walk(parsed(path)):
+    for node in nodes(path):
         if isinstance(node, ast.ImportFrom):
             base = package[: len(package) - node.level + 1] if node.level else ()
             yield (*base, *(node.module or "").split(".")) if node.module else base
@@ -65,7 +65,7 @@ def test_what_knows_the_compilers_has_one_door():
 def test_no_file_but_its_own_asks_whether_a_firmware_is_the_one():
     for path in (path for path in FILES if "formats" not in path.parts):
         others = FIRMWARES - ({*path.stem.split("_")} if "firmwares" in path.parts else set())
-        for node in ast.walk(parsed(path)):
+        for node in nodes(path):
             if isinstance(node, ast.Compare):
                 words = {x.value for x in ast.walk(node) if isinstance(x, ast.Constant)}
                 line = f"{path.relative_to(ROOT)}:{node.lineno}"
@@ -105,14 +105,14 @@ def test_what_pages_quote_is_measured_through_public_calls(path):
 
 
 def names_of_imports(path: Path) -> Iterator[tuple[str, ...]]:
-    for node in ast.walk(parsed(path)):
+    for node in nodes(path):
         if isinstance(node, ast.ImportFrom) and not node.level:
             yield from ((*(node.module or "").split("."), name.name) for name in node.names)
 
 
 def attributes(path: Path) -> Iterator[tuple[str, ...]]:
     """As `jq.room._file`."""
-    for node in ast.walk(parsed(path)):
+    for node in nodes(path):
         if isinstance(node, ast.Attribute):
             name = ast.unparse(node).split(".")
             yield ("jaxquad", *name[1:]) if name[0] == "jq" else tuple(name)
@@ -128,9 +128,9 @@ VAGUE = {
 }  # fmt: skip
 
 
-def bindings(tree: ast.AST) -> Iterator[tuple[int, str]]:
+def bindings(path: Path) -> Iterator[tuple[int, str]]:
     """The line and name of all that a file binds: variables, fields, arguments, functions."""
-    for node in ast.walk(tree):
+    for node in nodes(path):
         match node:
             case ast.Name(id=name, ctx=ast.Store()) | ast.Attribute(attr=name, ctx=ast.Store()):
                 yield node.lineno, name
@@ -144,7 +144,7 @@ def test_a_name_says_what_a_value_is():
     vague = [
         f"{path.relative_to(ROOT)}:{line}: {name}"
         for path in FILES
-        for line, name in (*bindings(parsed(path)), (0, path.stem))
+        for line, name in (*bindings(path), (0, path.stem))
         if name.strip("_") in VAGUE
     ]
     assert not vague, "\n".join(["name the value by the field's noun:", *vague])

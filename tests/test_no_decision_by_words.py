@@ -1,11 +1,11 @@
 """No code decides by the words of a message: its `kind` says what it is about."""
 
 import ast
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import pytest
 from conftest import ROOT
-from package_messages import PACKAGE, parsed
+from package_messages import nodes, PACKAGE
 
 
 OF_JAX = ("_xla", "_compile")  # errors of JAX say by their text alone what they are
@@ -28,10 +28,10 @@ LOOKS = {
 MATCHES = {"findall", "finditer", "fullmatch", "match", "search", "split", "sub"}
 
 
-def decisions(tree: ast.Module) -> Iterator[ast.expr]:
+def decisions(nodes: Sequence[ast.AST]) -> Iterator[ast.expr]:
     """Every expression that looks into the words of an error, a remark, a verdict or a remedy."""
-    bound = {name for node in ast.walk(tree) for name in _bound_to_texts(node)}
-    for node in ast.walk(tree):
+    bound = {name for node in nodes for name in _bound_to_texts(node)}
+    for node in nodes:
         if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute):
             looks = node.func.attr in LOOKS and _is_text(node.func.value, bound)
             matches = node.func.attr in MATCHES and any(_is_text(x, bound) for x in node.args)
@@ -87,7 +87,7 @@ def test_no_code_decides_by_the_words_of_a_message():
         f"{path.relative_to(ROOT)}:{node.lineno}: {ast.unparse(node)}"
         for path in sorted(PACKAGE.rglob("*.py"))
         if path.relative_to(PACKAGE).parts[0] not in OF_JAX
-        for node in decisions(parsed(path))
+        for node in decisions(nodes(path))
     ]
     assert not found
 
@@ -106,7 +106,7 @@ def test_no_code_decides_by_the_words_of_a_message():
     ],
 )
 def test_what_would_decide_by_words_is_seen(code):
-    assert list(decisions(ast.parse(code)))
+    assert list(decisions([*ast.walk(ast.parse(code))]))
 
 
 @pytest.mark.parametrize(
@@ -119,4 +119,4 @@ def test_what_would_decide_by_words_is_seen(code):
     ],
 )
 def test_what_decides_by_a_kind_is_allowed(code):
-    assert not list(decisions(ast.parse(code)))
+    assert not list(decisions([*ast.walk(ast.parse(code))]))

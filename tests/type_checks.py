@@ -2,10 +2,12 @@
 
 A search calls the same small functions some 10,000 times. To check all of these calls takes longer
 than they do. So calls whose arrays have the same shapes and types are checked a few times in each
-test; what is new is always checked.
+test; what is new is always checked. A function that is defined within another is made at each call
+of that one: its check is made once.
 """
 
 from collections import Counter
+from typing import Any
 
 import jax
 import numpy as np
@@ -17,6 +19,7 @@ _ARRAYS = (np.ndarray, np.generic, jax.Array)
 _LONG = 16  # items of a list, beyond which its length stands for it
 _tests = 0  # that have begun in this process
 _is_array: dict[type, bool] = {}
+_checks: dict[tuple, Any] = {}  # by module, name, parameters and their types
 _of_all_items = beartype(conf=BeartypeConf(strategy=BeartypeStrategy.On))
 
 
@@ -28,6 +31,20 @@ def begin_test():
 
 def checked(function):
     """`function` for its checks only, as jaxtyping calls it: made when it is called first."""
+    types, code = function.__annotations__, function.__code__
+    if all(kind is Any for kind in types.values()):
+        return function
+    counts = code.co_argcount, code.co_posonlyargcount, code.co_kwonlyargcount, code.co_flags
+    key = (function.__module__, function.__qualname__, code.co_varnames, counts, *types.items())
+    try:
+        if key not in _checks:
+            _checks[key] = _check_of(function)
+        return _checks[key]
+    except TypeError:  # a type without a hash
+        return _check_of(function)
+
+
+def _check_of(function):
     check, test, calls = None, 0, Counter()
 
     def check_first(*args, **kwargs):

@@ -16,7 +16,7 @@ import numpy as np
 from jax.tree_util import KeyPath
 from jaxtyping import Array, ArrayLike, Float, Int, PyTree
 
-from ._messages import is_concrete
+from ._host import is_concrete
 
 
 Tree = TypeVar("Tree")

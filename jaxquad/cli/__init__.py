@@ -1,3 +1,332 @@
-"""The command line `jaxquad`: options in, messages out."""
+"""The command line `jaxquad`: options in, messages out.
 
-from ._main import main as main, make_parser as make_parser
+Here are `main` and the commands that need no flight: a demonstration, and a signal to excite the
+vehicle with.
+"""
+
+import argparse
+import contextlib
+import difflib
+import io
+import os
+import re
+import sys
+import warnings
+from collections.abc import Callable, Sequence
+from importlib.metadata import version
+from itertools import chain, count
+from pathlib import Path
+
+import jaxquad.workflows as workflows
+from jaxquad._core import is_ours, readable
+from jaxquad.records import RecordWarning
+from jaxquad.report import PageWarning
+from jaxquad.workflows import AutopilotSettings, in_options
+
+from . import _options as shell
+from ._logs import (
+    autopilot,
+    batch,
+    channels,
+    finish_identification,
+    identify,
+    NOT_IDENTIFIABLE,
+    report,
+    run_autopilot,
+    tune,
+    verify,
+)
+from ._options import Run
+
+
+__all__ = ["main", "make_parser"]
+_NEXT = """
+
+The log is simulated: one axis under rate feedback, in gusts, excited by a sweep of its command.
+True values: gain {gain:g}, lag {lag:g} s, delay {delay:g} s, so lag + delay = {sum:.4g} s.
+Look at {{report}}
+Then identify your own log:
+  jaxquad channels YOUR.LOG
+  jaxquad identify YOUR.LOG"""
+_NEXT_FLIGHT = """
+
+The flight is measured: an ANT-X quadrotor on a pitch test stand in closed loop, with a binary
+sequence on the set-point x0 of its position.
+Look at {report}"""
+_NEXT_CHIRP = """
+
+The log is simulated, as Betaflight 2026.6 writes it: a 5-inch quadrotor with default gains rests,
+takes off, and flies a chirp on roll from 0.5 to 40 Hz, in gusts and gyro noise.
+True plant of roll: gain {gain:g}, lag {lag:g} s, delay {delay:g} s.
+Look at {{page}}
+Then your own log:
+  jaxquad autopilot YOUR.BFL"""
+
+
+@shell.command(
+    "write a simulated log whose true model is known, and identify it",
+    """examples:
+  jaxquad demo
+  jaxquad demo --autopilot
+  jaxquad demo --flight
+
+exit codes: 0 done, 2 the folder cannot be written, or the flight is not found; with --autopilot
+those of jaxquad autopilot
+""",
+)
+def demo(declared: argparse.ArgumentParser) -> Run:
+    text = "identify a measured flight instead: a quadrotor on a pitch test stand (JAXQUAD_DATA)"
+    source = declared.add_mutually_exclusive_group()
+    source.add_argument("--flight", action="store_true", help=text)
+    text = "tune the gains of a simulated Betaflight chirp flight instead, to a parameter file"
+    source.add_argument("--autopilot", action="store_true", help=text)
+    content = "result.json, or autopilot.json,"
+    shell.add_output(declared, content, folder="results/demo, demo_flight or demo_autopilot")
+
+    def run(options: argparse.Namespace) -> int:
+        if options.autopilot:
+            shell.start_computing()
+            from jaxquad.autopilot import CHIRP_TRUTH, write_chirp_log
+
+            folder = options.out or Path("results/demo_autopilot")
+            log, axis = write_chirp_log(folder / "demo.bfl"), AutopilotSettings(axis="roll")
+            return run_autopilot(options, log, axis, folder, _NEXT_CHIRP.format(**CHIRP_TRUTH))
+        if options.flight:
+            log, settings = workflows.find_demo_flight()  # before JAX: it may not be there
+            folder, note = Path("results/demo_flight"), _NEXT_FLIGHT
+            shell.start_computing()
+        else:
+            shell.start_computing()
+            settings, truth, folder = workflows.DEMO, workflows.DEMO_TRUTH, Path("results/demo")
+            log = workflows.write_demo_log((options.out or folder) / "demo.csv")
+            note = _NEXT.format(**truth, sum=truth["lag"] + truth["delay"])
+        result = workflows.identify(log, settings)
+        return finish_identification(options, result, options.out or folder, note)
+
+    return run
+
+
+_BELOW_GUIDELINE = 4
+
+
+@shell.command(
+    "make a signal to excite the vehicle with, and check it against published guidelines",
+    """examples:
+  jaxquad design sweep --band 0.3 12 --rate 500 --amplitude 0.2 --out sweep.csv
+  jaxquad design multisine --band 0.3 12 --rate 500 --amplitude 0.2 --lines 25 --json
+
+exit codes: 0 done, 2 unusable input, 4 a guideline is not met (the signal is written all the same)
+""",
+)
+def design(declared: argparse.ArgumentParser) -> Run:
+    declared.add_argument("kind", choices=("sweep", "multisine"))
+    add = declared.add_argument_group("the signal").add_argument
+    text = "in Hz; 1 Hz is 6.28 rad/s"
+    add("--band", type=float, nargs=2, required=True, metavar=("LOW", "HIGH"), help=text)
+    add("--rate", type=float, required=True, metavar="HZ", help="samples per second")
+    add("--amplitude", type=float, required=True, help="peak, in the unit of the command")
+    text = "of the excitation, without the 3 s of rest around a sweep; by default five of a "
+    text += "sweep's longest periods, ten of a multisine's"
+    add("--duration", type=float, metavar="S", help=text)
+    add("--lines", type=int, metavar="N", help="frequencies of a multisine; by default all")
+    text = "expected bandwidth of the response, for the guideline on the lower end of the band"
+    add("--bandwidth", type=float, metavar="HZ", help=text)
+    text = "where the phase is expected to be -180 degrees, for the guideline on the upper end"
+    add("--phase-crossover", type=float, metavar="HZ", help=text)
+    force = "overwrite another signal; without it, that is kept, and CSV-2 written"
+    file = ("CSV", "by default sweep.csv or multisine.csv")
+    shell.add_output(declared, "the guidelines", file=file, force=force, quiet=False)
+
+    def run(options: argparse.Namespace) -> int:
+        import numpy as np
+
+        from jaxquad._core import write_file
+        from jaxquad.excitation import check_guidelines, harmonics, multisine, sweep
+
+        (low, high), rate, duration = options.band, options.rate, options.duration
+        is_sweep = options.kind == "sweep"
+        if is_sweep and options.lines is not None:
+            raise ValueError("--lines is for a multisine: leave it out, or design a multisine")
+        if not 0 < low < high:
+            raise ValueError(f"--band is {low:g} {high:g}: give two frequencies above 0, rising")
+        if not rate > 0:
+            raise ValueError(f"--rate is {rate:g}: give a rate above 0 Hz")
+        band = 2 * np.pi * low, 2 * np.pi * high
+        if is_sweep:
+            duration = 5 / low if duration is None else duration
+            signal = sweep(*band, duration=duration, sample_rate=rate, amplitude=options.amplitude)
+        else:
+            period = np.ceil(rate / low - 1e-9) / rate
+            duration = 10 * period if duration is None else duration
+            if not duration > 0:
+                raise ValueError(f"--duration is {duration:g}: give a time above 0 s")
+            signal = multisine(
+                harmonics(*band, period=period, lines=options.lines), period=period,
+                periods=max(1, round(duration / period)), sample_rate=rate,
+                amplitude=options.amplitude,
+            )  # fmt: skip
+        radian = lambda hertz: None if hertz is None else 2 * np.pi * hertz
+        check = check_guidelines(
+            signal,
+            omega_bandwidth=radian(options.bandwidth),
+            omega_180=radian(options.phase_crossover),
+        )
+        rows = (f"{t:.9g},{u:.9g}\n" for t, u in zip(signal.time, signal.signal, strict=True))
+        content = f"time,signal\n{''.join(rows)}"
+        wanted = options.out or Path(f"{options.kind}.csv")
+        numbered = (wanted.with_stem(f"{wanted.stem}-{number}") for number in count(2))
+        out = next(  # another signal is kept
+            path
+            for path in chain([wanted], numbered)
+            if options.force or not path.exists() or path.read_bytes() == content.encode()
+        )
+        write_file(out, content)
+        if options.json:
+            rules = [rule._asdict() for rule in check]
+            shell.print_json(
+                {"file": str(out), "samples": signal.time.size, "ok": check.ok, "rules": rules}
+            )
+        else:
+            hertz = f"{low:g} to {high:g} Hz ({band[0]:.3g} to {band[1]:.3g} rad/s)"
+            print(f"{signal.time.size} samples, {signal.time[-1]:.4g} s, {hertz}\n{check}\n{out}")
+        return 0 if check.ok else _BELOW_GUIDELINE
+
+    return run
+
+
+# In order of use.
+_COMMANDS = (demo, design, channels, identify, verify, tune, autopilot, report, batch)
+_WAY = """jaxquad demo                   a simulated flight, identified: results/demo/report.html
+jaxquad identify YOUR.LOG      a model of your own flight, with error bars
+jaxquad tune results/YOUR ...  gains from it, with a certificate; jaxquad --help lists all commands
+"""
+_PLACES = {  # what a command takes beside its options
+    "demo": "",
+    "design": "{sweep,multisine} --band LOW HIGH --rate HZ --amplitude AMPLITUDE ",
+    "channels": "FILE ",
+    "identify": "FILE [FILE ...] ",
+    "verify": "RESULT FILE ",
+    "tune": "RESULT --inertia J --limit NUMBER ",
+    "autopilot": "FILE ",
+    "report": "RESULT ",
+    "batch": "FOLDER ",
+}
+_CODES = """exit codes:
+  0  done
+  2  the input or the options cannot be used
+  3  the record does not determine the parameters
+  4  some logs of a batch failed, a design is not to be flown, or an excitation misses a guideline
+  130  interrupted
+"""
+_UNUSABLE, _INTERRUPTED, _CLOSED = 2, 130, 141
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line.
+
+    **Arguments:**
+
+    - `argv`: its words; those of the process by default.
+
+    **Returns:** the exit code, see `jaxquad --help`.
+    """
+    words = sys.argv[1:] if argv is None else list(argv)
+    if isinstance(sys.stdout, io.TextIOWrapper):  # which may know fewer letters than names of files
+        sys.stdout.reconfigure(errors="replace")
+    try:
+        try:
+            return _run(words)
+        finally:
+            sys.stdout.flush()  # a full disk shows here, or never
+    except OSError as error:  # what the system could not do: `out/a.png: no space left on device`
+        place, why = error.filename or "what is printed", error.strerror
+        if error.filename is None:  # else the end of the process tries once more
+            with contextlib.suppress(io.UnsupportedOperation):  # of a test
+                os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        if isinstance(error, BrokenPipeError):  # `jaxquad ... | head` has read enough
+            return _CLOSED
+        return _fail(f"{place}: {why.lower()}" if why else str(error), _UNUSABLE)
+    except ValueError as error:
+        code = _UNUSABLE
+        if "jaxquad.identify" in sys.modules:  # else nothing was fitted, and JAX is not needed
+            from jaxquad.identify import UndeterminedError
+
+            code = NOT_IDENTIFIABLE if isinstance(error, UndeterminedError) else _UNUSABLE
+        return _fail(in_options(error), code)
+    except KeyboardInterrupt:
+        print("jaxquad: interrupted", file=sys.stderr)
+        return _INTERRUPTED
+
+
+def _run(words: Sequence[str]) -> int:
+    if not words:
+        print(_WAY, end="")
+        return 0
+    options, unknown = make_parser().parse_known_args(words)
+    if unknown:
+        return _fail(_describe_unknown(options, unknown), _UNUSABLE)
+    with warnings.catch_warnings(), shell.shown_stages(options):
+        for kind in (RecordWarning, PageWarning):
+            warnings.simplefilter("always", kind)
+        warnings.showwarning = printer_of_warnings()
+        shell.check_out(options)
+        return options.run(options)
+
+
+def _describe_unknown(options: argparse.Namespace, words: Sequence[str]) -> str:
+    """What is wrong with words that no command declares, and the option that was meant."""
+    command = f"jaxquad {options.command}"
+    first = next((word for word in words if word.startswith("-")), words[0])
+    if not first.startswith("-"):
+        return f"{command} takes no further argument {first!r}. See {command} --help."
+    name = first.partition("=")[0]
+    near = difflib.get_close_matches(name, re.findall(r"--[a-z][a-z0-9-]*", options.usage), n=1)
+    guess = f" Did you mean {near[0]}?" if near else ""
+    return f"{command} has no option {name}.{guess} See {command} --help."
+
+
+def _fail(message: str, code: int) -> int:
+    print("jaxquad: error:", *readable(message).split(), file=sys.stderr)
+    return code
+
+
+def printer_of_warnings() -> Callable[..., None]:
+    """Prints each text of the package, and of no other, once: a log is read several times."""
+    printed: set[str] = set()
+
+    def show(message: Warning | str, kind: type[Warning], *_: object) -> None:
+        text = " ".join(in_options(message).split())
+        if is_ours(kind) and text not in printed:
+            printed.add(text)
+            print("!", readable(text), file=sys.stderr)
+
+    return show
+
+
+class _Parser(argparse.ArgumentParser):
+    """argparse says nothing where its help cannot be printed."""
+
+    def _print_message(self, message, file=None):
+        (file or sys.stderr).write(message)
+
+
+def make_parser() -> argparse.ArgumentParser:
+    """The parser of the whole command line."""
+    listed = (f"  {x.name:<9} {x.help}\n  {'':<9} {x.example}" for x in _COMMANDS)
+    parser = _Parser(
+        prog="jaxquad",
+        usage="jaxquad COMMAND ...",
+        description="From a flight record to an identified model with honest error bars.",
+        epilog="\n".join(("commands, in order of use:", *listed, "", _CODES)),
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--version", action="version", version=f"%(prog)s {version('jaxquad')}")
+    commands = parser.add_subparsers(
+        required=True, metavar="COMMAND", dest="command", help=argparse.SUPPRESS
+    )
+    for command in _COMMANDS:
+        command.add_to(commands)
+    for name, declared in commands.choices.items():
+        declared.set_defaults(usage=declared.format_usage())
+        declared.usage = f"jaxquad {name} {_PLACES[name]}[options]"
+    return parser

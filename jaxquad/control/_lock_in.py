@@ -234,11 +234,8 @@ class LockInSolution(NamedTuple):
 def solve(
     acceleration: Float[Array, " parts tones places axes *ensemble"],
     torque: Float[Array, " parts tones places axes *ensemble"],
-    square: Float[Array, " tones *ones"],
-    *,
-    contrast: float,
-    stiff: bool,
-) -> LockInSolution:
+    square: Float[Array, " tones *ones"], *, contrast: float, stiff: bool,
+) -> LockInSolution:  # fmt: skip
     """Inertia from the correlations of torque and acceleration with each tone.
 
     The parts are a tone's cosine and sine; the places a frequency below it, its own, one above.

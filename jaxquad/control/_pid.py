@@ -382,12 +382,9 @@ class PD(eqx.Module):
 
 
 def place_pd(
-    gain: ArrayLike | Sequence[float],
-    *,
-    natural_frequency: float,
-    damping: float,
+    gain: ArrayLike | Sequence[float], *, natural_frequency: float, damping: float,
     dt: float = 0.002,
-) -> PD:
+) -> PD:  # fmt: skip
     """The `PD` that gives the plant gain/s^2 a natural frequency and a damping ratio.
 
     **Arguments:**

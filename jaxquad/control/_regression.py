@@ -307,12 +307,9 @@ class RecursiveInertia(AbstractRegression):
 
 
 def paper_inertia(
-    q0: Float[Array, " samples"],
-    q1: Float[Array, " samples"],
-    *,
-    J_n: float | Float[Array, ""],
+    q0: Float[Array, " samples"], q1: Float[Array, " samples"], *, J_n: float | Float[Array, ""],
     dt: float,
-) -> Float[Array, ""]:
+) -> Float[Array, ""]:  # fmt: skip
     """Eq. (22)-(24): the inertia in kg m^2 over one window of samples.
 
     J_n cancels: what is left is the regression of q1 on q0'. It is the inertia itself where the

@@ -215,13 +215,9 @@ class InertiaMap(eqx.Module):
 
 
 def certainty_equivalence(
-    torque_gain: Float[ArrayLike, "..."],
-    nominal: Float[ArrayLike, "..."],
-    *,
-    span: tuple[float, float] = (0.2, 5.0),
-    knots: int = 6,
-    factor: float = 1.0,
-) -> InertiaMap:
+    torque_gain: Float[ArrayLike, "..."], nominal: Float[ArrayLike, "..."], *,
+    span: tuple[float, float] = (0.2, 5.0), knots: int = 6, factor: float = 1.0,
+) -> InertiaMap:  # fmt: skip
     """The map b0 = `factor` KT / J: the estimate is used as if it were the true inertia.
 
     **Arguments:**

@@ -209,14 +209,9 @@ class Prediction(eqx.Module):
 
 
 def predict_accuracy(
-    model: PyTree,
-    excitation: Excitation,
-    *,
-    noise: Noise,
-    free: Free = None,
-    band: tuple[float, float] | None = None,
-    input: int = 0,
-) -> Prediction:
+    model: PyTree, excitation: Excitation, *, noise: Noise, free: Free = None,
+    band: tuple[float, float] | None = None, input: int = 0,
+) -> Prediction:  # fmt: skip
     """The standard errors to expect from a test signal: the Cramer-Rao bound.
 
     The signal's own transform weighs the information of each frequency; a multisine counts at its
@@ -261,12 +256,9 @@ def predict_accuracy(
 
 
 def unit_information(
-    model: PyTree,
-    parameters: Parameters,
-    omega: Float[np.ndarray, " frequencies"],
-    noise: Noise,
+    model: PyTree, parameters: Parameters, omega: Float[np.ndarray, " frequencies"], noise: Noise,
     input: int,
-) -> tuple[np.ndarray, np.ndarray]:
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     """The response to one input, (frequencies, outputs), and the information per energy."""
     parts = response_and_slopes(model, parameters, jnp.asarray(omega), input)
     response, slopes = map(np.asarray, parts)

@@ -110,23 +110,12 @@ class Design(eqx.Module):
 
 
 def optimal_multisine(
-    model: PyTree | Sequence[PyTree],
-    *,
-    noise: Noise,
-    amplitude: Number,
-    period: Number,
-    sample_rate: Number,
-    periods: int = 4,
-    free: Free = None,
-    band: tuple[Number, Number] | None = None,
-    omega: Lines | None = None,
-    rate: Number | None = None,
-    output_amplitude: Number | Sequence[float] | None = None,
-    criterion: Criterion = _D_OPTIMAL,
-    lines: int | None = None,
-    input: int = 0,
-    seed: int = 0,
-) -> Design:
+    model: PyTree | Sequence[PyTree], *, noise: Noise, amplitude: Number, period: Number,
+    sample_rate: Number, periods: int = 4, free: Free = None,
+    band: tuple[Number, Number] | None = None, omega: Lines | None = None,
+    rate: Number | None = None, output_amplitude: Number | Sequence[float] | None = None,
+    criterion: Criterion = _D_OPTIMAL, lines: int | None = None, input: int = 0, seed: int = 0,
+) -> Design:  # fmt: skip
     """The multisine that is most informative about a model's `free` parameters, within limits.
 
     Information is that of `periods` settled periods: fly one more before them, or estimate the

@@ -257,15 +257,10 @@ def _take(members: Members, places: Int[Array, " some"]) -> Members:
 
 @ft.partial(Jit, options=brief_options)  # eager, it would be a dozen programs for each shape
 def _add_drawn(
-    scenario: Scenario,
-    keys: Key[Array, " members"],
-    noise: Float[Array, "axes members"] | None,
-    gust: Float[Array, "axes members"] | None,
-    payload: MemberPayload | None,
-    shape: tuple[int, int],
-    dt: float,
-    corner: float,
-) -> dict[str, Float[Array, "samples axes members"]]:
+    scenario: Scenario, keys: Key[Array, " members"], noise: Float[Array, "axes members"] | None,
+    gust: Float[Array, "axes members"] | None, payload: MemberPayload | None,
+    shape: tuple[int, int], dt: float, corner: float,
+) -> dict[str, Float[Array, "samples axes members"]]:  # fmt: skip
     """The parts of the scenario that members add to, with what they add."""
 
     def white(key: Key[Array, ""]) -> Array:

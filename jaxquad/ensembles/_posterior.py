@@ -201,15 +201,10 @@ class Posterior(eqx.Module):
     largest_command: float | None = eqx.field(static=True)  # of the record, in its unit
 
     def __init__(
-        self,
-        fit: Fit,
-        *,
-        recorded_dt: float | None | Literal["as fitted"] = "as fitted",
-        believed: ArrayLike | None = None,
-        plant: Given | None = None,
-        band: tuple[float, float] | None = None,
-        largest_command: float | None = None,
-    ):
+        self, fit: Fit, *, recorded_dt: float | None | Literal["as fitted"] = "as fitted",
+        believed: ArrayLike | None = None, plant: Given | None = None,
+        band: tuple[float, float] | None = None, largest_command: float | None = None,
+    ):  # fmt: skip
         """**Arguments:**
 
         - `fit`: of a `jq.models.AttitudeAxis`, a `jq.LaggedIntegrator` (b = K, from the command to

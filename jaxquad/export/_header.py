@@ -72,12 +72,9 @@ class ExportableController(Protocol):
 
 
 def c_header(
-    controller: object,
-    *,
-    name: str = "attitude",
-    precision: Precision = "float",
+    controller: object, *, name: str = "attitude", precision: Precision = "float",
     axes: int | None = None,
-) -> str:
+) -> str:  # fmt: skip
     """Write a LADRC or a PID, plain or scheduled, as one C99 header, which C++ compiles too.
 
     Its functions are `<name>_init(state)`, `<name>_step(state, reference, reference_rate,
@@ -156,13 +153,9 @@ def c_header(
 
 
 def write_c_header(
-    path: str | Path,
-    controller: object,
-    *,
-    name: str = "attitude",
-    precision: Precision = "float",
-    axes: int | None = None,
-) -> Path:
+    path: str | Path, controller: object, *, name: str = "attitude",
+    precision: Precision = "float", axes: int | None = None,
+) -> Path:  # fmt: skip
     """Write `c_header` to a file; an interrupted call leaves no half-written file.
 
     **Arguments:**

@@ -114,7 +114,7 @@ from .uncertainty._derived import (
     Tied as Tied,
 )
 from .uncertainty._error_budget import Discrepancy as Discrepancy
-from .uncertainty._local_misfit import MISFIT as MISFIT
+from .uncertainty._misfit import MISFIT as MISFIT
 from .uncertainty._verdict import (
     Bound as Bound,
     Combination as Combination,

@@ -45,13 +45,9 @@ NUMBERS = ("abscissa", "noise_gain", *MARGINS, *REJECTION)
 
 
 def linear_numbers(
-    loop: Loop,
-    axes: Sequence[int],
-    wanted: Collection[str],
-    *,
-    smoothing: float = 1e-5,
+    loop: Loop, axes: Sequence[int], wanted: Collection[str], *, smoothing: float = 1e-5,
     smooth: bool = False,
-) -> dict[str, Float[Array, " axes *ensemble"]]:
+) -> dict[str, Float[Array, " axes *ensemble"]]:  # fmt: skip
     """The `wanted` numbers of a `LoopAnalysis`, and the abscissa, of some axes of all members.
 
     With `smooth`, noise gain and sensitivity peak stay finite and differentiable in an unstable
@@ -69,13 +65,9 @@ def linear_numbers(
 
 
 def numbers_of(
-    loop: OpenLoop,
-    closed: ClosedLoopMatrix,
-    wanted: Collection[str],
-    smoothing: float,
-    *,
+    loop: OpenLoop, closed: ClosedLoopMatrix, wanted: Collection[str], smoothing: float, *,
     smooth: bool = False,
-) -> dict[str, Float[Array, ""]]:
+) -> dict[str, Float[Array, ""]]:  # fmt: skip
     """The `wanted` numbers of one loop, and the abscissa; see `linear_numbers`."""
     smoothing = sharpest(smoothing, loop.dt, closed.matrix.dtype)
     ladder = powers(closed.matrix, loop.dt, smoothing)
@@ -278,12 +270,9 @@ class LoopAnalysis(eqx.Module):
 
 
 def analyse(
-    loop: Loop,
-    axis: int | str = "roll",
-    *,
-    member: int | tuple[int, ...] | None = None,
+    loop: Loop, axis: int | str = "roll", *, member: int | tuple[int, ...] | None = None,
     smoothing: float = 1e-5,
-) -> LoopAnalysis:
+) -> LoopAnalysis:  # fmt: skip
     """Stability, margins and noise of one axis with its sampled controller, exactly.
 
     The plant is discretised under a held command that acts `delay` seconds late, whatever part of a

@@ -191,14 +191,11 @@ class Bandwidth(eqx.Module):
 
 
 def attitude_bandwidth(
-    response: Response,
-    *,
-    quantity: str = "attitude",
+    response: Response, *, quantity: str = "attitude",
     omega: Float[ArrayLike, " frequencies"] | None = None,
-    phase_at_start: Float[ArrayLike, ""] | None = None,
-    output: str | int | None = None,
+    phase_at_start: Float[ArrayLike, ""] | None = None, output: str | int | None = None,
     input: str | int | None = None,
-) -> Bandwidth:
+) -> Bandwidth:  # fmt: skip
     """Bandwidth, phase delay and w180 of an attitude's response to the pilot's or tester's input.
 
     The phase is unwrapped upwards from the lowest frequency. The lowest crossings downwards count;

@@ -99,12 +99,9 @@ class _Opaque:
 
 
 def curve_of(
-    response: Response,
-    omega: Float[ArrayLike, " frequencies"] | None,
-    output: str | int | None,
-    input: str | int | None,
-    integrations: int = 0,
-) -> Curve:
+    response: Response, omega: Float[ArrayLike, " frequencies"] | None, output: str | int | None,
+    input: str | int | None, integrations: int = 0,
+) -> Curve:  # fmt: skip
     """The curve of a `FrequencyResponse` or of a model, searched at `omega` in rad/s."""
     if isinstance(response, FrequencyResponse):
         return _measured(response, omega, output, input, integrations)
@@ -151,12 +148,9 @@ def ambiguous(phase: Float[Array, " frequencies"]) -> Bool[Array, " intervals"]:
 
 
 def _measured(
-    frf: FrequencyResponse,
-    omega: Float[ArrayLike, " frequencies"] | None,
-    output: str | int | None,
-    input: str | int | None,
-    integrations: int,
-) -> Curve:
+    frf: FrequencyResponse, omega: Float[ArrayLike, " frequencies"] | None,
+    output: str | int | None, input: str | int | None, integrations: int,
+) -> Curve:  # fmt: skip
     o, i = _position("output", output, frf.output_names), _position("input", input, frf.input_names)
     values, error = (np.asarray(x)[:, o, i] for x in (frf.response, frf.random_error))
     measured, wanted = np.asarray(frf.omega), np.full(frf.omega.shape, True)
@@ -227,13 +221,9 @@ def crossed(values: Float[Array, " frequencies"], direction: str) -> Bool[Array,
 
 
 def crossings(
-    residual: Residual,
-    omega: Float[Array, " frequencies"],
-    where: Bool[Array, " intervals"],
-    *,
-    rank: Float[Array, " intervals"] | None = None,
-    limit: int = 1,
-) -> Float[Array, " crossings"]:
+    residual: Residual, omega: Float[Array, " frequencies"], where: Bool[Array, " intervals"], *,
+    rank: Float[Array, " intervals"] | None = None, limit: int = 1,
+) -> Float[Array, " crossings"]:  # fmt: skip
     """The roots of `residual` in the intervals `where`, rising in rad/s; `nan` where there is none.
 
     `residual` treats each frequency by itself. Of more than `limit` roots, those of lowest `rank`

@@ -107,13 +107,10 @@ def abscissa(
 
 
 def noise_gain(
-    matrix: Float[Array, "states states"],
-    noise: Float[Array, " states"],
-    command: Float[Array, " states"],
-    through: Float[Array, ""],
-    ladder: Powers,
+    matrix: Float[Array, "states states"], noise: Float[Array, " states"],
+    command: Float[Array, " states"], through: Float[Array, ""], ladder: Powers,
     shift: Float[Array, ""],
-) -> Float[Array, ""]:
+) -> Float[Array, ""]:  # fmt: skip
     """rms of command x + through n per rms of white n, a new value each sample.
 
     The state is x+ = tame x + noise n with tame = matrix exp(-shift), which is stable.
@@ -221,12 +218,9 @@ class LinearParts(eqx.Module):
 
 
 def linear_parts(
-    loop: Loop,
-    axes: Sequence[int],
-    member: int | tuple[int, ...] | None = None,
-    *,
+    loop: Loop, axes: Sequence[int], member: int | tuple[int, ...] | None = None, *,
     states: int = 0,
-) -> tuple[LinearParts, tuple[int, ...]]:
+) -> tuple[LinearParts, tuple[int, ...]]:  # fmt: skip
     """The linear loops of all members, or of one, axis by axis; and the shape of the ensemble.
 
     Controllers get as many `states` at least, idle ones, to share what is compiled.

@@ -199,18 +199,11 @@ class Loop(eqx.Module):
     queue: DelayQueue = eqx.field(static=True)
 
     def __init__(
-        self,
-        plant: Plant,
-        controller: AnyController,
-        *,
-        drive: Drive | None = None,
-        encoder: Sensor | None = None,
-        delay: Float[ArrayLike, "..."] = 0.0,
-        dt: float | None = None,
-        substeps: int = 1,
-        bound: float = 100.0,
+        self, plant: Plant, controller: AnyController, *, drive: Drive | None = None,
+        encoder: Sensor | None = None, delay: Float[ArrayLike, "..."] = 0.0,
+        dt: float | None = None, substeps: int = 1, bound: float = 100.0,
         longest_delay: float | None = None,
-    ):
+    ):  # fmt: skip
         dt = (sample_interval(controller) or _DEFAULT_DT) if dt is None else dt
         if not (dt > 0 and math.isfinite(dt)):
             raise ValueError(f"dt is {dt} s: give a sample interval above 0")

@@ -162,13 +162,10 @@ class Margins(eqx.Module):
 
 
 def margins(
-    loop: Response,
-    *,
-    omega: Float[ArrayLike, " frequencies"] | None = None,
-    unstable_poles: int | None = None,
-    output: str | int | None = None,
+    loop: Response, *, omega: Float[ArrayLike, " frequencies"] | None = None,
+    unstable_poles: int | None = None, output: str | int | None = None,
     input: str | int | None = None,
-) -> Margins:
+) -> Margins:  # fmt: skip
     """Gain, phase and delay margins of a loop's response L, with negative feedback.
 
     Margins are distances to -1 in gain, phase and delay, whatever the branch of the phase, and mean

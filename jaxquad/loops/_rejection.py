@@ -106,14 +106,10 @@ class Rejection(eqx.Module):
 
 
 def disturbance_rejection(
-    response: Response,
-    *,
-    quantity: str = "loop",
-    omega: Float[ArrayLike, " frequencies"] | None = None,
-    unstable_poles: int | None = None,
-    output: str | int | None = None,
-    input: str | int | None = None,
-) -> Rejection:
+    response: Response, *, quantity: str = "loop",
+    omega: Float[ArrayLike, " frequencies"] | None = None, unstable_poles: int | None = None,
+    output: str | int | None = None, input: str | int | None = None,
+) -> Rejection:  # fmt: skip
     """Disturbance rejection bandwidth and peak, and the complementary peak, of a control loop.
 
     The peak of a measured response is its greatest value at a measured frequency: noise pushes it
@@ -252,13 +248,10 @@ class RmsResponse(eqx.Module):
 
 def rms_response(
     response: Response,
-    spectrum: Callable | Float[ArrayLike, " frequencies"] | Float[ArrayLike, ""],
-    *,
-    sides: str = "one",
-    omega: Float[ArrayLike, " frequencies"] | None = None,
-    output: str | int | None = None,
-    input: str | int | None = None,
-) -> RmsResponse:
+    spectrum: Callable | Float[ArrayLike, " frequencies"] | Float[ArrayLike, ""], *,
+    sides: str = "one", omega: Float[ArrayLike, " frequencies"] | None = None,
+    output: str | int | None = None, input: str | int | None = None,
+) -> RmsResponse:  # fmt: skip
     """Root mean square of the output for an input of known spectrum, within the frequencies given.
 
     A model is integrated by Gauss' rule in ln omega between the neighbours of `omega`. A measured

@@ -310,13 +310,10 @@ QUANSER_HOVER = HoverDataSheet()
 
 
 def quanser_hover(
-    *,
-    lag: float | None = 0.02,
-    damping: Sequence[float] = (0.0, 0.0, 0.0),
-    stiffness: Sequence[float] | None = None,
-    coulomb: Sequence[float] | None = None,
+    *, lag: float | None = 0.02, damping: Sequence[float] = (0.0, 0.0, 0.0),
+    stiffness: Sequence[float] | None = None, coulomb: Sequence[float] | None = None,
     convention: str = "frd-frbl",
-) -> Multirotor:
+) -> Multirotor:  # fmt: skip
     """The test stand of the paper's section 5, the Quanser 3 DOF Hover, driven by four voltages.
 
     Source: the data sheet, `QUANSER_HOVER`, which gives none of the arguments.

@@ -93,12 +93,9 @@ def split_delay(
 
 
 def _propagation(
-    A: Square,
-    B: Float[Array, "states inputs"],
-    late: Float[Array, " inputs"],
-    span: Float[Array, ""],
-    dt: Number,
-) -> tuple[Square, Float[Array, "segments states"]]:
+    A: Square, B: Float[Array, "states inputs"], late: Float[Array, " inputs"],
+    span: Float[Array, ""], dt: Number,
+) -> tuple[Square, Float[Array, "segments states"]]:  # fmt: skip
     """What the first `span` samples of a sample `dt` s long make of the state and of the inputs.
 
     Each input goes over from one straight segment to the next after `late` samples. The second
@@ -167,12 +164,9 @@ _HOLDS = ("zero", "first")
 
 def simulate_linear(
     model: TransferFunction | StateSpace,
-    u: Float[ArrayLike, " samples"] | Float[ArrayLike, "samples inputs"],
-    dt: Number,
-    *,
-    hold: str = "zero",
-    direct_samples: Float[ArrayLike, "outputs inputs"] | None = None,
-) -> Float[Array, " samples"] | Float[Array, "samples outputs"]:
+    u: Float[ArrayLike, " samples"] | Float[ArrayLike, "samples inputs"], dt: Number, *,
+    hold: str = "zero", direct_samples: Float[ArrayLike, "outputs inputs"] | None = None,
+) -> Float[Array, " samples"] | Float[Array, "samples outputs"]:  # fmt: skip
     """Simulate a linear model from rest, exactly at the samples.
 
     Delays may be any fraction of a sample. Where a held input jumps, x' jumps: H1 x' is the value

@@ -21,6 +21,7 @@ from ._proposal import (
 from ._read import (
     Mix as Mix,
     MixError as MixError,
+    other_axes as other_axes,
     parse_mix as parse_mix,
     read as read,
     read_segments as read_segments,
@@ -29,4 +30,8 @@ from ._read import (
 from ._record import Record as Record
 from ._timebase import channels as channels, ChannelSummary as ChannelSummary
 from .firmware import read_settings as read_settings, Settings as Settings
-from .formats import require_file as require_file
+from .formats import (
+    channel_names as channel_names,
+    keep_logs as keep_logs,
+    require_file as require_file,
+)

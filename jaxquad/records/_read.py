@@ -4,7 +4,7 @@ import dataclasses
 import itertools
 import re
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -390,3 +390,58 @@ def _without_gaps(
         f"A gap up to a length in s is bridged instead where that is allowed («max_gap=»)."
     )
     return parts
+
+
+_AXES = [
+    words.split()
+    for words in (
+        "roll pitch yaw", "aileron elevator rudder throttle", "ail ele rud thr",
+        "lateral longitudinal pedal collective", "lat lon ped col", "x y z", "l m n", "r p y",
+        "a e r t", "da de dr dt", "mx my mz",
+    )
+]  # fmt: skip
+_WORD = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+")
+_PAIRS = ((1, 1, -1, -1), (1, -1, 1, -1), (1, -1, -1, 1))  # of the motors that turn an axis
+
+
+def other_axes(command: Mix, names: Iterable[str]) -> list[Mix]:
+    """Commands of other axes, by their names: `pitch_cmd` beside `roll_cmd`, `u[1]` beside `u[0]`.
+
+    **Arguments:**
+
+    - `command`: that of one axis, as `parse_mix` returns it; of four motors, others are the two
+        that turn them in other pairs.
+    - `names`: of all channels.
+    """
+    names, mixes = set(names), dict[tuple[str, ...], Mix]()
+    [(name, weights)] = command.items()
+    siblings = [_siblings(channel, names) for channel in weights]
+    for key in dict.fromkeys(key for one in siblings for key in one):
+        channels = tuple(one[key] for one in siblings if key in one)
+        if len(set(channels)) == len(weights):
+            title = _siblings(name, None).get(key, f"other{len(mixes) + 1}")
+            title = channels[0] if list(weights.values()) == [1.0] else title
+            mixes[channels] = {title: dict(zip(channels, weights.values(), strict=True))}
+    signs = tuple(np.sign(list(weights.values())))
+    if not mixes and len(weights) == 4 and len(set(map(abs, weights.values()))) == 1:
+        others = [pair for pair in _PAIRS if signs not in (pair, tuple(-x for x in pair))]
+        for k, pair in enumerate(others if sum(signs) == 0 else (), 1):
+            mixed = zip(weights, pair, strict=True)
+            mixes[f"other{k}",] = {f"other{k}": {channel: float(x) for channel, x in mixed}}
+    return list(mixes.values())
+
+
+def _siblings(name: str, names: set[str] | None) -> dict[tuple[int, str], str]:
+    """What a channel is called with another axis' word, or another number at its end, by that."""
+    words, renamed = list(_WORD.finditer(name)), dict[tuple[int, str], str]()
+    numbers = [word for word in words if word[0].isdigit()][-1:]
+    for word in words:
+        groups = [(k, axes) for k, axes in enumerate(_AXES) if word[0].lower() in axes]
+        groups += [(-1, "0123456789")] if word in numbers else []
+        for k, axes in groups:
+            for axis in axes:
+                case = str.upper if word[0].isupper() else str.title if word[0].istitle() else str
+                other = f"{name[: word.start()]}{case(axis)}{name[word.end() :]}"
+                if other != name and (names is None or other in names):
+                    renamed.setdefault((k, axis), other)
+    return renamed

@@ -316,13 +316,9 @@ _OF_A_UNIT_STEP = {"itae": "s^2", "iae": "s", "ise": "s"}
 
 
 def metrics(
-    simulation: Simulation,
-    *,
-    start: float = 0.0,
-    stop: float | None = None,
-    load_start: float | None = None,
-    torque_gain: ArrayLike | Sequence[float] | None = None,
-) -> Metrics:
+    simulation: Simulation, *, start: float = 0.0, stop: float | None = None,
+    load_start: float | None = None, torque_gain: ArrayLike | Sequence[float] | None = None,
+) -> Metrics:  # fmt: skip
     """The `Metrics` of a stored `jq.simulation.Simulation`, for start <= t < stop.
 
     Differentiable with respect to the simulation.
@@ -350,14 +346,9 @@ def metrics(
 
 
 def evaluate(
-    loop: Loop,
-    scenario: Scenario,
-    *,
-    start: float = 0.0,
-    stop: float | None = None,
-    load_start: float | None = None,
-    devices: DeviceChoice = None,
-) -> Metrics:
+    loop: Loop, scenario: Scenario, *, start: float = 0.0, stop: float | None = None,
+    load_start: float | None = None, devices: DeviceChoice = None,
+) -> Metrics:  # fmt: skip
     """The `Metrics` of a loop without its trajectories: what is kept does not grow with time.
 
     The same numbers as `jq.simulation.metrics(jq.simulate(loop, scenario), ...)` in the memory of

@@ -39,12 +39,9 @@ DeviceChoice = int | Sequence[jax.Device] | None  # see `jq.simulate`
 
 
 def over_devices(
-    function: Callable[[PyTree, PyTree], PyTree],
-    members: PyTree,
-    shared: PyTree = None,
-    *,
+    function: Callable[[PyTree, PyTree], PyTree], members: PyTree, shared: PyTree = None, *,
     devices: DeviceChoice = None,
-) -> PyTree:
+) -> PyTree:  # fmt: skip
     """`function(members, shared)`, with each device computing its part of the members.
 
     Members must not feel each other in the function: take means and quantiles of its result.
@@ -307,12 +304,9 @@ _ALIGNED = 64  # bytes, for an array that JAX takes over without a copy
 
 
 def over_cores(
-    program: Jit,
-    run: Run,
-    further: tuple,
-    devices: Devices | None,
+    program: Jit, run: Run, further: tuple, devices: Devices | None,
     check: Callable[[PyTree], None] | None = None,
-) -> PyTree:
+) -> PyTree:  # fmt: skip
     """`program(*run, *further, devices)`, whose results have the members on the last axis.
 
     Parts of the members run side by side where the call is no part of another program, the ensemble

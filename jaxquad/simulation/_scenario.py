@@ -85,19 +85,11 @@ _PARTS = ("reference", "injection", "disturbance", "noise", "payload")
 
 
 def scenario(
-    *,
-    duration: float,
-    dt: float = 0.002,
-    axes: int | Sequence[str] = 3,
-    reference: Given = None,
-    injection: Given = None,
-    disturbance: Given = None,
-    noise: Given = None,
-    payload: Given = None,
-    feed_forward: bool = False,
-    ensemble: int | tuple[int, ...] = (),
+    *, duration: float, dt: float = 0.002, axes: int | Sequence[str] = 3, reference: Given = None,
+    injection: Given = None, disturbance: Given = None, noise: Given = None, payload: Given = None,
+    feed_forward: bool = False, ensemble: int | tuple[int, ...] = (),
     key: Key[Array, ""] | None = None,
-) -> Scenario:
+) -> Scenario:  # fmt: skip
     """A `Scenario` from signals of single axes, with zeros where nothing is given.
 
         jq.scenario(
@@ -208,15 +200,10 @@ def _stack(
 
 
 def excite(
-    signal: Float[ArrayLike, " samples *ensemble"],
-    *,
-    key: Key[Array, ""],
-    dt: float,
-    axis: str = "roll",
-    torque_noise: float = 0.0,
-    torque_corner: float = 2.0,
+    signal: Float[ArrayLike, " samples *ensemble"], *, key: Key[Array, ""], dt: float,
+    axis: str = "roll", torque_noise: float = 0.0, torque_corner: float = 2.0,
     sensor_noise: float = 0.0,
-) -> Scenario:
+) -> Scenario:  # fmt: skip
     """An identification experiment: level flight with a `signal` injected into one axis.
 
     **Arguments:**

@@ -342,13 +342,9 @@ def _between(
 
 
 def gauss_markov(
-    key: Key[Array, ""],
-    shape: tuple[int, ...],
-    *,
-    deviation: float | Float[Array, ""],
-    corner: float | Float[Array, ""],
-    dt: float,
-) -> Float[Array, "samples ..."]:
+    key: Key[Array, ""], shape: tuple[int, ...], *, deviation: float | Float[Array, ""],
+    corner: float | Float[Array, ""], dt: float,
+) -> Float[Array, "samples ..."]:  # fmt: skip
     """Stationary first-order Gauss-Markov noise along the first axis, such as gusts of torque.
 
     `deviation` is its standard deviation, `corner` its bandwidth in rad/s.
@@ -358,12 +354,9 @@ def gauss_markov(
 
 
 def gauss_markov_of(
-    white: Float[Array, "samples ..."],
-    *,
-    deviation: float | Float[Array, ""],
-    corner: float | Float[Array, ""],
-    dt: float,
-) -> Float[Array, "samples ..."]:
+    white: Float[Array, "samples ..."], *, deviation: float | Float[Array, ""],
+    corner: float | Float[Array, ""], dt: float,
+) -> Float[Array, "samples ..."]:  # fmt: skip
     """`gauss_markov` that white noise of unit variance drives."""
     keep = jnp.exp(jnp.asarray(-corner * dt))
     drive = deviation * jnp.sqrt(1 - keep**2)

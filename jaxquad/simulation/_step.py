@@ -83,13 +83,9 @@ def _rolled_runge_kutta(
 
 
 def integrate(
-    derivative: Callable[[PyTree], PyTree],
-    state: PyTree,
-    duration: Float[ArrayLike, "*ensemble"],
-    substeps: int,
-    *,
-    rolled: bool = False,
-) -> PyTree:
+    derivative: Callable[[PyTree], PyTree], state: PyTree, duration: Float[ArrayLike, "*ensemble"],
+    substeps: int, *, rolled: bool = False,
+) -> PyTree:  # fmt: skip
     """`duration` seconds in `substeps` equal Runge-Kutta steps, whose stages may be `rolled`."""
     step = _rolled_runge_kutta if rolled else runge_kutta
     if substeps == 1:
@@ -155,12 +151,9 @@ class LoopStep(eqx.Module):
         return Carry(state, self.controller.init(like), past, jnp.ones(self.ensemble, bool), queue)
 
     def sample(
-        self,
-        carry: Carry,
-        index: Int[Array, ""],
-        happens: Scenario,
+        self, carry: Carry, index: Int[Array, ""], happens: Scenario,
         oldest: Float[Array, " inputs *ensemble"] | None = None,
-    ) -> tuple[Carry, SampleResult]:
+    ) -> tuple[Carry, SampleResult]:  # fmt: skip
         """Measure, control, and hold the inputs until the next sample.
 
         `oldest` are the inputs that leave the queue; the next carry's queue has the newest alone.
@@ -196,12 +189,9 @@ class LoopStep(eqx.Module):
         return following, choose(fine, result, result, self.ensemble)
 
     def _answer(
-        self,
-        carry: Carry,
-        measurement: Float[Array, " axes *ensemble"],
-        happens: Scenario,
+        self, carry: Carry, measurement: Float[Array, " axes *ensemble"], happens: Scenario,
         fine: Bool[Array, "*ensemble"],
-    ) -> tuple[PyTree, Array, Array, Array, Array]:
+    ) -> tuple[PyTree, Array, Array, Array, Array]:  # fmt: skip
         """The controller's memory, what it asked for, what the drive makes of it, who is fine."""
         memory, command = self.controller.step(carry.memory, _setpoint(happens), measurement)
         if command.shape != measurement.shape:

@@ -35,3 +35,4 @@ from ._frequency_response import (
     FrequencyResponse as FrequencyResponse,
 )
 from ._noise import find_line as find_line, SpectralLine as SpectralLine
+from ._other_inputs import compare_with_input as compare_with_input, OtherInput as OtherInput

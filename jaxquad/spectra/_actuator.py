@@ -23,7 +23,7 @@ from jaxquad.records import Record
 from ._estimators import COHERENT, Method, Pair, Remark
 from ._frequency_response import Estimate
 from ._linearity import (
-    factors,
+    factors_of,
     FEWEST,
     interpolated,
     left_over,
@@ -31,7 +31,7 @@ from ._linearity import (
     local_mean,
     Signal,
     Spectra,
-    transform,
+    transform_bins,
 )
 
 
@@ -53,7 +53,7 @@ _CLEAR_STEPS, _LIKE = 5.0, (0.45, 1.25)  # standard errors; share of the roundin
 _EVERYWHERE, _HALF = 3.0, (0.25, 1.25)  # likewise, for small and for large commands
 _BIASED = 3.0  # random errors of the gain from which a remark is made
 
-Commands = Sequence[Signal]
+Commands = Sequence[Float[np.ndarray, "_samples"]]
 
 
 class TwoLags(Remark):
@@ -166,9 +166,9 @@ class _Search:
         parts = []
         for part, u, columns in zip(self.spectra, inputs, added, strict=True):
             count, changed = part.input.size, part.inputs.copy()
-            changed[:, self.place[1]] = transform(u[:count, None])[:, 0]
+            changed[:, self.place[1]] = transform_bins(u[:count, None])[:, 0]
             moving = changed if self.method == "direct" else part.moving
-            rows = transform(columns[:count])
+            rows = transform_bins(columns[:count])
             parts.append(part._replace(inputs=changed, moving=moving, added=rows))
         return left_over(parts, self.omega, self.response, self.place)
 
@@ -181,7 +181,7 @@ class _Search:
         left = self.examine(self.commands, sizes)
         if left is None:
             return None
-        single = [factors(left, left.added[:, [k]]) for k in range(tried.size)]
+        single = [factors_of(left, left.added[:, [k]]) for k in range(tried.size)]
         distinct = left.share[: tried.size] > _DISTINCT
         clear = np.where(distinct, [one[2] for one in single], 0.0)
         best = int(np.argmax(clear[:-1]))
@@ -257,7 +257,7 @@ class _Search:
         left = self.examine(self.commands, added)
         if left is None:
             return None
-        single = [factors(left, left.added[:, [k]]) for k in range(len(steps))]
+        single = [factors_of(left, left.added[:, [k]]) for k in range(len(steps))]
         factor = np.array([one[0][0] for one in single])
         like = (factor > _LIKE[0]) & (factor < _LIKE[1]) & (left.share[: factor.size] > _DISTINCT)
         clear = np.where(like, [one[2] for one in single], 0.0)
@@ -273,7 +273,7 @@ class _Search:
         left = self.examine(self.commands, halves)
         if left is None:
             return None
-        both, covariance, _ = factors(left, left.added[:, :2])
+        both, covariance, _ = factors_of(left, left.added[:, :2])
         least = np.maximum(_EVERYWHERE * np.sqrt(np.diagonal(covariance)), _HALF[0])
         if np.any(both < least) or np.any(both > _HALF[1]):
             return None
@@ -325,7 +325,7 @@ class _Search:
             left = self.examine(self.inputs_of(lag, z), slopes)
             if left is None:
                 return z, unknown
-            step, covariance, _ = factors(left, left.added[:, : z.size])
+            step, covariance, _ = factors_of(left, left.added[:, : z.size])
             z = z + np.clip(step, -_LONGEST, _LONGEST)
             z[0] = np.clip(z[0], -_MOST, _MOST)
             if z.size > 1 and abs(z[1]) > np.log(_AROUND):
@@ -348,7 +348,7 @@ class _Search:
         i, above, below = self.place[1], 0.0, 0.0
         for part, u, v in zip(self.spectra, inputs, commands or self.commands, strict=True):
             moving = part.moving[:, min(i, part.moving.shape[1] - 1)]
-            changed, plain = transform(np.stack([u, v], axis=1)[: part.input.size]).T
+            changed, plain = transform_bins(np.stack([u, v], axis=1)[: part.input.size]).T
             above = above + near(part.grid, changed * np.conj(moving))
             below = below + near(part.grid, plain * np.conj(moving))
         return np.asarray(above / below)

@@ -1,4 +1,5 @@
-"""Whether the outputs' time stamps run at another rate than those of the other signals.
+"""Whether the outputs' time stamps run at another rate than those of the other signals; and when a
+sweep has each of its frequencies.
 
 A controller makes the inputs of the references and the outputs, with hardly any noise of its own:
 u = A r + C y. Where the outputs' stamps gain a share e of the time, u keeps e C (t dy/dt). A sweep
@@ -12,7 +13,7 @@ from jaxtyping import Complex, Float
 
 from jaxquad.records import Record
 
-from ._estimators import COHERENT, Grid, Remark
+from ._estimators import COHERENT, Grid, Method, power_of, Remark, sums_between
 from ._frequency_response import Estimate
 from ._linearity import fast_length
 
@@ -23,6 +24,8 @@ _BLOCK, _POWERS = 24, 3  # bins for each signal, over which A and C are smooth; 
 _DISTINCT = 1e-5  # share of the signal looked for that no controller explains
 _MOST = 0.01  # drift of a clock, as a share of the time
 _FEWEST = 8  # points of the response
+_NEAR = 0.05  # of a frequency, over which the time of its power is averaged
+_BRIEF = 0.2  # of a sweep's length, within which it passes a frequency
 _FLOOR = 1e-20  # of the input's power: below it lies rounding
 
 Columns = Complex[np.ndarray, "bins columns"]
@@ -105,6 +108,31 @@ def _compare(record: Record, low: float, high: float) -> list[tuple[np.ndarray, 
         columns_of = left / noise, drift / noise, np.abs(added / noise) ** 2
         parts.append((*map(np.ravel, columns_of), np.repeat(leverage, inputs.shape[1])))
     return parts
+
+
+def sweep_times(
+    records: Sequence[Record], method: Method, omega: Grid
+) -> Float[np.ndarray, "frequencies inputs"] | None:
+    """When each input sweeps each frequency, in s from the middle of its record, by power; None
+    where another excitation moves an input."""
+    moments = np.zeros((3, omega.size, records[0].inputs.shape[1]))
+    for record in records:
+        count = fast_length(record.samples)
+        moving = (record.inputs if method == "direct" else record.references)[:count]
+        moving = moving - np.mean(moving, axis=0)
+        time = np.linspace(-0.5, 0.5, count)[:, None] * count * record.dt
+        plain, later = (np.fft.rfft(x.T).T for x in (moving, time * moving))
+        place = omega * count * record.dt / (2 * np.pi)
+        reach = np.maximum(_NEAR * place, 1.0)
+        low = np.clip(np.rint(place - reach).astype(int), 0, len(plain) - 1)
+        high = np.clip(np.rint(place + reach).astype(int) + 1, low + 1, len(plain))
+        parts = power_of(plain), np.real(later * np.conj(plain)), power_of(later)
+        moments += [sums_between(part, low, high) for part in parts]
+    power, first, second = moments
+    power = np.maximum(power, 1e-300)
+    times = first / power
+    spread = np.sqrt(np.median(np.maximum(second / power - times**2, 0.0), axis=0))
+    return times if np.all(spread < _BRIEF * np.ptp(times, axis=0)) else None
 
 
 def _transform(columns: Float[np.ndarray, "samples columns"]) -> Columns:

@@ -116,15 +116,16 @@ def _same(a: np.ndarray, b: np.ndarray) -> bool:
     return np.array_equal(a[:64], b[:64]) and np.array_equal(a, b)
 
 
-def check_references(records: Sequence[Record]) -> None:
-    """Raise `ValueError` unless there is one external reference for each input."""
+def check_references(records: Sequence[Record], others: int = 0) -> None:
+    """Raise `ValueError` unless there is one reference for each input, before the `others`."""
     names, inputs = records[0].reference_names, records[0].input_names
-    if len(names) != len(inputs):
+    if len(names) != len(inputs) + others:
+        more = f" and {others} others" if others else ""
         raise ValueError(
             Message(
                 "the joint estimate needs one external reference for each input, but the record "
                 f"has {len(names)} references {list(names)} for {len(inputs)} inputs "
-                f"{list(inputs)}. Name them («references=»), «select other channels with "
+                f"{list(inputs)}{more}. Name them («references=»), «select other channels with "
                 "jq.records.select, or »use a direct estimate« "
                 "(estimator=jq.spectra.LocalPolynomial())»"
             )
@@ -474,9 +475,21 @@ class JointInputOutput(eqx.Module):
     **Arguments:**
 
     - `spectra`: any of the other estimators.
+    - `others`: how many of the last references are signals of another kind, which move the outputs
+        beside the inputs, such as another axis' command: their part is taken out.
+
+    **Raises:** ValueError for `others` without local polynomials.
     """
 
     spectra: DirectEstimator = LocalPolynomial()
+    others: int = eqx.field(static=True, default=0)
+
+    def __check_init__(self):
+        if self.others and not isinstance(self.spectra, LocalPolynomial):
+            raise ValueError(
+                f"others is {self.others}, which needs local polynomials: leave it out, or give "
+                "jq.spectra.LocalPolynomial()"
+            )
 
 
 Estimator = DirectEstimator | JointInputOutput

@@ -1,5 +1,6 @@
 """Frequency responses: estimates of records, and tables that were measured elsewhere."""
 
+import dataclasses
 import itertools
 from collections.abc import Callable, Sequence
 from typing import NamedTuple, Protocol, runtime_checkable
@@ -134,6 +135,7 @@ class FrequencyResponse:
     distortion: Distortion | None = None  # of a periodic excitation
     log_noise_covariance: Square | None = None
     divided: Pairs | Array | None = None  # 0 to 1; 0 without
+    swept_at: Float[Array | np.ndarray, "frequencies inputs"] | None = None  # s, of a sweep
     dt: float = eqx.field(static=True, default=0.0)  # s; 0 where nothing was sampled
     hold: float | None = eqx.field(static=True, default=None)  # s
     fed_back: bool = eqx.field(static=True, default=False)  # the records had references: a loop
@@ -294,6 +296,29 @@ class FrequencyResponse:
                 dominated[np.isin(omega, remark.omega), *place] = True
         return dominated
 
+    def pair(self, output: int = 0, input: int = 0) -> "FrequencyResponse":
+        """The response of one output to one input, beside the other inputs."""
+        name = self.output_names[output], self.input_names[input]
+        o, i = slice(output, output + 1), slice(input, input + 1)
+        pick = lambda values: None if values is None else values[:, o, i]
+        about = lambda: tuple(one for one in self.remarks if one.pair in (None, name))
+        return dataclasses.replace(
+            self,
+            response=pick(self.response),
+            coherence=pick(self.coherence),
+            random_error=pick(self.random_error),
+            errors=self.errors.pair(output, input),
+            divided=pick(self.divided),
+            swept_at=None if self.swept_at is None else self.swept_at[:, i],
+            direct_coherence=pick(self.direct_coherence),
+            multiple_coherence=self.multiple_coherence[:, o],
+            input_names=self.input_names[i],
+            output_names=self.output_names[o],
+            input_units=self.input_units[i],
+            output_units=self.output_units[o],
+            remarks=Remarks(about),
+        )
+
     def relative_covariance(
         self, output: int = 0, input: int = 0
     ) -> Complex[np.ndarray, "frequencies frequencies"]:
@@ -389,6 +414,7 @@ def frequency_response(
         ```
     """
     from ._average import average_windows
+    from ._clock import sweep_times
     from ._local_polynomial import estimate_local_polynomial
     from ._periodic import estimate_periodic
 
@@ -406,7 +432,7 @@ def frequency_response(
             "jq.spectra.JointInputOutput(jq.spectra.LocalPolynomial())"
         )
     if isinstance(estimator, JointInputOutput):
-        check_references(records)
+        check_references(records, estimator.others)
         method, estimator = "joint", estimator.spectra
     if isinstance(estimator, Welch | Composite):
         estimate = average_windows(records, grid, estimator, method)
@@ -445,6 +471,7 @@ def frequency_response(
         distortion=estimate.distortion,
         log_noise_covariance=estimate.log_noise_covariance,
         divided=estimate.divided,
+        swept_at=sweep_times(records, method, estimate.omega),
         dt=first.dt,
         hold=first.hold,
         fed_back=bool(first.reference_names),

@@ -123,8 +123,11 @@ class Spectra(NamedTuple):
     @classmethod
     def of(cls, record: Record, i: int, method: Method, scale: float) -> "Spectra":
         count = fast_length(record.samples)
-        inputs, outputs = transform(record.inputs[:count]), transform(record.outputs[:count])
-        moving = inputs if method == "direct" else transform(record.references[:count])
+        inputs, outputs = (
+            transform_bins(record.inputs[:count]),
+            transform_bins(record.outputs[:count]),
+        )
+        moving = inputs if method == "direct" else transform_bins(record.references[:count])
         u = record.inputs[:count, i] - np.mean(record.inputs[:count, i])
         if method == "joint":  # less what neither the references nor a transient explain
             moved = np.empty_like(inputs[:, i])
@@ -136,10 +139,10 @@ class Spectra(NamedTuple):
         v, time = u / scale, np.linspace(-1.0, 1.0, count)
         added = np.stack([u * np.abs(v), u * v**2, u * v, u * time]).T
         grid = 2 * np.pi / (count * record.dt) * np.arange(len(inputs))
-        return cls(grid, moving, inputs, outputs, transform(added), u)
+        return cls(grid, moving, inputs, outputs, transform_bins(added), u)
 
 
-def transform(columns: Float[np.ndarray, "samples columns"]) -> Columns:
+def transform_bins(columns: Float[np.ndarray, "samples columns"]) -> Columns:
     rows = np.ascontiguousarray(columns.T)
     rows = rows - np.mean(rows, axis=1, keepdims=True)
     return np.fft.rfft(rows).T / np.sqrt(len(columns))
@@ -219,7 +222,7 @@ def left_over(
     return LeftOver(left[:, 0], left[:, 1:], leverage, weight, share, slope)
 
 
-def factors(left: LeftOver, columns: Columns) -> tuple[np.ndarray, np.ndarray, float]:
+def factors_of(left: LeftOver, columns: Columns) -> tuple[np.ndarray, np.ndarray, float]:
     """Real factors of columns in the residual, their covariance, and their size in standard errors.
 
     The covariance is that of residuals of any variance (MacKinnon and White, 1985, HC3).
@@ -242,8 +245,8 @@ def _say_static(left: LeftOver, v: Signal) -> str:
         if np.min(left.share[columns]) < _DISTINCT_STATIC:
             return 1.0, 1.0, 0.0
         added = left.added[:, columns]
-        value, _, clear = factors(left, added)
-        if clear < _CLEAR or clear < 2 * factors(left, 1j * added)[2]:
+        value, _, clear = factors_of(left, added)
+        if clear < _CLEAR or clear < 2 * factors_of(left, 1j * added)[2]:
             return 1.0, 1.0, 0.0
         powers = [_POWER[column] for column in columns]
         mean = [np.sum(x**power * v**2) / np.sum(v**2) for power in powers]
@@ -304,7 +307,7 @@ def _say_change(left: LeftOver, omega: Grid, method: Method) -> str:
     _, strength, turned = np.linalg.svd(real, full_matrices=False)
     distinct = strength > _DEPENDENT * strength[0]
     distinct = turned[distinct].T / strength[distinct]
-    value, covariance, clear = factors(left, columns @ distinct)
+    value, covariance, clear = factors_of(left, columns @ distinct)
     if not clear > _CLEAR:
         return ""
     # Of t, from -1 to 1, the mean in the second half is 1 more than that in the first.

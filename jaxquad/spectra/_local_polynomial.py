@@ -64,6 +64,7 @@ from ._local_windows import (
 from ._noise import covariance_of_bands, Noise, smooth_noise, smoothed
 
 
+_ROUNDING = 1e-12  # of the power of references, added so that it has an inverse
 _DEPENDENT = 1e-6  # smallest singular value of the responses of the inputs, to the largest
 _DIVISIBLE = 0.15  # largest random error of an input's response to the references
 _SHARPER = 0.5  # ratio of residual powers that noise alone seldom reaches
@@ -89,14 +90,17 @@ def estimate_local_polynomial(
     Coherence is that near each frequency; of the joint estimate, the smaller of input and output.
     """
     inputs, outputs = records[0].inputs.shape[1], records[0].outputs.shape[1]
+    joint = method == "joint"
+    moving = records[0].references.shape[1] if joint else inputs
     bins, dt = record_bins(records, options.integrators, options.delay), records[0].dt
     if omega is None:
         lowest = 2 * np.pi * _CYCLES / max(record.duration for record in records)
         omega = np.geomspace(lowest, 2 * np.pi / (10 * dt), 100)
-    windows = make_windows(omega, bins, options, inputs)
+    windows = make_windows(omega, bins, options, moving)
     furthest = max(windows.furthest(options.width), highest_looked_at(omega[-1], windows.grid))
-    bins, at, joint = bins.up_to(furthest), windows.at, method == "joint"
-    setup = Setup(bins, windows, inputs, outputs, options.order, options.global_order, joint)
+    bins, at = bins.up_to(furthest), windows.at
+    orders = options.order, options.global_order
+    setup = Setup(bins, windows, inputs, outputs, moving, *orders, joint)
     # Models, and narrow fits on the grid of windows of what they leave.
     rest = subtract_models(bins, *setup.channels, omega[-1], dt, options.global_order)
     rest, from_sources = _repair_models(setup, rest)
@@ -138,7 +142,7 @@ def estimate_local_polynomial(
     moved = moved.replace_rows(lost, blank)
     plant = setup.plant(moved)
     back = recolour(omega, options.integrators, options.delay, dt)[:, None, None]
-    plain = setup._replace(joint=False)
+    plain = setup._replace(joint=False, sources=inputs)
     respond = plain.to_moved(Rest(bins, (), *plain.channels) if joint else rest)
     fit = respond(windows.grid, windows.narrow, "polynomial")  # from inputs to outputs
     power = setup.noise_of(fit).power
@@ -187,6 +191,7 @@ class Setup(NamedTuple):
     windows: Windows
     inputs: int
     outputs: int
+    sources: int  # that move all other channels: the references, or else the inputs
     order: int  # of the local polynomials
     global_order: int  # the most
     joint: bool
@@ -196,7 +201,7 @@ class Setup(NamedTuple):
         """The channels that move, and those that are moved."""
         first = self.inputs + self.outputs
         if self.joint:
-            return slice(first, first + self.inputs), slice(0, first)
+            return slice(first, first + self.sources), slice(0, first)
         return slice(0, self.inputs), slice(self.inputs, first)
 
     def plant(self, moved: LocalFit) -> LocalFit:
@@ -339,13 +344,19 @@ def _remarks(
 
 
 def joint_factors(fit: LocalFit, inputs: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Where T_ru has an inverse, [-G, 1], and that inverse: dG = [-G, 1] dT T_ru^-1."""
+    """Where T_ru has an inverse, [-G, 1], and that inverse: dG = [-G, 1] dT T_ru^-1.
+
+    References beyond one for each input move input and output, too: T_ru is without them.
+    """
     invertible = fit.determined
-    through = np.where(invertible[:, None, None], fit.response[:, :inputs], np.eye(inputs))
+    moved = fit.response[:, :inputs, :inputs]
+    through = np.where(invertible[:, None, None], moved, np.eye(inputs))
     strength = np.linalg.svd(through, compute_uv=False)
     invertible &= strength[:, -1] > _DEPENDENT * strength[:, 0]
     back = np.linalg.inv(np.where(invertible[:, None, None], through, np.eye(inputs)))
-    response = fit.response[:, inputs:] @ back
+    response = fit.response[:, inputs:, :inputs] @ back
+    further = fit.response.shape[2] - inputs
+    back = np.pad(back, ((0, 0), (0, further), (0, 0)))
     outputs = response.shape[1]
     ones = np.broadcast_to(np.eye(outputs), (len(back), outputs, outputs))
     return invertible, np.concatenate([-response, ones], axis=2), back
@@ -358,7 +369,7 @@ def joint_fit(fit: LocalFit, inputs: int) -> LocalFit:
     Source: Pintelon and Schoukens, System Identification, 2nd ed., section 2.6 and 7.2.7.
     """
     invertible, left, back = joint_factors(fit, inputs)
-    through, response = fit.response[:, :inputs], -left[:, :, :inputs]
+    through, response = fit.response[:, :inputs, :inputs], -left[:, :, :inputs]
     blank = np.where(invertible, 1.0, np.nan)[:, None, None]
     effect = np.swapaxes(back, 1, 2) @ fit.effect * blank
     scatter = left @ fit.scatter @ adjoint(left) * blank
@@ -366,9 +377,27 @@ def joint_fit(fit: LocalFit, inputs: int) -> LocalFit:
     boosted = diagonal(boosted @ fit.scatter @ adjoint(boosted))
     boost = np.sqrt(boosted / np.maximum(diagonal(scatter), 1e-300))
     gain = boost[:, :, None] ** 2 * np.vecdot(effect, effect).real[:, None, :]
-    power = through @ fit.power @ adjoint(through)
+    power = through @ _power_beside(fit.power, inputs) @ adjoint(through)
     freedom = np.where(invertible, fit.freedom, 0.0)
     return LocalFit(response * blank, effect, boost, gain, fit.first, scatter, freedom, power)
+
+
+def _power_beside(power: np.ndarray, inputs: int) -> np.ndarray:
+    """That of the first references, less what the others explain of it."""
+    first, crossed, others = (
+        power[:, :inputs, :inputs],
+        power[:, :inputs, inputs:],
+        power[:, inputs:, inputs:],
+    )
+    if not others.shape[1]:
+        return first
+    others = (
+        others
+        + _ROUNDING
+        * np.eye(others.shape[1])
+        * np.trace(others, axis1=1, axis2=2).real[:, None, None]
+    )
+    return first - crossed @ np.linalg.solve(others, adjoint(crossed))
 
 
 def share_of_inputs(left: np.ndarray, noise: Noise, at: Places, inputs: int) -> Pairs:

@@ -55,23 +55,12 @@ class _Idle(eqx.Module):
 
 
 def certify(
-    loop: Loop,
-    ensemble: Ensemble | Members,
-    scenario: Scenario,
-    *,
-    limits: Sequence[Limit] = (),
-    peers: Mapping[str, PyTree] | None = None,
-    begun: PyTree | None = None,
-    members: int = 256,
-    linear_members: int | None = None,
-    key: Key[Array, ""] | None = None,
-    events: Sequence[float] = (),
-    start: float = 0.0,
-    stop: float | None = None,
-    load_start: float | None = None,
-    name: str = "tuned",
-    devices: DeviceChoice = None,
-) -> Certificate:
+    loop: Loop, ensemble: Ensemble | Members, scenario: Scenario, *, limits: Sequence[Limit] = (),
+    peers: Mapping[str, PyTree] | None = None, begun: PyTree | None = None, members: int = 256,
+    linear_members: int | None = None, key: Key[Array, ""] | None = None,
+    events: Sequence[float] = (), start: float = 0.0, stop: float | None = None,
+    load_start: float | None = None, name: str = "tuned", devices: DeviceChoice = None,
+) -> Certificate:  # fmt: skip
     """Evaluate a design on members that its tuner never saw, beside its peers.
 
     All designs fly on `members`. The linear loop of the design itself is analysed on many more,
@@ -308,13 +297,9 @@ def _nominal_numbers(plant: Plant) -> tuple[Float[np.ndarray, " axes"], ...]:
 
 
 def worst_flights(
-    design: "Tuned | Certificate",
-    loop: Loop,
-    ensemble: Ensemble | Members,
-    scenario: Scenario,
-    *,
+    design: "Tuned | Certificate", loop: Loop, ensemble: Ensemble | Members, scenario: Scenario, *,
     quantities: Sequence[str] = ("itae", "sensitivity_peak"),
-) -> dict[str, Simulation]:
+) -> dict[str, Simulation]:  # fmt: skip
     """Fly the nominal loop, and the members of a certificate that are worst in some quantity.
 
     The members have the noise that was theirs.

@@ -124,25 +124,12 @@ def front_point(design: DesignResult, over: str) -> tuple[float, float]:
 
 
 def pareto(
-    loop: Loop,
-    ensemble: Ensemble | Members,
-    scenario: Scenario,
-    *,
-    over: str = "activity",
-    points: int = 8,
-    levels: Sequence[float] | None = None,
-    objective: Objective | None = None,
-    limits: Sequence[Limit] = (),
-    reserve: float = 0.03,
-    peers: Mapping[str, PyTree] | None = None,
-    free: Free = None,
-    members: int = 64,
-    fresh: int | Members = 256,
-    method: LBFGS | None = None,
-    key: Key[Array, ""] | None = None,
-    progress: bool | None = None,
-    devices: DeviceChoice = None,
-) -> Pareto:
+    loop: Loop, ensemble: Ensemble | Members, scenario: Scenario, *, over: str = "activity",
+    points: int = 8, levels: Sequence[float] | None = None, objective: Objective | None = None,
+    limits: Sequence[Limit] = (), reserve: float = 0.03, peers: Mapping[str, PyTree] | None = None,
+    free: Free = None, members: int = 64, fresh: int | Members = 256, method: LBFGS | None = None,
+    key: Key[Array, ""] | None = None, progress: bool | None = None, devices: DeviceChoice = None,
+) -> Pareto:  # fmt: skip
     """What better tracking costs: designs between little and much of `over`, tuned together.
 
     All points descend in lockstep on the same members, each with the objective and a penalty that

@@ -205,25 +205,13 @@ def describe_tail(tail: Tail) -> str:
 
 
 def tune(
-    loop: Loop,
-    ensemble: Ensemble | Members,
-    scenario: Scenario,
-    *,
-    objective: Objective | None = None,
-    limits: Sequence[Limit] = (),
-    reserve: float = 0.03,
-    free: Free = None,
-    members: int = 64,
-    fresh: int | Members | None = 256,
-    starts: int = 1,
-    scatter: float = 0.4,
-    method: Method | None = None,
-    peers: Mapping[str, PyTree] | None = None,
-    key: Key[Array, ""] | None = None,
-    progress: bool | None = None,
-    listener: Listener | None = None,
-    devices: DeviceChoice = None,
-) -> Tuned:
+    loop: Loop, ensemble: Ensemble | Members, scenario: Scenario, *,
+    objective: Objective | None = None, limits: Sequence[Limit] = (), reserve: float = 0.03,
+    free: Free = None, members: int = 64, fresh: int | Members | None = 256, starts: int = 1,
+    scatter: float = 0.4, method: Method | None = None, peers: Mapping[str, PyTree] | None = None,
+    key: Key[Array, ""] | None = None, progress: bool | None = None,
+    listener: Listener | None = None, devices: DeviceChoice = None,
+) -> Tuned:  # fmt: skip
     """Tune a controller by gradient through the closed loops of all members of an ensemble at once.
 
     First the slowest pole of every member is moved to the left of the knee of the objective's

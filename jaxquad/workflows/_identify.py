@@ -1,6 +1,7 @@
 """Identify a log: its response, the fit to it, fits to parts of the band, and a second record."""
 
 import dataclasses
+import shlex
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TypeVar
@@ -9,10 +10,10 @@ import numpy as np
 
 import jaxquad.identify as fitting
 import jaxquad.spectra as spectra
-from jaxquad._core import announce, as_messages
+from jaxquad._core import announce, as_messages, Message
 from jaxquad.identify import Fit, fit, KnownFilter
 from jaxquad.models import LaggedIntegrator, parameter_units, TransferFunction
-from jaxquad.records import Proposal, Record
+from jaxquad.records import Proposal, Record, select
 from jaxquad.records.firmware import axis_of_rate
 from jaxquad.report import reason_of
 from jaxquad.spectra import FrequencyResponse
@@ -30,6 +31,12 @@ _LONGEST = 0.02  # of the record: a longer delay is no delay of the vehicle
 _NEAR = 1.5  # samples: a delay that is taken out as precisely as that need not be better
 _MISFIT = 3.0  # ratio of misfit to random error from which parts of the band are fitted, too
 _CHANGE = 0.1  # of the gain, between parts of the band: more than that is not noise
+# Of commands of other axes: the chance that one acts where it does not; how little of its power
+# moves without the input where both are alike; how large it is, at least, in inputs.
+_CHANCE, _ALIKE, _LOUD = 2e-3, 5e-3, 0.1
+_CLEAR = 3.5  # standard errors, of a change by them
+_EXPLAINS = 0.7  # of a misfit that is left, where they explain it
+_OTHER = "other input"  # kind of a remark
 _EXCITE = "excite the axis more, over a wider band (jaxquad design sweep), or record longer"
 
 
@@ -101,7 +108,7 @@ def identify_opened(opened: OpenedLogs) -> Identification:
     if settings.verify is not None and fit.verdict.fitted:
         other = dataclasses.replace(
             settings, start=settings.verify_start, stop=settings.verify_stop, segments=(),
-            reference=None,
+            reference=None, other_inputs=(),
         )  # fmt: skip
         record = _longest(Path(settings.verify), other)
         check = fitting.verify(fit, fitting.behind_filters(record, filters))
@@ -119,8 +126,8 @@ def identify_opened(opened: OpenedLogs) -> Identification:
     bands = explanation = None
     if fit.verdict.fitted and fit.verdict.kind != "no minimum":
         bands = attempt(HALVES, fit.bands)
-        lags = any(remark.kind == spectra.TWO_LAGS for remark in fit.remarks)
-        if settings.explain and (lags or fit.chi_squared > fitting.MISFIT**2):
+        changes = any(remark.kind in ("drift", spectra.TWO_LAGS) for remark in fit.remarks)
+        if settings.explain and (changes or fit.chi_squared > fitting.MISFIT**2):
             explanation = attempt(EXPLAINED, fit.explain)
     if settings.reference:
         announce("fit to the direct response")
@@ -157,7 +164,7 @@ def _estimate(
     another, it is estimated again. Known `filters` are divided out. The rate of a `vehicle` may be
     damped by the air. `compare` says that the direct estimate comes later.
     """
-    paths, settings, proposal, records = opened
+    paths, settings, proposal, records, _ = opened
     method = "joint" if settings.reference else "direct"
     compared = compare and settings.reference
     said = "joint and direct responses" if compared else f"{method} response"
@@ -176,11 +183,17 @@ def _estimate(
         announce(f"{said}, {delay:.4g} s of delay taken out")
         frf = _respond(opened, method, filters, delay)
         fit = _fit_response(frf, settings)
-    if vehicle and isinstance(fit.model, LaggedIntegrator) and settings.integrators:
-        fit = fitting.fit_damped(fit)
+    damped = vehicle and isinstance(fit.model, LaggedIntegrator) and settings.integrators
+    fit = fitting.fit_damped(fit) if damped else fit
+
+    def fit_beside(opened: OpenedLogs) -> Fit:
+        other = _fit_response(_respond(opened, method, filters, delay), settings)
+        return fitting.fit_damped(other) if damped and other.verdict.fitted else other
+
+    further = _remarks_on_other_inputs(opened, fit, frf, fit_beside)
     announce("fits to parts of the band")
     span, parts, changes = _fit_parts(fit, frf, settings)
-    fit = finish_fit(fit, settings, records[0], changes, remedies)
+    fit = finish_fit(fit, settings, records[0], (*further, *changes), remedies)
     parts = {span: fit} | parts if parts else {}
     responses, fits, more = {method: frf}, {method: fit}, paths[1:]
     result = Identification(paths[0], settings, records, responses, fits, parts, proposal, more)
@@ -200,14 +213,26 @@ def _respond(
         estimator = spectra.Composite(**shape)
     else:
         estimator = spectra.LocalPolynomial(**shape, global_order=0 if quick else 12)
+    records = _moved_records(opened, method)
     if method == "joint":
-        estimator = spectra.JointInputOutput(estimator)
+        estimator = spectra.JointInputOutput(estimator, len(records[0].reference_names) - 1)
     band = settings.band_rad
     if settings.band is not None:
         band = 2 * np.pi * settings.band[0], 2 * np.pi * settings.band[1]
     omega = None if band is None else np.geomspace(*band, _POINTS)
-    frf = spectra.frequency_response(list(opened.records), omega, estimator=estimator)
+    frf = spectra.frequency_response(records, omega, estimator=estimator)
+    frf = frf.pair() if len(frf.input_names) > 1 else frf
     return fitting.without_filters(frf, filters)
+
+
+def _moved_records(opened: OpenedLogs, method: str) -> list[Record]:
+    """With further inputs as further references, whose part a joint estimate takes out."""
+    records = list(opened.records)
+    first, *others = records[0].input_names
+    if method == "direct" or not others:
+        return records
+    roles = {"inputs": first, "references": (*records[0].reference_names, *others)}
+    return [select(record, outputs=record.output_names, **roles) for record in records]
 
 
 def _delay_of(fit: Fit, records: tuple[Record, ...]) -> float:
@@ -236,6 +261,74 @@ def _fit_response(frf: FrequencyResponse, settings: IdentifySettings) -> Fit:
     lag = 0.0 if not settings.lag else guess.lag if settings.delay else total
     delay = 0.0 if not settings.delay else guess.delay if settings.lag else total
     return fit(LaggedIntegrator(guess.gain, lag, delay, n), frf, free=free, cost=cost)
+
+
+def _remarks_on_other_inputs(
+    opened: OpenedLogs, full: Fit, frf: FrequencyResponse,
+    fit_beside: Callable[[OpenedLogs], Fit],
+) -> list[Message]:  # fmt: skip
+    """On commands of other axes that move an estimate by more than its standard error, once they
+    are inputs, too, and on those that nothing tells from the input."""
+    controlled = any(remark.kind == spectra.DOMINATED for remark in frf.remarks)
+    if not opened.others or not np.any(full.determined) or controlled:
+        return []
+    records, acting, alike = _moved_records(opened, frf.method), {}, {}
+    size = max(float(np.std(record.inputs[:, 0])) for record in records)
+    for text, signals in opened.others.items():
+        power = spectra.compare_with_input(records, frf, signals)
+        if power is None:
+            continue
+        if power.alone > _ALIKE and power.chance < _CHANCE / len(opened.others):
+            acting[text] = signals
+        elif power.alone <= _ALIKE and max(map(np.std, signals)) > _LOUD * size:
+            alike[text] = 100 * (1 - power.alone)
+    source, output = frf.input_names[0], frf.output_names[0]
+    remarks = [
+        Message(
+            f"{text} moves as the input {source} does ({share:.1f} % of its power): what it does "
+            f"to {output} counts as the input's, and no estimate of this log tells the two apart. "
+            "Move one axis at a time",
+            _OTHER,
+        )
+        for text, share in alike.items()
+    ]
+    if not acting:
+        return remarks
+    announce(f"fit beside {', '.join(acting)}")
+    try:
+        other = fit_beside(opened.with_inputs(acting))
+    except ValueError:  # the inputs are too alike for a response
+        return remarks
+    changes = []
+    for name in {*full.names} & {*other.names}:  # a damping may be in one alone
+        k, j = full.names.index(name), other.names.index(name)
+        if not (full.determined[k] and other.determined[j]):
+            continue
+        before, after, error = full.values[k], other.values[j], full.standard_errors[k]
+        # What only adds noise moves an estimate, too: by the difference of both variances.
+        added = full.noise_standard_errors[k] ** 2 - other.noise_standard_errors[j] ** 2
+        if abs(after - before) > max(error, _CLEAR * np.sqrt(abs(added))):
+            changes.append((abs(after - before) / error, name, before, after))
+    misfits = full.chi_squared**0.5, other.chi_squared**0.5
+    explains = misfits[0] > fitting.MISFIT and misfits[1] < _EXPLAINS * misfits[0]
+    if not changes and not explains:
+        return remarks
+    options = " ".join(f"--other-input {shlex.quote(text)}" for text in acting)
+    them, effects = "it" if len(acting) == 1 else "them", []
+    if changes:
+        errors, name, before, after = max(changes)
+        percent = f"{100 * (after / before - 1):+.2g} %, " if before else ""
+        effects.append(
+            f"the {name} is {after:.4g} instead of {before:.4g} ({percent}{errors:.1f} standard "
+            "errors), which the error bars do not include"
+        )
+    if explains:
+        effects.append(f"the misfit is {misfits[1]:.1f} instead of {misfits[0]:.1f} random errors")
+    text = (
+        f"{output} answers to {' and '.join(acting)}, too, and {source} moves with {them}: "
+        f"without this part {', and '.join(effects)}. Take it out ({options})"
+    )
+    return [*remarks, Message(text, _OTHER)]
 
 
 def _fit_parts(
@@ -289,7 +382,7 @@ def finish_fit(
         remedies = _options_for(fit, settings) if remedies is None else remedies
         verdict = dataclasses.replace(verdict, remedies=as_messages(remedies))
     if verdict.fitted:
-        [output], [source] = record.output_units, record.input_units
+        output, source = record.output_units[0], record.input_units[0]
         units = parameter_units(
             fit.model, fit.names,
             output=output or record.output_names[0], input=source or record.input_names[0],
@@ -354,7 +447,7 @@ def verify_result(
     log that cannot be used.
     """
     stored = result if isinstance(result, StoredResult) else load_result(result)
-    every = {"start": None, "stop": None, "segments": (), "reference": None}
+    every = {"start": None, "stop": None, "segments": (), "reference": None, "other_inputs": ()}
     settings = dataclasses.replace(stored.settings, **every, band=None, band_rad=stored.band)
     settings = settings.changed(changes or {})
     model, band = stored.model, stored.used_band

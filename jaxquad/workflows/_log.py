@@ -1,6 +1,9 @@
 """What an identification reads: the channels that a log proposes, its records, a demo's log."""
 
 import dataclasses
+import functools as ft
+import operator
+import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -11,13 +14,17 @@ from jaxquad._core import announce, write_file
 from jaxquad.datasets import FILES, locate
 from jaxquad.excitation import sweep
 from jaxquad.records import (
+    channel_names,
+    keep_logs,
     Mix,
+    other_axes,
     parse_mix,
     Proposal,
     propose,
     read_segments,
     Record,
     RecordError,
+    RecordWarning,
     Segment,
     select,
 )
@@ -26,6 +33,9 @@ from jaxquad.report import sha256_of
 from ._options import mix_text, SettingsError
 from ._result_file import load_result, StoredResult
 from ._settings import IdentifySettings
+
+
+_MOST_OTHERS = 8  # commands of other axes that are looked at
 
 
 def propose_settings(
@@ -82,6 +92,19 @@ class OpenedLogs(NamedTuple):
     settings: IdentifySettings  # with what the log proposes
     proposal: Proposal | None  # where the log itself said what is input and output
     records: tuple[Record, ...]  # one for each segment of each log
+    others: Mapping[str, tuple[np.ndarray, ...]] = {}  # other axes' commands, for each record
+
+    def with_inputs(self, more: Mapping[str, tuple[np.ndarray, ...]]) -> "OpenedLogs":
+        """With further inputs, by their mixes: their samples at the times of each record."""
+        records = tuple(
+            dataclasses.replace(
+                record, inputs=np.column_stack([record.inputs, *signals]),
+                input_names=(*record.input_names, *more),
+                input_units=(*record.input_units, *[""] * len(more)),
+            )
+            for record, *signals in zip(self.records, *more.values(), strict=True)
+        )  # fmt: skip
+        return self._replace(records=records)
 
 
 def open_logs(
@@ -95,8 +118,15 @@ def open_logs(
     """
     paths = (Path(path),) if isinstance(path, str | Path) else tuple(map(Path, path))
     settings = settings or IdentifySettings()
-    if proposal is None:
-        settings, proposal = propose_settings(paths[0], settings, several=len(paths) > 1)
+    with keep_logs():
+        if proposal is None:
+            settings, proposal = propose_settings(paths[0], settings, several=len(paths) > 1)
+        return _open_logs(paths, settings, proposal)
+
+
+def _open_logs(
+    paths: tuple[Path, ...], settings: IdentifySettings, proposal: Proposal | None
+) -> OpenedLogs:
     logs = {path: read_records(path, settings) for path in paths}
     rates = [records[0].sample_rate for records in logs.values()]
     if max(rates) > (1 + 1e-6) * min(rates):
@@ -120,7 +150,7 @@ def open_logs(
             records = tuple(
                 select(x, inputs=x.input_names, outputs=x.output_names) for x in records
             )
-    return OpenedLogs(paths, settings, proposal, records)
+    return OpenedLogs(paths, settings, proposal, records, _other_commands(logs, settings))
 
 
 def open_again(result: str | Path | StoredResult, *, log: str | Path | None = None) -> OpenedLogs:
@@ -150,8 +180,13 @@ def read_records(
 ) -> tuple[Record, ...]:
     """One record for each segment. Raises RecordError, ReadError."""
     announce(f"reading {path.name}")
+    return _read(path, settings, further_inputs or {})
+
+
+def _read(path: Path, settings: IdentifySettings, further_inputs: Mix) -> tuple[Record, ...]:
     inputs, outputs, references = map(mix_of, (settings.input, settings.output, settings.reference))
-    inputs = inputs | (further_inputs or {})
+    others = (mix_of(text) for text in settings.other_inputs)
+    inputs = ft.reduce(operator.or_, (*others, further_inputs), inputs)
     names = {*inputs, *outputs, *references}
     segments: list[Segment] = list(settings.segments) or [(settings.start, settings.stop)]
     records = read_segments(
@@ -162,6 +197,41 @@ def read_records(
         max_gap=settings.max_gap, valid=settings.valid, hold=settings.hold,
     )  # fmt: skip
     return tuple(records)
+
+
+def _other_commands(
+    logs: Mapping[Path, Sequence[Record]], settings: IdentifySettings
+) -> dict[str, tuple[np.ndarray, ...]]:
+    """Commands of other axes that move in all logs, at the times of the records."""
+    texts = (*settings.other_inputs, settings.reference, settings.output)
+    taken = [weights for text in texts for weights in mix_of(text).values()]
+    names = set.intersection(*map(channel_names, logs))
+    others = other_axes(mix_of(settings.input), names)
+    others = [mix for mix in others if not any(w in taken for w in mix.values())][:_MOST_OTHERS]
+    settings = dataclasses.replace(settings, reference=None, other_inputs=())
+
+    def read(*mixes: Mix) -> list[tuple[np.ndarray, ...]]:
+        """Of each mix the samples; what is missing, or missing in places, is left out."""
+        parts: list[list[np.ndarray]] = [[] for _ in mixes]
+        together = ft.reduce(operator.or_, mixes)
+        try:
+            for path, records in logs.items():
+                with warnings.catch_warnings():
+                    warnings.simplefilter("ignore", RecordWarning)
+                    commands = _read(path, settings, together)
+                for x, y in zip(records, commands, strict=True):
+                    for part, name in zip(parts, together, strict=True):
+                        part.append(np.interp(x.time, y.time, y.channel(name)))
+        except ValueError:  # other gaps, or records of other parts
+            return [samples for mix in mixes for samples in read(mix)] if len(mixes) > 1 else [()]
+        return list(map(tuple, parts))
+
+    samples = read(*others) if others else []
+    return {
+        mix_text(mix): signals
+        for mix, signals in zip(others, samples, strict=True)
+        if any(np.ptp(signal) > 0 for signal in signals)
+    }
 
 
 def mix_of(text: str | None) -> Mix:

@@ -251,6 +251,11 @@ def _mix(value: object) -> str:
     return text
 
 
+def _mixes(value: object) -> tuple[str, ...]:
+    """One text alone is one mix."""
+    return tuple(map(_mix, value if _is_list(value) else [value]))
+
+
 def _rising(value: object) -> Pair | None:
     """Two numbers, the lower one first; None for anything else, ValueError for other entries."""
     if not _is_list(value) or len(value) != 2:
@@ -345,6 +350,7 @@ HOLD = Kind(_hold, lambda text: text if text == "dt" else float(text), str, meta
 COUNT, SIZE = Kind(_count, int, metavar="N"), Kind(_size, int, metavar="N")
 SWITCH = Kind(_require(lambda value: isinstance(value, bool), "give true or false"), words=0)
 BAND = Kind(_band, float, _plain, words=2, metavar=("LOW", "HIGH"))
+MIXES = Kind(_mixes, repeated=True, metavar="CHANNEL")
 SEGMENTS = Kind(_segments, write=_joined, repeated=True, metavar="START:STOP")
 UNITS = Kind(_units, write="=".join, repeated=True, metavar="NAME=UNIT")
 RANGES = Kind(

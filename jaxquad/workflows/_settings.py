@@ -41,6 +41,8 @@ class IdentifySettings(Settings):
     - `output`: likewise
     - `reference`: an external signal that no feedback computes; with it, the joint input-output
       estimate is made beside the direct one
+    - `other_inputs` (`--other-input`): another signal that moves the output, such as another axis'
+      command: its part is taken out of the response; may be repeated
     - `axis`: the axis to propose input and output for
     - `chirp`: the number of the one to use of the chirps that a log's proposal lists; by default
       the longest, with all others on its axis at its place
@@ -83,8 +85,8 @@ class IdentifySettings(Settings):
       one length; local by default
     - `window`: length of welch's window, which it selects; a fifth of the record by default
     - `cost`: maximum likelihood, or CIFER's coherence-weighted cost, Eq. (14); ml by default
-    - `explain`: where the misfit exceeds 1.5 random errors, fit again with one more pole, zero,
-      pair, or damping, and say which of them explains it
+    - `explain`: where the misfit exceeds 1.5 random errors, or the gain seems to drift, fit again
+      with one more pole, zero, pair, damping, or drift, and say which of them explains it
 
     **A second record:**
 
@@ -107,6 +109,7 @@ class IdentifySettings(Settings):
     input: Annotated[str | None, kinds.MIX] = None
     output: Annotated[str | None, kinds.MIX] = None
     reference: Annotated[str | None, kinds.MIX] = None
+    other_inputs: Annotated[Sequence[str], kinds.MIXES] = ()
     axis: Annotated[str | None, kinds.AXIS] = None
     chirp: Annotated[int | None, kinds.SIZE] = None
     flight: Annotated[int | None, kinds.SIZE] = None
@@ -153,6 +156,11 @@ class IdentifySettings(Settings):
             yield "`segments` says where to start and stop: leave `start` and `stop` out"
         if self.band is not None and self.band_rad is not None:
             yield "`band` (Hz) and `band_rad` (rad/s) are both given: keep one"
+        if self.other_inputs and self.reference and (self.window or self.estimator != "local"):
+            yield (
+                "`other_inputs` beside a `reference` need local polynomials: leave `estimator` and "
+                "`window` out"
+            )
         if self.dt is not None and (self.time is not None or self.time_unit is not None):
             yield "`dt` is for a table without time: leave `time` and `time_unit` out"
         # What would change nothing beside the others.

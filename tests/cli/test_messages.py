@@ -22,7 +22,7 @@ DEFINED = {  # words that need a definition, and where a reader of the command l
 
 @pytest.fixture(scope="module")
 def found():
-    return list(messages())
+    return messages()
 
 
 @pytest.mark.slow

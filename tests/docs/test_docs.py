@@ -26,6 +26,7 @@ RUN = (
 )
 LINK = re.compile(r"\]\(([^)#\s]+)(?:#[^)\s]*)?\)")
 BLOCK = re.compile(r"(?:<!-- (.*?) -->\n)?```(\w*)\n(.*?)```", flags=re.S)
+EVERY = re.compile(r"^<!-- all blocks read (.*?) -->$", flags=re.M)
 MARK = "--- printed by the next block ---"
 
 
@@ -40,11 +41,11 @@ class Block(NamedTuple):
 
 def blocks(page):
     """Those that run; a page's shell blocks come after its Python."""
-    found = BLOCK.findall((ROOT / "docs" / page).read_text())
-    kept = []
+    text = (ROOT / "docs" / page).read_text()
+    found, every, kept = BLOCK.findall(text), EVERY.search(text), []
     for k, (remark, kind, code) in enumerate(found):
         if kind in ("python", "sh") and remark != "fragment":
-            place = remark.removeprefix("reads ") if remark else ""
+            place = remark.removeprefix("reads ") or (every[1] if every else "")
             follows = k + 1 < len(found) and found[k + 1][1] == ""
             kept.append(Block(kind, place, code, found[k + 1][2] if follows else ""))
     return kept

@@ -31,8 +31,8 @@ class HeldLead(NamedTuple):
         return (driven / (z - np.exp(-2 * HOLD)) + z**-whole)[:, None, None]
 
 
-def held(model, seed=None):
-    frf = response_of(model, error=0.005, seed=seed, omega=OMEGA)
+def held(model, seed=None, error=0.005):
+    frf = response_of(model, error=error, seed=seed, omega=OMEGA)
     return dataclasses.replace(frf, hold=HOLD, dt=HOLD)
 
 
@@ -47,7 +47,15 @@ def test_a_delay_of_the_direct_part_is_known_to_its_sample(delay):
     # The gain of the direct part has the spread that the sample leaves it.
     assert 0.004 < fit.standard_errors[0] < 0.02
     assert [remark.kind for remark in fit.remarks] == ["sampled delay"]
+    assert "the interval is that sample" in fit.remarks[0]
     assert fit.chi_squared < 1.5**2
+
+
+def test_what_the_rest_of_the_response_tells_of_such_a_delay_narrows_its_interval():
+    start = jq.TransferFunction([1.0, 5.0], [1.0, 2.0], delay=0.042)
+    fit = jq.fit(start, held(HeldLead(0.043), seed=3, error=0.1), free=("delay",))
+    assert fit.standard_errors[0] < 0.9 * HOLD / np.sqrt(12)
+    assert "the rest of the response narrows the interval;" in fit.remarks[0]
 
 
 def test_the_response_at_known_values_is_exact():

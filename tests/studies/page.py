@@ -6,13 +6,12 @@ notes.txt there holds what was simulated and what a study misses.
 
 import csv
 import io
-import json
 import re
 from pathlib import Path
 from textwrap import fill
 
 from healthy_table import shown
-from result_files import FOLDER, tables
+from result_files import FOLDER, read
 
 
 PAGE = Path(__file__).parents[2] / "docs" / "validation.md"
@@ -34,10 +33,9 @@ ORDER = (
 HEAD = """\
 # Validation: do the error bars hold?
 
-What a user gets without options, on plants whose truth is known. NumPy and scipy alone simulate
-plants and noise, by code that shares nothing with the library. Each section has its table and its
-command. [notes.txt](validation/notes.txt) says what was simulated. `python tests/studies/page.py`
-makes this page.
+What a user gets without options, on plants of known truth. NumPy and scipy alone simulate them, by
+code that shares nothing with the library ([what was simulated](validation/notes.txt)).
+`python tests/studies/page.py` makes this page.
 """
 SHORT = {  # columns of the first table that the page itself shows
     "plant": "plant",
@@ -50,19 +48,13 @@ FINDINGS = {
 400 records of each plant (200 of three inputs), through `jq.frequency_response` and `jq.fit` with
 their defaults. The least possible error is the Cramer-Rao bound; the luck of the draws is taken
 out. Wanted: 93 to 97 %, at most 1.06 (coloured noise 1.10), at most 2 % of records with a remark.
-scipy's `csd` and `least_squares` on the same records: 1.5 to 490 times the bound.
-""",
-    "New ground: silent misses": """\
-Each of them, by its number.
+scipy's `csd` and `least_squares` on the same records: 1.5 to 490 times the bound. Counting
+model error widens intervals by 0 to 12 % where the model is right.
 """,
     "New ground": """\
 1000 plants drawn at random, seed 806560 (each run draws others): 94.1 % of the printed 95 %
 intervals hold the truth, and 5 % of records have a remark. 1.3 % of plants are silent misses, by
 more than 4 claimed errors without a mark or remark (wanted: 0.2 %), all of order 3 or 4.
-""",
-    "Healthy plants, parameter by parameter": """\
-95 % of 400 draws is known to 2.1 %. Counting model error widens intervals by 0 to 12 % where the
-model is right.
 """,
     "Refinement in the time domain": """\
 `jq.refine` reaches 0.92 to 1.05 times the bound with a noise model, in closed loop too. Output
@@ -71,11 +63,9 @@ times the bound.
 """,
     "Ring-down at the end of a record": """\
 A light mode still rings when the record ends: the worst error is 2.0 to 2.5 claimed errors in the
-median record, 4.7 at most.
-""",
-    "The same, no global model": """\
-With local fits alone it is 2.6 to 171 claimed errors, and up to 319 %. Six of nine settings have
-remarks in 97 % of records or more; 3 rad/s at 5 % noise has them in 5 %.
+median record, 4.7 at most. With local fits alone it is 2.6 to 171 claimed errors, and up to
+319 %. Six of nine settings then have remarks in 97 % of records or more; 3 rad/s at 5 % noise has
+them in 5 %.
 """,
     "The hold of a command": """\
 A command is held for 0.02 s. With the hold stated, 93.5 to 98 % of the intervals hold the truth.
@@ -111,35 +101,27 @@ bandwidth and 1.8 times the rate after a torque. The simulated plant has the mod
 TAIL = """\
 ## Numbers of others, and measured flights
 
-- A fit that CIFER 6.3 printed, `python fits/cessna_navfit.py`: [Comparison](comparison.md).
-- Loops and simulations equal python-control's and scipy's: [Comparison](comparison.md).
+- CIFER (`python fits/cessna_navfit.py`), python-control and scipy: [Comparison](comparison.md).
 - The paper's figures: [equations](equations.md), `python fits/paper.py`.
 """
 
 
 def page() -> str:
     """The whole page."""
-    return "\n".join([HEAD, *(_section(table) for table in _tables()), TAIL])
+    return "\n".join([HEAD, *map(_section, studies()), TAIL])
 
 
 def files() -> dict[str, str]:
     """Text of the files in docs/validation/ by name."""
-    made = {_file_name(table): _as_csv(table) for table in _tables()}
-    return made | {NOTES: "\n".join(_notes(table) for table in _tables())}
+    parts = [table for name in studies() for table in read(name)]
+    made = {_file_name(table): _as_csv(table) for table in parts}
+    return made | {NOTES: "\n".join(map(_notes, parts))}
 
 
 def studies() -> list[str]:
     """Names of the results that there are, in the order of the page."""
     there = sorted(path.stem for path in FOLDER.glob("*.json"))
     return [name for name in ORDER if name in there] + [n for n in there if n not in ORDER]
-
-
-def _tables() -> list[dict]:
-    return [
-        table
-        for name in studies()
-        for table in tables(json.loads((FOLDER / f"{name}.json").read_text()))
-    ]
 
 
 def _file_name(table: dict) -> str:
@@ -160,15 +142,18 @@ def _notes(table: dict) -> str:
     return "\n".join(parts) + "\n"
 
 
-def _section(table: dict) -> str:
+def _section(study: str) -> str:
+    """What a study finds, and its tables."""
+    table, *_ = found = read(study)
     title = str(table["title"])
     parts = [f"## {title}", fill(FINDINGS.get(title) or table.get("text", ""), 110)]
-    if title == "Healthy plants without options":
+    if study == "healthy":
         places = [table["columns"].index(name) for name in SHORT]
         rows = [[*SHORT.values()], ["---"] * len(SHORT)]
-        rows += [[str(row[place]) for place in places] for row in table["rows"]]
+        rows += [[str(row[k]).replace(" .. ", "..") for k in places] for row in table["rows"]]
         parts += ["\n".join(f"| {' | '.join(row)} |" for row in rows)]
-    parts += [f"[Table](validation/{_file_name(table)})\n`{table['command']}`"]
+    links = " ".join(f"[Table](validation/{_file_name(each)})" for each in found)
+    parts += [f"{links}\n`{table['command']}`"]
     return "\n\n".join(part for part in parts if part) + "\n"
 
 

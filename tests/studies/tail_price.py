@@ -8,6 +8,7 @@ Each optimum is flown by 1024 members that no tune saw, and 65,536 others tell h
 """
 
 import argparse
+import csv
 import sys
 from pathlib import Path
 from typing import NamedTuple
@@ -40,12 +41,20 @@ PEAK, SLICE = 3.6, 2048
 START = loop(STARTS["certainty equivalence"])
 ACTIVE, CYCLES = 256, 12  # members that the limit is kept on at once; how often others join them
 SETTINGS = {  # the limit, and the slices of 2048 members that it is kept on
-    "no limit": (PEAK, 0),
+    "no members": (PEAK, 0),
     "8192": (PEAK, 4),
     "24,576": (PEAK, 12),
     "24,576, 1 % tighter": (0.99 * PEAK, 12),
     "65,536": (PEAK, 32),
 }
+TUNED = "jq.tune, which searched 24,576"
+HEAD = (
+    "limit kept on",
+    "ITAE mean / worst",
+    "cost, tuned on",
+    "cost, others",
+    "of 65,536 others beyond",
+)
 
 
 @eqx.filter_jit
@@ -116,9 +125,9 @@ class Row(NamedTuple):
     worst: float
     beyond: float  # of 65,536, per design
 
-    def __str__(self) -> str:
-        numbers = f"{self.mean:.2f} / {self.worst:.1f} | {self.cost:.4f} | {self.fresh:.4f}"
-        return f"{numbers} | {self.beyond:.3g}"
+    def cells(self) -> list[str]:
+        itae = f"{self.mean:.2f} / {self.worst:.1f}"
+        return [itae, f"{self.cost:.4f}", f"{self.fresh:.4f}", f"{self.beyond:.2g}"]
 
 
 def row_of(z, members, fresh, test) -> Row:
@@ -135,7 +144,7 @@ def tuned(key) -> np.ndarray:
         START, ensemble(), flight(), objective=objective(), key=key, fresh=None,
         limits=[jq.Limit("sensitivity_peak", at_most=PEAK)], progress=False,
     )  # fmt: skip
-    print(f"{found.tail}, {found.evaluations} gradients", flush=True)
+    print(f"{found.tail}, {found.evaluations} gradients", file=sys.stderr, flush=True)
     return start_of(found.controller)
 
 
@@ -160,15 +169,16 @@ def main() -> None:
         drawn = draw(fold(key, 2), 32 * SLICE)
         searched = sliced(drawn)
         first = tuned(key)
-        ends = {"`jq.tune`": first}
+        ends = {TUNED: first}
         for name, (bound, slices) in SETTINGS.items():
             ends[name] = solve(cost, first, bound, drawn, searched[:slices])
         for name, z in ends.items():
             rows.setdefault(name, []).append(row_of(z, members, fresh, test))
-            print(name, rows[name][-1], flush=True)
-    print("| limit kept on | ITAE mean / worst | cost | on fresh members | of 65,536 beyond |")
-    for name, found in rows.items():
-        print(f"| {name} | {Row(*np.mean(found, axis=0))} |")
+            print(name, *rows[name][-1].cells(), file=sys.stderr, flush=True)
+    table = csv.writer(sys.stdout, lineterminator="\n")
+    table.writerow(HEAD)
+    for name in (*SETTINGS, TUNED):
+        table.writerow([name, *Row(*np.mean(rows[name], axis=0)).cells()])
 
 
 if __name__ == "__main__":

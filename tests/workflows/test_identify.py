@@ -7,7 +7,7 @@ import re
 
 import numpy as np
 import pytest
-from sweep_logs import GAIN, write_noise, write_sweep
+from sweep_logs import GAIN, swept, write_noise, write_sweep
 from synthetic import response_of
 
 import jaxquad as jq
@@ -257,3 +257,35 @@ def test_a_file_that_is_no_result_is_refused(tmp_path, text):
     (tmp_path / "result.json").write_text(text)
     with pytest.raises(ValueError, match="no result of"):
         load_result(tmp_path)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("closed", [False, True])
+def test_another_axis_that_moves_the_output_is_remarked_and_taken_out(closed, tmp_path):
+    time, sweep, _ = swept(0)
+    random = np.random.default_rng(3)
+    wave = np.convolve(random.standard_normal(sweep.size + 5), np.ones(6), "valid")
+    other = 0.6 * sweep / np.std(sweep) + 0.8 * wave / np.std(wave)
+    other *= np.std(sweep)
+    noise, command, rate = random.normal(0, 0.05, time.size), *np.zeros((2, time.size))
+    for k in range(1, time.size):  # one sample late, and held: delay .01 s
+        rate[k] = rate[k - 1] + 0.01 * GAIN * (command[k - 2] + 0.05 * other[k - 2]) * (k > 1)
+        command[k] = sweep[k] - 0.05 * closed * (rate[k] + noise[k])
+    columns = {"t": time, "roll_cmd": command, "pitch_cmd": other, "p": rate + noise}
+    np.savez(
+        tmp_path / "axes.npz", **columns, sweep=sweep, yaw_cmd=random.standard_normal(wave.size)
+    )
+    settings = IdentifySettings(
+        input="roll_cmd", output="p", reference="sweep" if closed else None, hold="dt", lag=False,
+    )  # fmt: skip
+    found = identify(tmp_path / "axes.npz", settings)
+    [remark] = [remark for remark in found.fit.remarks if remark.kind == "other input"]
+    assert "--other-input pitch_cmd)" in remark
+    assert abs(found.fit["gain"] - GAIN) > 3 * found.fit.noise_standard_errors[0]
+    settings = settings.changed({"other_inputs": ["pitch_cmd"]})
+    again = identify(tmp_path / "axes.npz", settings)
+    assert not any(remark.kind == "other input" for remark in again.fit.remarks)
+    for name, truth in (("gain", GAIN), ("delay", 0.01)):
+        error = again.fit.standard_errors[again.fit.names.index(name)]
+        assert again.fit[name] == pytest.approx(truth, abs=3 * error)
+    assert "--other-input pitch_cmd" in " ".join(again.settings.words())

@@ -223,13 +223,9 @@ class HarmonicNotch(eqx.Module):
 
 
 def ardupilot_harmonic_notch(
-    frequency_hz: ArrayLike,
-    bandwidth_hz: ArrayLike,
-    attenuation_db: ArrayLike,
-    *,
-    harmonics: Sequence[int] = (1, 2),
-    notches: Composite = 1,
-) -> HarmonicNotch:
+    frequency_hz: ArrayLike, bandwidth_hz: ArrayLike, attenuation_db: ArrayLike, *,
+    harmonics: Sequence[int] = (1, 2), notches: Composite = 1,
+) -> HarmonicNotch:  # fmt: skip
     """ArduPilot's harmonic notch by its parameters, centred on `frequency_hz`.
 
     Several notches at a harmonic have the bandwidth divided by their number each, and are

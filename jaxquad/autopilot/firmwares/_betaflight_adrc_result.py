@@ -64,17 +64,10 @@ _SPREAD = 4.0  # factor on b0 to either side
 
 
 def propose_adrc(
-    plant: GainOverThrottle,
-    flown: Flown,
-    axis: str,
-    *,
-    hover: float | None = None,
-    targets: Limits | None = None,
-    bins: int = 5,
-    members: int = 32,
-    fresh: int = 256,
+    plant: GainOverThrottle, flown: Flown, axis: str, *, hover: float | None = None,
+    targets: Limits | None = None, bins: int = 5, members: int = 32, fresh: int = 256,
     seed: int = 0,
-) -> ADRCProposal:
+) -> ADRCProposal:  # fmt: skip
     """Tune wc, wo and b0 of Betaflight's proposed ADRC on the plants that a log leaves possible.
 
     Wanted is the least rate after a step of torque, with the targets kept on every plant at every

@@ -31,6 +31,7 @@ _DIGITS = 9  # of slopes: delays that change alike
 # A delay that its sample leaves with that share of its standard error, and does not move by more
 # standard errors, is known better from the rest of the response.
 _SEEN, _MOVED = 0.95, 0.05
+_NARROWED = 0.9  # of the deviation of a sample, below which an interval is no longer that sample
 _REACH = 8.0  # standard errors, beyond which a density is nothing
 _PLACES = 401  # at which it is integrated
 _NOTHING = 1e-3  # of the precision of a sample
@@ -186,6 +187,7 @@ class SampleLimit(NamedTuple):
     high: float
     value: float
     standard_error: float
+    narrowed: bool = False  # whether the rest of the response says more than the sample
 
 
 def sample_limits(
@@ -221,7 +223,7 @@ def sample_limits(
     spread = np.diagonal(jacobian @ scaled_inverse(solved.information) @ jacobian.T)
     needed = []
     for limit, variance in zip(limits, spread, strict=True):
-        one, low, high, middle, error = limit
+        one, low, high, middle, error, _ = limit
         mean = float(np.asarray(late[one.record])[one.output, one.input])
         precision = 1 / variance - 1 / error**2
         if precision < _NOTHING / error**2:
@@ -241,7 +243,8 @@ def sample_limits(
             continue
         more = 1 / variance - precision
         value = (mean / variance - aim * precision) / more
-        needed.append(limit._replace(value=value, standard_error=more**-0.5))
+        narrowed = variance < (_NARROWED * error) ** 2
+        needed.append(SampleLimit(one, low, high, value, more**-0.5, narrowed))
     return needed, solved.z
 
 
@@ -260,13 +263,15 @@ def remarks_on_samples(
 ) -> list[Message]:
     """Say which sample is all that is known of a delay, and which direct part nobody knows."""
     remarks = list[Message]()
-    for delay, low, high, *_ in limits:
-        of = data[delay.record]
+    for delay, low, high, _, _, narrowed in limits:
+        of, extent = data[delay.record], "the interval is that sample"
+        if narrowed:
+            extent = "the rest of the response narrows the interval"
         text = (
             f"{of.input_names[delay.input]} passes directly to {of.output_names[delay.output]}, "
             "which shows in whole samples of the held input: its delay lies between "
-            f"{1e3 * low:.4g} and {1e3 * high:.4g} ms, and the interval is that sample; record at "
-            "a higher rate to know it better"
+            f"{1e3 * low:.4g} and {1e3 * high:.4g} ms, and {extent}; "
+            "record at a higher rate to know it better"
         )
         remarks.append(Message(text, "sampled delay"))
     if any(aliases is not None and aliases.is_level for aliases in problem.aliases):

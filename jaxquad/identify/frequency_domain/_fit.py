@@ -28,7 +28,7 @@ from jaxquad.spectra import FrequencyResponse
 
 from ..uncertainty._assess import assess, unfitted
 from ..uncertainty._error_budget import weighting_at
-from ..uncertainty._local_misfit import DOUBT
+from ..uncertainty._misfit import DOUBT
 from ..uncertainty._verdict import without_numbers
 from ..uncertainty._zero_bounds import linearise, solve_within_bounds
 from ._cost import (

@@ -15,7 +15,17 @@ from jaxquad._core import pytree_node
 from jaxquad.spectra import FrequencyResponse, TwoLags
 
 from ._cost import Band, Cost, MaximumLikelihood, Points, Range
-from ._parameters import Condition, Free, Parameters, Positive, Real, Tie, with_values
+from ._parameters import (
+    Condition,
+    Free,
+    Numbers,
+    Parameters,
+    Positive,
+    Real,
+    require_conditions,
+    Tie,
+    with_values,
+)
 from ._problem import on_device, Prior
 
 
@@ -206,11 +216,12 @@ def fit_bands(fit: PyTree) -> Bands:
 
 
 class _Term(NamedTuple):
-    """A factor of the response; `starts` are in units of the band's edges and middle (rad/s)."""
+    """A factor of the response, by s or by when a sweep has it; `starts` are by the band's edges
+    and middle (rad/s)."""
 
     title: str
     formula: str
-    factor: Callable[[Complex[Array, " f"], Float[Array, " extra"]], Complex[Array, " f"]]
+    factor: Callable[[Array, Float[Array, " extra"]], Array]
     names: tuple[str, ...]
     starts: Callable[[float, float, float], list[list[float]]]
 
@@ -251,21 +262,58 @@ _TERMS = (
                                 [mid, 0.1, 1.1], [np.sqrt(mid * high), 0.1, 1.1]],
     ),
 )  # fmt: skip
+_DRIFT = _Term(
+    "a gain that drifts", "1 + change t / T (t from mid-record, T the length of the sweep)",
+    lambda time, x: 1 + x[0] * time, ("change",), lambda low, mid, high: [[-0.01]],
+)  # fmt: skip
 
 
 class Extended(eqx.Module):
-    """A model whose responses are all multiplied by one further factor."""
+    """A model whose responses are all multiplied by one further factor. A gain that drifts has it
+    in the response to a sweep alone (`swept`: omega, and when each input has it)."""
 
     model: PyTree
     extra: Float[Array, " extra"]
     term: _Term = eqx.field(static=True)
+    swept: tuple[Numbers, Numbers] | None = None
 
     def frequency_response(self, omega: Float[Array, " f"]) -> Complex[Array, "f ..."]:
         """Of the model, times the factor."""
-        s = jax.lax.complex(jnp.zeros_like(omega), omega)
         response = self.model.frequency_response(omega)
+        if self.term is _DRIFT:
+            if self.swept is None:
+                return response
+            time = ft.partial(jnp.interp, jnp.abs(omega), self.swept[0])
+            times = jax.vmap(time, in_axes=1, out_axes=1)(self.swept[1])
+            factor = self.term.factor(times, self.extra).astype(response.dtype)
+            return response * jnp.expand_dims(factor, range(1, response.ndim - 1))
+        s = jax.lax.complex(jnp.zeros_like(omega), omega)
         factor = self.term.factor(s, self.extra.astype(s.dtype))
         return response * factor.reshape(-1, *(1,) * (response.ndim - 1))
+
+
+@pytree_node
+class _During:
+    """A condition: the model under `change`, during a sweep."""
+
+    change: Condition
+    swept: tuple[Numbers, Numbers]
+
+    def __call__(self, model: Extended) -> Extended:
+        model = self.change(model)
+        return Extended(model.model, model.extra, model.term, self.swept)
+
+
+def _sweeps(origin: Origin) -> list[tuple[np.ndarray, np.ndarray]] | None:
+    """Of each response, in lengths of the sweep over the points in use; None without a sweep."""
+    sweeps = []
+    for frf, points in zip(origin.frfs, origin.points, strict=True):
+        if frf.swept_at is None:
+            return None
+        omega, times = np.asarray(frf.omega), np.asarray(frf.swept_at)
+        length = np.ptp(times[np.any(points.used, axis=1)])
+        sweeps.append((omega, times / max(length, 1e-9)))
+    return sweeps
 
 
 class Candidate(NamedTuple):
@@ -345,7 +393,7 @@ def explain_misfit(fit: PyTree) -> Explanation:
     model, middle = model_to_start_from(fit), float(np.sqrt(low * high))
     plain = origin.fit_again(model, _options(fit, origin, None), 0) or fit
     tried = []
-    for term in _TERMS:
+    for term in (*_TERMS, *([_DRIFT] if _sweeps(origin) else [])):
         options, fits = _options(fit, origin, term), []
         for start in term.starts(low, middle, high):
             other = origin.fit_again(Extended(model, jnp.asarray(start), term), options, 0)
@@ -353,7 +401,7 @@ def explain_misfit(fit: PyTree) -> Explanation:
                 continue
             # A frequency far from the band makes the term a gain, or nothing.
             place = float(np.asarray(other.model.extra)[0])
-            if term.names[0] == "T" or low / _FAR < place < high * _FAR:
+            if term.names[0] in ("T", "change") or low / _FAR < place < high * _FAR:
                 fits.append(other)
         tried.append((term, min(fits, key=lambda other: other.cost, default=None)))
     # A misfit that is left in all of them counts as noise here. The refit may end in a poorer
@@ -488,8 +536,9 @@ def _options(fit: PyTree, origin: Origin, term: _Term | None) -> Options:
     options = options._replace(cost=MaximumLikelihood(), starts=1, free=free)
     if term is None:
         return options
+    sizes = {"T": 1 / origin.band[1], "change": 1.0}
     extra = [
-        Real(f"extra[{k}]", 1 / origin.band[1]) if name == "T" else Positive(f"extra[{k}]")
+        Real(f"extra[{k}]", sizes[name]) if name in sizes else Positive(f"extra[{k}]")
         for k, name in enumerate(term.names)
     ]
     tied, conditions, priors = options.tied, options.conditions, []
@@ -497,6 +546,9 @@ def _options(fit: PyTree, origin: Origin, term: _Term | None) -> Options:
         tied = {f"model.{name}": ft.partial(_of_model, tie) for name, tie in tied.items()}
     if conditions is not None:
         conditions = [c if c is None else ft.partial(_change_model, c) for c in conditions]
+    if term is _DRIFT:
+        changes = require_conditions(fit.model, conditions, len(origin.frfs))
+        conditions = list(map(_During, changes, _sweeps(origin) or []))
     for prior in options.priors:
         quantity = prior.quantity
         named = isinstance(quantity, str)

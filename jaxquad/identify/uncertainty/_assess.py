@@ -36,7 +36,7 @@ from ._error_budget import (
     units_of,
     Weighting,
 )
-from ._local_misfit import DOUBT, local_misfits, MISFIT, with_resonance
+from ._misfit import DOUBT, find_drift, local_misfits, MISFIT, with_resonance
 from ._verdict import (
     identifiability_of,
     Information,
@@ -194,6 +194,9 @@ def assess(
                 f"the misfit is {ratio:.1f} times the random error{where}: the model's structure "
                 f"does not explain the whole response{minimum if ratio > _POOR else ''}",
             )
+        drift = None if stopped or near else find_drift(alone)
+        if drift and drift.is_clear(misfit):
+            remark("drift", str(drift))
         # Parameters at zero that the data want to have the other sign, by random errors.
         unbounded, steps = without_bounds(budget.by_noise, budget, zeros)
         pulls = {k: -x / float(np.sqrt(max(unbounded[k, k], 1e-300))) for k, x in steps.items()}

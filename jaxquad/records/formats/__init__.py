@@ -9,12 +9,14 @@ fill the memory before anyone has seen its size. So that process has limits of t
 size. It runs `_by_library.py` by its path, without the package.
 """
 
+import contextlib
 import functools as ft
 import json
 import subprocess
 import sys
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextvars import ContextVar
 from pathlib import Path
 from typing import NamedTuple
 
@@ -173,9 +175,44 @@ def load_signals(path: str | Path) -> Signals:
     return signals
 
 
+def channel_names(path: str | Path) -> set[str]:
+    """Those of all arrays of a file, and of their columns. Raises ReadError."""
+    arrays = {name: signal.values for name, signal in load_signals(path).arrays.items()}
+    columns = ((name, x.shape[1]) for name, x in arrays.items() if x.ndim == 2)
+    return {*arrays, *(f"{name}[{k}]" for name, count in columns for k in range(count))}
+
+
+_kept: ContextVar[dict[Path, Log] | None] = ContextVar("kept logs", default=None)
+
+
+@contextlib.contextmanager
+def keep_logs() -> Iterator[None]:
+    """Within it, a file that is read again is not decoded again."""
+    token = _kept.set({})
+    try:
+        yield
+    finally:
+        _kept.reset(token)
+
+
 def load_log(path: str | Path) -> Log:
     """The tables of a file, as its reader finds them. Raises ReadError, warns RecordWarning."""
-    path = Path(path)
+    path, kept = Path(path), _kept.get()
+    log = None if kept is None else kept.get(path)
+    if log is None:
+        log = _decode(path)
+    if kept is not None:
+        kept.clear()
+        kept[path] = log
+    remarks = list(log.remarks[:_LISTED])
+    if len(log.remarks) > _LISTED:
+        remarks.append(f"{len(log.remarks) - _LISTED} more remarks of this kind")
+    for remark in remarks:
+        warn(f"{path}: {remark}.")
+    return log
+
+
+def _decode(path: Path) -> Log:
     try:
         require_file(path)
         head = b""
@@ -211,7 +248,7 @@ def load_log(path: str | Path) -> Log:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            log = reader.load(path)
+            return reader.load(path)
     except ReadError as error:
         raise located(error, path) from error.__cause__
     # A damaged file makes zipfile, zlib, numpy, HDF5 and their like raise almost anything.
@@ -220,12 +257,6 @@ def load_log(path: str | Path) -> Log:
             f"{path}: cannot be read as {reader.kind}: the file is cut off or damaged "
             f"({type(error).__name__}: {printable(str(error))})."
         ) from error
-    remarks = list(log.remarks[:_LISTED])
-    if len(log.remarks) > _LISTED:
-        remarks.append(f"{len(log.remarks) - _LISTED} more remarks of this kind")
-    for remark in remarks:
-        warn(f"{path}: {remark}.")
-    return log
 
 
 def require_file(path: str | Path) -> None:

@@ -1,4 +1,4 @@
-"""A misfit that is local in frequency: where it is, and what it may move.
+"""Misfits of a kind: local in frequency, where they are and what they may move; along a sweep.
 
 A stationary discrepancy hardly sees a notch or a mode of the plant: beside many points that fit,
 it is improbable. So windows from half an octave to the whole band are searched, overlapping by
@@ -8,6 +8,10 @@ less what the parameters take off. The noise is an estimate, so this is an F of 
 its own (`log_noise_covariance`). The least probability of all windows, times their number, bounds
 that of a false alarm (Bonferroni).
 Source: Glaz, Naus & Wallenstein (2001), Scan Statistics.
+
+A sweep has each frequency at one time, so a gain that drifts with time does so along frequency. Its
+score test is the next step of the fit with such a drift as one more parameter.
+Source: Rao (1948), Large sample tests of statistical hypotheses.
 """
 
 import dataclasses
@@ -20,7 +24,7 @@ from jaxtyping import Float
 from jaxquad.spectra import in_hertz
 
 from ..frequency_domain._cost import mix, Points
-from ._error_budget import ErrorBudget, scaled_inverse, SHARES
+from ._error_budget import ErrorBudget, PriorRows, scaled_inverse, SHARES
 
 
 MISFIT = 1.5  # ratio of misfit to random error from which the model's structure is in doubt
@@ -31,7 +35,10 @@ _MOST = 0.5  # share of the misfit beyond the noise
 _FEWEST = 2.0  # degrees of freedom of a window
 _PLACES, _DAMPINGS = 24, (0.1, 0.2, 0.4)  # of the resonances that are tried
 _OUTSIDE = 1.3  # times the window's ends: resonances up to there show within it
-_DISTINCT = 1e-8  # share of a resonance that the parameters do not take up
+_DISTINCT = 1e-8  # share of a resonance, or of a drift, that the parameters do not take up
+_FALLS, _RISES = 0.004, 0.0005  # chance of a remark on a steady gain: batteries fall
+_LOOKED_AT = 2.0  # standard errors of a drift from which its covariance is computed
+_EXPLAINED = 0.1  # of a large misfit, which a drift may leave
 
 
 class LocalMisfit(NamedTuple):
@@ -159,3 +166,54 @@ def with_resonance(budget: ErrorBudget, local: LocalMisfit | None) -> ErrorBudge
     shares = np.exp((np.array(lowered) - max(lowered)) / (2 * scale))
     moved = np.tensordot(shares / np.sum(shares), np.array(moves[1:]), axes=1)
     return dataclasses.replace(budget, moved=moved)
+
+
+class Drift(NamedTuple):
+    """A change of the gain while a sweep lasts, as the residual shows it."""
+
+    change: float  # of the gain, relative
+    standard_error: float
+    seconds: float  # that the sweep lasts
+    chance: float  # of as much where the gain is steady, on this side
+    misfit_ratio: float  # with it
+
+    def is_clear(self, misfit: float) -> bool:
+        """Whether it is beyond chance and explains the fit's `misfit`."""
+        clear = self.chance < (_FALLS if self.change < 0 else _RISES)
+        return clear and self.misfit_ratio < max(MISFIT**2, _EXPLAINED * misfit)
+
+    def __str__(self) -> str:
+        return (
+            "the misfit changes along the sweep, as if the gain changed by "
+            f"{100 * self.change:+.2g} % (standard error {100 * self.standard_error:.2g} %) in "
+            f"{self.seconds:.3g} s, which the intervals do not include; or the model lacks a term "
+            "(«Fit.explain()» tries both). Sweep in both directions, or with a full battery"
+        )
+
+
+def find_drift(budget: ErrorBudget) -> Drift | None:
+    """The drift of the gain that the residual of sweeps shows; None of other excitation."""
+    if any(record.frf.swept_at is None for record in budget.records):
+        return None
+    from scipy.special import stdtr
+
+    records, count, times = [], budget.count, []
+    for record in budget.records:
+        time = np.asarray(record.frf.swept_at)[:, None, :]
+        times.append(time[np.any(record.used, axis=1, keepdims=True) & np.isfinite(time)])
+        column = np.zeros((*record.misfit.shape, 1))
+        column[..., 0, 0] = np.where(record.used, time, 0.0)
+        slopes = np.concatenate([record.slopes[..., :count], column], axis=-1)
+        records.append(dataclasses.replace(record, slopes=slopes, count=count + 1))
+    priors = np.pad(budget.prior.slopes[:, :count], ((0, 0), (0, 1)))
+    more = ErrorBudget(records, PriorRows(budget.prior.misfit, priors), count + 1)
+    inverse = scaled_inverse(more.bread)
+    step = inverse @ more.gradient
+    if not step[-1] ** 2 > _LOOKED_AT**2 * inverse[-1, -1]:  # as if the noise were known and white
+        return None
+    error = float(np.sqrt(more.by_noise[-1, -1]))
+    chance = float(stdtr(more.degrees_of_freedom[-1], -abs(step[-1]) / error))
+    left = more.data_cost - float(more.gradient @ step)
+    ratio = left / max(more.noise.cost - more.fitted_noise, 1e-300)
+    seconds = max(float(np.ptp(time)) for time in times)
+    return Drift(-float(step[-1]) * seconds, error * seconds, seconds, chance, ratio)
