@@ -13,7 +13,7 @@ u. The transform of what is left, over the command and not over time, has a peak
 
 import dataclasses
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import cast, NamedTuple
 
 import numpy as np
 from jaxtyping import Complex, Float
@@ -53,7 +53,7 @@ _CLEAR_STEPS, _LIKE = 5.0, (0.45, 1.25)  # standard errors; share of the roundin
 _EVERYWHERE, _HALF = 3.0, (0.25, 1.25)  # likewise, for small and for large commands
 _BIASED = 3.0  # random errors of the gain from which a remark is made
 
-Commands = Sequence[Float[np.ndarray, "_samples"]]
+Commands = Sequence[Float[np.ndarray, " _samples"]]
 
 
 class TwoLags(Remark):
@@ -217,7 +217,7 @@ class _Search:
             "an actuator of two lags; or record what the actuator does (its position or rpm) as "
             "the input"
         )
-        remark = TwoLags(text, pair=pair, kind=TWO_LAGS)
+        remark = cast(TwoLags, TwoLags(text, pair=pair, kind=TWO_LAGS))
         remark.lags, remark.differences, remark.errors = table, differences, errors
         remark.changes, remark.further, remark.clear = changes, further, float(clear[best])
         return remark

@@ -451,8 +451,8 @@ def frequency_response(
 
         remarks = remarks_on_feedback(records, method, estimate)
         if estimate.distortion is None:  # periods show their own
-            lags, *behind = remarks_on_actuator(records, method, estimate)
-            remarks += lags + remarks_on_linearity(behind[0], method, behind[1])
+            of_actuator, corrected, behind = remarks_on_actuator(records, method, estimate)
+            remarks += of_actuator + remarks_on_linearity(corrected, method, behind)
         if method == "joint":
             remarks += remarks_on_clock(records, estimate)
         return remarks + estimate.remarks()
