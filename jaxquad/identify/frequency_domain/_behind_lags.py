@@ -94,7 +94,7 @@ def fit_behind_lags(fit: PyTree, origin: Origin) -> tuple[Candidate, str] | None
     candidate = Candidate(title, "m' = (u - m) / T", behind, clearest.clear**2 - float(price))
     return candidate, (
         f"The actuator has two lags: {up} while its command rises, {down} while it falls"
-        f"{'' if 'lag' in fit.names else ', if both are its slowest ones'}. The values below are "
+        f"{'' if 'lag' in fit.names else ', where their difference is clearest'}. The values below are "
         "those of the plant behind it, with the lag 2 / (1 / up + 1 / down)"
     )
 
