@@ -92,10 +92,10 @@ def fit_behind_lags(fit: PyTree, origin: Origin) -> tuple[Candidate, str] | None
     price = 2 * np.log(2 * origin.independent_points)
     title = "an actuator of two lags"
     candidate = Candidate(title, "m' = (u - m) / T", behind, clearest.clear**2 - float(price))
+    rest = "" if "lag" in fit.names else ", where their difference is clearest"
     return candidate, (
-        f"The actuator has two lags: {up} while its command rises, {down} while it falls"
-        f"{'' if 'lag' in fit.names else ', where their difference is clearest'}. The values below are "
-        "those of the plant behind it, with the lag 2 / (1 / up + 1 / down)"
+        f"The actuator has two lags: {up} while its command rises, {down} while it falls{rest}. "
+        "The values below are those of the plant behind it, with the lag 2 / (1 / up + 1 / down)"
     )
 
 
