@@ -1,3 +1,4 @@
+from ._actuator import TWO_LAGS as TWO_LAGS, TwoLags as TwoLags
 from ._clock import compare_with_input as compare_with_input, OtherInput as OtherInput
 from ._error_covariance import (
     ErrorCovariance as ErrorCovariance,
