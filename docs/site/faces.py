@@ -15,7 +15,7 @@ class Faces(griffe.Extension):
     def on_package(self, *, pkg: griffe.Module, **_: Any) -> None:
         """`from ._file import X as X` makes X public, as if `__all__` named it."""
         for room in pkg.modules.values():
-            for face in (room, *room.modules.values()):
+            for face in (room, *(x for x in room.modules.values() if not x.is_alias)):
                 aliases = [n for n, m in face.members.items() if m.is_alias and n[0] != "_"]
                 face.exports = face.exports or aliases  # a room of one file has `__all__`
 

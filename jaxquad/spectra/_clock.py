@@ -1,21 +1,29 @@
-"""Whether the outputs' time stamps run at another rate than those of the other signals; and when a
-sweep has each of its frequencies.
+"""What takes part in a record beside its input: another clock, another signal; and when a sweep has
+each of its frequencies.
 
-A controller makes the inputs of the references and the outputs, with hardly any noise of its own:
+**Clocks**: whether the outputs' time stamps run at another rate than those of the other signals. A
+controller makes the inputs of the references and the outputs, with hardly any noise of its own:
 u = A r + C y. Where the outputs' stamps gain a share e of the time, u keeps e C (t dy/dt). A sweep
 alone cannot tell this from a delay; what else moves the loop excites C all the time.
+
+**Signals**, such as another axis' command. At the plant's input, the residual of the local linear
+model holds h W, where W is what that model does not explain of the other signal: so far as it moves
+with the input, both are one. h is smooth: complex, and linear in the logarithm of frequency. Its
+four factors are tested together.
+Source: Bendat and Piersol, "Random Data", 4th ed., ch. 7 (partial coherence).
 """
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Complex, Float
+from jaxtyping import Float
 
 from jaxquad.records import Record
 
 from ._estimators import COHERENT, Grid, Method, power_of, Remark, sums_between
-from ._frequency_response import Estimate
-from ._linearity import fast_length
+from ._frequency_response import Estimate, FrequencyResponse
+from ._linearity import factors_of, fast_length, FEWEST, left_over, Spectra, transform_bins
 
 
 _CLEAR = 6.0  # standard errors from which a remark is made
@@ -23,19 +31,16 @@ _OTHER = 3.0  # times what is found in quadrature, as a controller leaves whose 
 _BLOCK, _POWERS = 24, 3  # bins for each signal, over which A and C are smooth; their coefficients
 _DISTINCT = 1e-5  # share of the signal looked for that no controller explains
 _MOST = 0.01  # drift of a clock, as a share of the time
-_FEWEST = 8  # points of the response
 _NEAR = 0.05  # of a frequency, over which the time of its power is averaged
 _BRIEF = 0.2  # of a sweep's length, within which it passes a frequency
 _FLOOR = 1e-20  # of the input's power: below it lies rounding
-
-Columns = Complex[np.ndarray, "bins columns"]
 
 
 def remarks_on_clock(records: Sequence[Record], estimate: Estimate) -> tuple[Remark, ...]:
     """A remark on outputs whose stamps drift by more than the random error of a delay."""
     usable = np.isfinite(estimate.response) & (estimate.coherence >= COHERENT)
     omega = estimate.omega[np.any(usable, axis=(1, 2))]
-    if omega.size < _FEWEST:
+    if omega.size < FEWEST:
         return ()
     rate, clear = _clock_drift(records, omega)
     error = np.where(usable, estimate.random_error, np.inf)
@@ -79,7 +84,7 @@ def _compare(record: Record, low: float, high: float) -> list[tuple[np.ndarray, 
     band, y = slice(max(int(first), 1), int(last)), record.outputs[:count]
     time = np.linspace(-0.5, 0.5, count)[:, None] * count  # in samples
     commands, moving, gained = (
-        _transform(x)[band]
+        transform_bins(x)[band]
         for x in (
             record.inputs[:count],
             np.hstack([y, record.references[:count]]),
@@ -115,10 +120,11 @@ def sweep_times(
 ) -> Float[np.ndarray, "frequencies inputs"] | None:
     """When each input sweeps each frequency, in s from the middle of its record, by power; None
     where another excitation moves an input."""
-    moments = np.zeros((3, omega.size, records[0].inputs.shape[1]))
+    inputs = records[0].inputs.shape[1]  # references beyond theirs are other signals
+    moments = np.zeros((3, omega.size, inputs))
     for record in records:
         count = fast_length(record.samples)
-        moving = (record.inputs if method == "direct" else record.references)[:count]
+        moving = (record.inputs if method == "direct" else record.references)[:count, :inputs]
         moving = moving - np.mean(moving, axis=0)
         time = np.linspace(-0.5, 0.5, count)[:, None] * count * record.dt
         plain, later = (np.fft.rfft(x.T).T for x in (moving, time * moving))
@@ -135,5 +141,55 @@ def sweep_times(
     return times if np.all(spread < _BRIEF * np.ptp(times, axis=0)) else None
 
 
-def _transform(columns: Float[np.ndarray, "samples columns"]) -> Columns:
-    return np.fft.rfft((columns - np.mean(columns, axis=0)).T).T / np.sqrt(len(columns))
+Samples = Float[np.ndarray, " _samples"]
+_FACTORS = 4  # of h
+_ROUNDING = 1e-6  # of the power of a signal
+
+
+class OtherInput(NamedTuple):
+    """What a record tells of another signal."""
+
+    chance: float  # that noise explains as much of the output as the signal does
+    alone: float  # share of the signal's power that does not move with the input
+
+
+def compare_with_input(
+    records: Sequence[Record], frf: FrequencyResponse, signals: Sequence[Samples]
+) -> OtherInput | None:
+    """Compare another signal, sampled as each record is, with the first input of a response.
+
+    None where the response has too few coherent points, or the records too few bins.
+    """
+    omega, method = np.asarray(frf.omega), frf.method
+    response, coherence = (np.asarray(x)[:, 0, :1] for x in (frf.response, frf.coherence))
+    used = (np.isfinite(response) & (coherence >= COHERENT))[:, 0]
+    if np.sum(used) < FEWEST:
+        return None
+    low, high = omega[used][[0, -1]]
+    spectra = [
+        _spectra(record, method, signal, low, high)
+        for record, signal in zip(records, signals, strict=True)
+    ]
+    left = left_over(spectra, omega[used], response[used], (0, 0))
+    if left is None:
+        return None
+    from scipy.special import chdtrc
+
+    added = left.added[:, :2]
+    if not left.share[0] > _ROUNDING:
+        return OtherInput(1.0, 0.0)
+    clear = factors_of(left, np.hstack([added, 1j * added]))[2]
+    alone = left.share[0] / np.mean(1 - left.leverage)  # the model takes its share of any signal
+    return OtherInput(float(chdtrc(_FACTORS, clear**2)), float(min(alone, 1.0)))
+
+
+def _spectra(record: Record, method: Method, signal: Samples, low: float, high: float) -> Spectra:
+    count = fast_length(record.samples)
+    inputs, outputs, other = (
+        transform_bins(x[:count]) for x in (record.inputs, record.outputs, signal[:, None])
+    )
+    moving = inputs if method == "direct" else transform_bins(record.references[:count])
+    grid = 2 * np.pi / (count * record.dt) * np.arange(len(inputs))
+    slope = np.log(np.maximum(grid, grid[1]) ** 2 / (low * high))[:, None] / np.log(high / low)
+    added = np.hstack([other, slope * other])
+    return Spectra(grid, moving, inputs[:, :1], outputs[:, :1], added, record.inputs[:0, 0])

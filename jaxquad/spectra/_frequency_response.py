@@ -444,13 +444,15 @@ def frequency_response(
             estimate = estimate_local_polynomial(records, grid, estimator, method)
 
     def find_remarks() -> tuple[Remark, ...]:
+        from ._actuator import remarks_on_actuator
         from ._clock import remarks_on_clock
         from ._feedback import remarks_on_feedback
         from ._linearity import remarks_on_linearity
 
         remarks = remarks_on_feedback(records, method, estimate)
         if estimate.distortion is None:  # periods show their own
-            remarks += remarks_on_linearity(records, method, estimate)
+            of_actuator, corrected, behind = remarks_on_actuator(records, method, estimate)
+            remarks += of_actuator + remarks_on_linearity(corrected, method, behind)
         if method == "joint":
             remarks += remarks_on_clock(records, estimate)
         return remarks + estimate.remarks()

@@ -126,8 +126,8 @@ def identify_opened(opened: OpenedLogs) -> Identification:
     bands = explanation = None
     if fit.verdict.fitted and fit.verdict.kind != "no minimum":
         bands = attempt(HALVES, fit.bands)
-        drifts = any(remark.kind == "drift" for remark in fit.remarks)
-        if settings.explain and (drifts or fit.chi_squared > fitting.MISFIT**2):
+        changes = any(remark.kind in ("drift", spectra.TWO_LAGS) for remark in fit.remarks)
+        if settings.explain and (changes or fit.chi_squared > fitting.MISFIT**2):
             explanation = attempt(EXPLAINED, fit.explain)
     if settings.reference:
         announce("fit to the direct response")
@@ -314,6 +314,7 @@ def _remarks_on_other_inputs(
     if not changes and not explains:
         return remarks
     options = " ".join(f"--other-input {shlex.quote(text)}" for text in acting)
+    names = " and ".join(text.partition("=")[0] for text in acting)
     them, effects = "it" if len(acting) == 1 else "them", []
     if changes:
         errors, name, before, after = max(changes)
@@ -325,7 +326,7 @@ def _remarks_on_other_inputs(
     if explains:
         effects.append(f"the misfit is {misfits[1]:.1f} instead of {misfits[0]:.1f} random errors")
     text = (
-        f"{output} answers to {' and '.join(acting)}, too, and {source} moves with {them}: "
+        f"{output} answers to {names}, too, and {source} moves with {them}: "
         f"without this part {', and '.join(effects)}. Take it out ({options})"
     )
     return [*remarks, Message(text, _OTHER)]

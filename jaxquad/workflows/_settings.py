@@ -156,6 +156,9 @@ class IdentifySettings(Settings):
             yield "`segments` says where to start and stop: leave `start` and `stop` out"
         if self.band is not None and self.band_rad is not None:
             yield "`band` (Hz) and `band_rad` (rad/s) are both given: keep one"
+        names = [text.partition("=")[0] for text in (*self.other_inputs, self.input or "")]
+        if len(set(names)) < len(names):
+            yield f"`input` and `other_inputs` are {', '.join(names)}: give each signal once"
         if self.other_inputs and self.reference and (self.window or self.estimator != "local"):
             yield (
                 "`other_inputs` beside a `reference` need local polynomials: leave `estimator` and "

@@ -113,3 +113,16 @@ def test_a_response_is_interpolated_across_a_wide_gap_near_its_points():
     grid = np.geomspace(0.21, 22.0, 500)
     found = np.abs(interpolated(grid, omega, size.astype(complex)[:, None]))
     assert np.all((found > 0.09 / np.e - 1e-9) & (found < 0.172 * np.e + 1e-9))
+
+
+@pytest.mark.parametrize("steps", [4.7, 5.0, 5.3])
+def test_steps_of_an_actuator_are_remarked_with_the_bias_of_the_gain(steps):
+    # Describing function of a rounding: Gelb and Vander Velde (1968), table B.
+    edges = (2 * np.arange(1, int(steps + 0.5) + 1) - 1) / (2 * steps)
+    truth = 4 / (np.pi * steps) * np.sum(np.sqrt(1 - edges**2)) - 1
+    record = open_loop(lambda u: np.round(u * steps) / steps, 0, noise=0.01)
+    (remark,) = frequency_response(record, OMEGA).remarks
+    assert remark.kind == "steps"
+    named = float(remark.split("biased by about ")[1].split(" %")[0]) / 100
+    assert named == pytest.approx(truth, rel=0.4)
+    assert float(remark.split("steps of ")[1].split(",")[0]) == pytest.approx(1 / steps, rel=0.05)

@@ -43,6 +43,7 @@ SETTINGS = [
     Setting("healthy: .6-correlated sticks, no coupling", 0.0, 0.6, "sticks"),
     Setting("healthy: loops, .6-correlated, no coupling", 0.0, 0.6, "sweep", 0.1),
     Setting("healthy: loops, independent, coupling .05", 0.05, 0.0, "sweep", 0.1),
+    Setting("healthy: loops, loud gusts on both, no coupling", 0.0, 0.9, "sticks", 0.1, gust=0.5),
     Setting(".6-correlated, coupling .05", 0.05, 0.6),
     Setting(".6-correlated, coupling .2, louder noise", 0.2, 0.6, noise=0.3, gust=0.2),
     Setting(".6-correlated sticks, coupling .05", 0.05, 0.6, "sticks"),

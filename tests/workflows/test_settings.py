@@ -24,6 +24,7 @@ EVERY = [
         cost="coherence", verify="b.npz", verify_start=-1e-3, verify_stop=1e6,
     ),
     IdentifySettings(axis="pitch", start=-2.5, stop=1 / 3, band_rad=(1, 2), lag=False),
+    IdentifySettings(input="u[0]", output="p", other_inputs=["u[1]", "b=-m1+0.5*m2"]),
 ]  # fmt: skip
 
 
@@ -94,6 +95,8 @@ def test_an_option_takes_the_place_of_what_says_the_same_in_a_file():
         ({"poles": 2, "lag": False}, "lag is for a model of gain, lag and delay"),
         ({"window": 5, "estimator": "composite"}, "window is for windows of one length"),
         ({"verify_start": 3}, "verify_start and verify_stop are for a second record"),
+        ({"input": "M", "output": "q", "other_inputs": ["M"]}, "give each signal once"),
+        ({"reference": "r", "other_inputs": ["L"], "estimator": "welch"}, "need local polynomials"),
     ],
 )
 def test_settings_that_cannot_be_say_what_to_change(content, complaint):

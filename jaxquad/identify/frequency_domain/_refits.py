@@ -326,32 +326,38 @@ class Explanation(eqx.Module):
     """Structures that were tried on a misfit, and the one that the responses want, if any.
 
     `best` is a `jq.identify.Fit` of it, whose model is an `Extended` one: of the simplest of those
-    within 6 of the lowest BIC. None where no term lowers BIC by 6 and the misfit.
+    within 6 of the lowest BIC. None where no term lowers BIC by 6 and the misfit. Where a remark
+    says that the actuator has two lags, all of this is behind such an actuator: `actuator` says
+    which, the first candidate has no further term, and `best` is this one if none is wanted.
     """
 
     fit: PyTree  # the one that was to be explained
     candidates: tuple[Candidate, ...]  # what was tried, by gain, but `best` first
     best: PyTree
+    actuator: str = eqx.field(static=True, default="")
 
     @property
     def summary(self) -> str:
         """Which term the model lacks, in a sentence or two."""
         before = float(np.sqrt(self.fit.chi_squared))
+        if self.actuator and not isinstance(self.best.model, Extended):
+            return self.actuator
         if self.best is None:
             return (
                 f"None of {len(self.candidates)} further terms explains the misfit of "
                 f"{before:.1f} random errors: rely on the intervals with model error, or fit the "
                 "part of the band where the model holds"
             )
-        first = self.candidates[0]
+        first = self.candidates[1 if self.actuator else 0]
         after = float(np.sqrt(first.fit.chi_squared))
         names = self.best.model.term.names
         numbers = zip(names, self.best.values[len(self.fit.names) :], strict=True)
         values = ", ".join(f"{name} = {value:.4g}" for name, value in numbers)
         rest = "" if after < _MISFIT else ", which is still more than noise"
+        actuator = f"{self.actuator}. " if self.actuator else ""
         return (
-            f"The model lacks {first.title}, {first.formula} with {values}: with it the misfit "
-            f"falls from {before:.1f} to {after:.1f} random errors{rest}"
+            f"{actuator}The model lacks {first.title}, {first.formula} with {values}: with it the "
+            f"misfit falls from {before:.1f} to {after:.1f} random errors{rest}"
         )
 
     def __str__(self) -> str:
@@ -370,7 +376,17 @@ class Explanation(eqx.Module):
 
 def explain_misfit(fit: PyTree) -> Explanation:
     """Fit again with one further term after the other, as `Fit.explain` says."""
+    from ._behind_lags import fit_behind_lags
+
     origin = require_origin(fit)
+    behind = fit_behind_lags(fit, origin)
+    if behind is not None:
+        candidate, actuator = behind
+        if candidate.fit.chi_squared <= _MISFIT**2:
+            return Explanation(fit, (candidate,), candidate.fit, actuator)
+        inner = explain_misfit(candidate.fit)
+        best = candidate.fit if inner.best is None else inner.best
+        return Explanation(fit, (candidate, *inner.candidates), best, actuator)
     low, high = origin.band
     model, middle = model_to_start_from(fit), float(np.sqrt(low * high))
     plain = origin.fit_again(model, _options(fit, origin, None), 0) or fit
