@@ -38,7 +38,7 @@ _OUTSIDE = 1.3  # times the window's ends: resonances up to there show within it
 _DISTINCT = 1e-8  # share of a resonance, or of a drift, that the parameters do not take up
 _FALLS, _RISES = 0.004, 0.0005  # chance of a remark on a steady gain: batteries fall
 _LOOKED_AT = 2.0  # standard errors of a drift from which its covariance is computed
-_EXPLAINED = 0.1  # of a large misfit, which a drift may leave
+_EXPLAINED = 0.2  # of a large misfit, which a drift may leave
 
 
 class LocalMisfit(NamedTuple):
