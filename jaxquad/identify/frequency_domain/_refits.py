@@ -376,7 +376,7 @@ class Explanation(eqx.Module):
 
 def explain_misfit(fit: PyTree) -> Explanation:
     """Fit again with one further term after the other, as `Fit.explain` says."""
-    from ._behind_lags import fit_behind_lags
+    from ._structure import fit_behind_lags
 
     origin = require_origin(fit)
     behind = fit_behind_lags(fit, origin)
