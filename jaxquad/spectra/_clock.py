@@ -33,6 +33,7 @@ _DISTINCT = 1e-5  # share of the signal looked for that no controller explains
 _MOST = 0.01  # drift of a clock, as a share of the time
 _NEAR = 0.05  # of a frequency, over which the time of its power is averaged
 _BRIEF = 0.2  # of a sweep's length, within which it passes a frequency
+_NOTHING = 1e-12  # of the largest power: between the lines of an excitation that repeats
 _FLOOR = 1e-20  # of the input's power: below it lies rounding
 
 
@@ -135,7 +136,7 @@ def sweep_times(
         parts = power_of(plain), np.real(later * np.conj(plain)), power_of(later)
         moments += [sums_between(part, low, high) for part in parts]
     power, first, second = moments
-    power = np.maximum(power, 1e-300)
+    power = np.maximum(power, _NOTHING * np.max(power, axis=0) + 1e-280)
     times = first / power
     spread = np.sqrt(np.median(np.maximum(second / power - times**2, 0.0), axis=0))
     return times if np.all(spread < _BRIEF * np.ptp(times, axis=0)) else None

@@ -57,7 +57,8 @@ def main() -> None:
     warnings.simplefilter("ignore", jq.records.RecordWarning)
     print(f"setting | claimed / actual of {', '.join(RATE.names)} | coverage, %")
     for title, (make, changes) in SETTINGS.items():
-        plants, conditions = [make(title, TRUTH)], [None]
+        plants = [make(title, TRUTH)]
+        conditions: list[jq.identify.Changed | None] = [None]
         for name, times, plus in changes:
             theta, k = TRUTH.copy(), RATE.names.index(name)
             theta[k] = times * theta[k] + plus
