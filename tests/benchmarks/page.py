@@ -99,11 +99,11 @@ PAIRS = (
         "C, two threads, a simpler model",
     ),
     Pair(
-        "tune of wc, wo and a map of six knots over 64 members, compiled",
+        "tune of wc, wo and six knots over 64 members, compiled",
         "test_tune_speed.py",
         "test_tune_with_everything_compiled",
         "test_scipy_with_the_same_objective",
-        "scipy L-BFGS-B, the same objective by `jq.simulate`",
+        "scipy L-BFGS-B, the same objective",
     ),
 )
 PRINTED = (
