@@ -46,14 +46,16 @@ def test_what_moves_with_the_input_is_told_from_it_unless_both_are_one(feedback)
         record = Record(TIME, u, y, r if feedback else None)
         estimator = JointInputOutput(PLAIN) if feedback else PLAIN
         frf = frequency_response(record, OMEGA, estimator=estimator)
-        return compare_with_input([record], frf, [other])
+        compared = compare_with_input([record], frf, [other])
+        assert compared is not None
+        return compared
 
     idle = [compare(0.6, 0.0, seed) for seed in range(6)]
-    assert min(one.chance for one in idle) > 1e-3  # pyright: ignore[reportOptionalMemberAccess]
+    assert min(one.chance for one in idle) > 1e-3
     acting = compare(0.6, 0.05, 0)
-    assert acting.chance < 1e-6  # pyright: ignore[reportOptionalMemberAccess]
-    assert acting.alone == pytest.approx(1 - 0.6**2, abs=0.1)  # pyright: ignore[reportOptionalMemberAccess]
-    assert compare(1.0, 0.05, 0).alone < 5e-3  # pyright: ignore[reportOptionalMemberAccess]
+    assert acting.chance < 1e-6
+    assert acting.alone == pytest.approx(1 - 0.6**2, abs=0.1)
+    assert compare(1.0, 0.05, 0).alone < 5e-3
 
 
 def test_a_joint_estimate_takes_other_signals_out():
