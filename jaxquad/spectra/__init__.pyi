@@ -1,5 +1,4 @@
 from ._actuator import TWO_LAGS as TWO_LAGS, TwoLags as TwoLags
-from ._clock import compare_with_input as compare_with_input, OtherInput as OtherInput
 from ._error_covariance import (
     ErrorCovariance as ErrorCovariance,
     independent_errors as independent_errors,
@@ -36,3 +35,4 @@ from ._frequency_response import (
     FrequencyResponse as FrequencyResponse,
 )
 from ._noise import find_line as find_line, SpectralLine as SpectralLine
+from ._other_inputs import compare_with_input as compare_with_input, OtherInput as OtherInput

@@ -414,8 +414,8 @@ def frequency_response(
         ```
     """
     from ._average import average_windows
-    from ._clock import sweep_times
     from ._local_polynomial import estimate_local_polynomial
+    from ._other_inputs import sweep_times
     from ._periodic import estimate_periodic
 
     require_x64("a frequency response")
@@ -445,9 +445,9 @@ def frequency_response(
 
     def find_remarks() -> tuple[Remark, ...]:
         from ._actuator import remarks_on_actuator
-        from ._clock import remarks_on_clock
         from ._feedback import remarks_on_feedback
         from ._linearity import remarks_on_linearity
+        from ._other_inputs import remarks_on_clock
 
         remarks = remarks_on_feedback(records, method, estimate)
         if estimate.distortion is None:  # periods show their own

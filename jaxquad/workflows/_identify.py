@@ -294,11 +294,17 @@ def _remarks_on_other_inputs(
     ]
     if not acting:
         return remarks
+    names = " and ".join(text.partition("=")[0] for text in acting)
+    them, effects = "it" if len(acting) == 1 else "them", []
     announce(f"fit beside {', '.join(acting)}")
     try:
         other = fit_beside(opened.with_inputs(acting))
-    except ValueError:  # the inputs are too alike for a response
-        return remarks
+    except ValueError as error:
+        text = (
+            f"{output} answers to {names}, too, and {source} moves with {them}. By how much that "
+            f"moves the estimates is not known, as a fit beside {them} failed: {error}"
+        )
+        return [*remarks, Message(text, _OTHER)]
     changes = []
     for name in {*full.names} & {*other.names}:  # a damping may be in one alone
         k, j = full.names.index(name), other.names.index(name)
@@ -314,8 +320,6 @@ def _remarks_on_other_inputs(
     if not changes and not explains:
         return remarks
     options = " ".join(f"--other-input {shlex.quote(text)}" for text in acting)
-    names = " and ".join(text.partition("=")[0] for text in acting)
-    them, effects = "it" if len(acting) == 1 else "them", []
     if changes:
         errors, name, before, after = max(changes)
         percent = f"{100 * (after / before - 1):+.2g} %, " if before else ""
