@@ -460,7 +460,7 @@ _WORDS = {  # of a message, by what stands in its guillemets
     ", or raise global_order": "",
     "wider": "",
     "start from other values": "choose another band (--band)",
-    "start from other values, or leave solver= at its default":
+    "start from other values, or fit fewer parameters (free=)":
         "choose another band (--band) or a simpler model (--no-lag, --no-delay, fewer --poles)",
     "try other starting values": "try another band (--band), or jaxquad identify --no-lag",
     ", or give starts=20": "",

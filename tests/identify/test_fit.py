@@ -195,6 +195,12 @@ def test_undamped_gauss_newton_that_diverges_says_so():
         jq.fit(jq.LaggedIntegrator(1.0, 0.5, 0.5), response_of(TRUTH, seed=0), solver=solver)
 
 
+def test_a_fit_that_diverges_by_the_default_solver_names_what_else_to_try():
+    with pytest.raises(ValueError, match="the fit diverged.*fit fewer parameters") as error:
+        jq.fit(jq.LaggedIntegrator(280.0, 1e200, 0.01), response_of(TRUTH, seed=0))
+    assert "solver=" not in str(error.value)
+
+
 def test_a_local_minimum_is_called_one():
     """A delay that starts a whole turn away stays there."""
     fit = jq.fit(jq.LaggedIntegrator(1e4, 1.0, 1.0), response_of(TRUTH, seed=0))

@@ -300,7 +300,7 @@ def _fit(
         problem = weighted(points, again)
         solution = solve_within_bounds(problem, solution.z, solver, max_steps)
         descents.append(Descent(problem, points, solution))
-    _check_finite(solution)
+    _check_finite(solution, solver)
     check_priors(problem, solution)
     # Again with what the model leaves unexplained as a floor on the random error, where it does
     # leave something: for a right model a floor costs efficiency.
@@ -314,7 +314,7 @@ def _fit(
         problem, lifted = weighted(raised, weights), True
         solution = solve_within_bounds(problem, solution.z, solver, max_steps)
         descents.append(Descent(problem, raised, solution))
-        _check_finite(solution)
+        _check_finite(solution, solver)
         weighting = weighting_at(problem, points, solution)
     limits, z = sample_limits(problem, solution.z, delays, solve_from)
     if limits:
@@ -342,17 +342,15 @@ def _fit(
     return assess(problem, weighting, solution, minima, further=remarks, origin=origin)
 
 
-def _check_finite(solution: Solution) -> None:
+def _check_finite(solution: Solution, solver: eqx.Module | None) -> None:
     """Raise ValueError where the solver diverged."""
     finite = all(np.all(np.isfinite(np.asarray(part))) for part in solution.sensitivity.misfits)
     if not (finite and np.all(np.isfinite(np.asarray(solution.z)))):
-        raise ValueError(
-            Message(
-                "the fit diverged: "
-                f"{solution.message or 'the response of the model is not finite'}; «start from "
-                "other values, or leave solver= at its default»"
-            )
-        )
+        reason = solution.message or "the response of the model is not finite"
+        remedy = "«start from other values, or fit fewer parameters (free=)»"
+        if solver is not None:
+            remedy = "leave solver= at its default"
+        raise ValueError(Message(f"the fit diverged: {reason}; {remedy}"))
 
 
 def check_priors(problem: Problem, solution: Solution) -> None:
