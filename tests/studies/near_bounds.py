@@ -1,11 +1,11 @@
 """Parameters at or near zero in records of much noise: what is printed of them, against the truth.
 
-    python tests/studies/near_bounds.py --draws 84
+    python tests/studies/near_bounds.py --draws 60
 
 An interval, or a limit of what may be zero, is printed of each parameter that counts as determined;
-a number and its error of each combination; and a limit beside what is not determined. A silent miss
-is off by more than four of its claimed errors, a limit by as much beyond the value. Seeds are
-fixed; the draws that are there already are not repeated.
+a number and its error of each sum; and a limit beside what is not determined. A miss, with a remark
+or without, is off by more than four of its claimed errors; a limit, by as many beyond the value.
+Seeds are fixed; the draws that are there already are not repeated.
 """
 
 import argparse
@@ -161,7 +161,7 @@ def printed(name: str, rows: list[dict]) -> str:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--draws", type=int, default=84)
+    parser.add_argument("--draws", type=int, default=60)
     parser.add_argument("--first", type=int, default=0, help="seed of the first draw")
     parser.add_argument("--case", action="append", choices=list(CASES))
     parser.add_argument("--raw", type=Path, default=ROOT / "results" / "studies" / "near_bounds")

@@ -349,7 +349,7 @@ def _check_finite(solution: Solution, solver: eqx.Module | None) -> None:
         reason = solution.message or "the response of the model is not finite"
         remedy = "«start from other values, or fit fewer parameters (free=)»"
         if solver is not None:
-            remedy = "leave solver= at its default"
+            remedy = "start from other values, or leave solver= at its default"
         raise ValueError(Message(f"the fit diverged: {reason}; {remedy}"))
 
 
