@@ -3,12 +3,14 @@
 import jax
 import numpy as np
 import pytest
+import scipy.optimize
 from synthetic import response_of
 
 import jaxquad as jq
 
 
 FLOWN = np.geomspace(7.0, 238.0, 60)  # rad/s, as a Betaflight chirp shows them
+ML = jq.identify.MaximumLikelihood()
 SCORES = np.random.default_rng(0).normal(size=(3, 256))
 
 
@@ -125,9 +127,39 @@ def test_draws_of_a_lag_near_zero_spread_as_the_sum_says(weak):
 def test_a_small_lead_has_its_limit_for_the_lag_and_its_sum():
     """100 (0.004 s + 1) e^(-0.008 s) / s: no lag at all, and 4 ms late."""
     model = jq.TransferFunction([0.4, 100.0], [1.0, 0.0], delay=0.008)
-    frf = response_of(model, error=0.01, seed=0, omega=np.geomspace(20.0, 140.0, 40))
+    frf = response_of(model, error=0.01, seed=1, omega=np.geomspace(20.0, 140.0, 40))
     for start in ((0.01, 0.01), (0.001, 0.02)):
         fit = jq.fit(jq.LaggedIntegrator(100.0, *start), frf)
         total = fit.derived(lambda model: model.lag + model.delay)
         assert fit.values[1] < 1e-4 and abs(total.value - 0.004) < 4 * total.standard_error
         assert 0 < total.standard_error < 1e-3
+
+
+def misfit(values, frf, error):
+    """That of ln-magnitude and phase, in units of their error."""
+    gain, lag, delay = values
+    s = 1j * np.asarray(frf.omega)
+    model = gain * np.exp(-delay * s) / (s * (lag * s + 1))
+    ratio = np.log(np.asarray(frf.response)[:, 0, 0] / model)
+    return np.concatenate([ratio.real, ratio.imag]) / error
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(4))
+def test_an_interval_near_zero_ends_where_the_cost_has_risen(seed):
+    """What a lag does beside a delay goes by its square; scipy finds where the cost rises."""
+    frf = response_of(jq.LaggedIntegrator(40.0, 0.015, 0.012), error=0.025, seed=seed)
+    fit = jq.fit(jq.LaggedIntegrator(30.0, 0.02, 0.02), frf, cost=ML)
+
+    def distance(lag):
+        """In standard errors, from the best lag."""
+        others = lambda x: misfit((x[0], lag, x[1]), frf, 0.025)
+        start, bounds = fit.values[[0, 2]], (0, np.inf)
+        found = scipy.optimize.least_squares(others, start, bounds=bounds, x_scale=(40, 0.01))
+        rise = 2 * found.cost - np.sum(misfit(fit.values, frf, 0.025) ** 2)
+        return np.sqrt(max(rise, 0.0))
+
+    low, high = fit.interval("lag", model_error=False)
+    assert fit.values[1] > 2.5 * fit.standard_errors[1]  # by the cost's curvature alone
+    assert distance(low) == pytest.approx(1.96, rel=0.05) or (low == 0 and distance(0.0) < 1.96)
+    assert distance(high) > 1.96

@@ -102,6 +102,11 @@ def measured(case: Case, seed: int) -> jq.spectra.FrequencyResponse:
     return jq.frequency_response(jq.Record(time, command[:, None], output[:, None], **names))
 
 
+def claimed(value: float, ends: tuple[float, float], truth: float) -> float:
+    """The error that the interval's side towards the truth claims."""
+    return max(ends[1] - value if truth > value else value - ends[0], 1e-12) / 1.96
+
+
 def draw(case: Case, seed: int) -> dict:
     """What is printed, with the truth of each, and by how many claimed errors it is off."""
     fit = jq.fit(case.start, measured(case, seed), free=case.free)
@@ -116,7 +121,7 @@ def draw(case: Case, seed: int) -> dict:
             inside = truth <= bounds[name]
         elif fit.determined[k]:
             low, high = fit.interval(name)
-            inside = low <= truth <= high
+            inside, error = low <= truth <= high, claimed(value, (low, high), truth)
         else:
             continue
         kind = "limit" if name in bounds else "interval"
@@ -126,15 +131,14 @@ def draw(case: Case, seed: int) -> dict:
         if truth is None:
             continue
         low, high = one.interval
-        off = (truth - one.value) / one.standard_error
-        row["printed"].append(
-            [one.name, "sum", low <= truth <= high, off, one.value, one.standard_error]
-        )
+        error = claimed(one.value, (low, high), truth)
+        off = (truth - one.value) / error
+        row["printed"].append([one.name, "sum", low <= truth <= high, off, one.value, error])
     total = lambda model: model.lag + model.delay - model.lead
     truth = float(total(case.truth))
     try:
         one = fit.derived(total)
-        off = (truth - one.value) / one.standard_error
+        off = (truth - one.value) / claimed(one.value, one.interval, truth)
         row["derived"] = [one.interval[0] <= truth <= one.interval[1], off]
     except ValueError as error:
         row["derived"] = str(error)

@@ -362,7 +362,9 @@ def judge(setting: Setting) -> dict:
         if not fit.determined[k]:
             continue
         low, high = fit.interval(name)
-        off = float((fit.values[k] - truth[name]) / fit.standard_errors[k])
+        off = float(fit.values[k] - truth[name])
+        side = fit.values[k] - low if off > 0 else high - fit.values[k]
+        off *= 1.96 / max(float(side), 1e-300)
         if name in bounds:  # its limit is 1.645 errors away
             off = -1.645 * abs(truth[name] / bounds[name].limit)
             off = off if abs(off) > 1.645 else 0.0

@@ -36,6 +36,7 @@ from ..uncertainty._verdict import (
     USUAL,
     Verdict,
 )
+from ..uncertainty._zero_bounds import Profile
 from ._parameters import Parameters
 from ._refits import Bands, explain_misfit, Explanation, fit_bands, Origin
 from ._solve import Minimum
@@ -91,6 +92,7 @@ class Fit:
     discrepancy: Discrepancy | None = None  # what the model leaves unexplained, if it was looked at
     noise_models: tuple[tuple[NoiseModel, ...], ...] = ()  # of each record's outputs, by jq.refine
     origin: Origin | None = None  # the responses and options of `jq.fit`
+    profiles: tuple[Profile, ...] = ()  # of weak parameters that keep their sign
     parameter_units: tuple[str, ...] = eqx.field(static=True, default=())  # for tables
 
     @property
@@ -246,8 +248,11 @@ class Fit:
                 limit = bound.limit_at(level, model_error=model_error)
                 return min(0.0, limit), max(0.0, limit)
         errors = self.standard_errors if model_error else self.noise_standard_errors
-        reach = reach_of_interval(float(self.degrees_of_freedom[k]), level) * errors[k]
-        low, high = float(self.values[k] - reach), float(self.values[k] + reach)
+        reach = reach_of_interval(float(self.degrees_of_freedom[k]), level)
+        ends = [float(self.values[k] + side * reach * errors[k]) for side in (-1, 1)]
+        for profile in self.profiles if self.determined[k] else ():
+            ends += profile.interval(k, float(errors[k]), reach, model_error=model_error)
+        low, high = min(ends), max(ends)
         if not (self.determined[k] and self.parameters.logarithmic[k]):
             return low, high
         # It keeps its sign.

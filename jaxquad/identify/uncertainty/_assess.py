@@ -46,7 +46,7 @@ from ._verdict import (
     Verdict,
     without_numbers,
 )
-from ._zero_bounds import bounds_among, near_zeros, one_sided, without_bounds
+from ._zero_bounds import bounds_among, near_zeros, one_sided, Profile, profiles, without_bounds
 
 
 _NO_MINIMUM = 1e-2  # Newton decrement over cost, above which no number counts as determined
@@ -96,6 +96,7 @@ def assess(
         again = dataclasses.replace(again, mixtures=weighting.budget.mixtures)
         return with_resonance(again, beyond)
 
+    followed = profiles(problem, solution, budget, near)
     local, beyond = local_misfits(budget, weighting.points)
     budget = with_resonance(budget, beyond)
     if near:
@@ -155,6 +156,7 @@ def assess(
             values=np.asarray(solution.values),
             units=units,
             same=ft.partial(same_responses, problem, solution),
+            profiles=followed,
         )
         verdict, by_data = identifiability_of(information, budget.prior, bounds)
         indefinite = not verdict.identifiable and not len(verdict.exact)
@@ -258,6 +260,7 @@ def assess(
         minima=minima,
         discrepancy=budget.discrepancy,
         origin=origin,
+        profiles=followed if verdict.fitted else (),
     )
 
 
@@ -392,6 +395,7 @@ def make_fit(
     discrepancy: Discrepancy | None = None,
     noise_models: tuple[tuple[NoiseModel, ...], ...] = (),
     origin: Origin | None = None,
+    profiles: tuple[Profile, ...] = (),
 ) -> Fit:
     """A result in physical units; both covariances are those of changes relative to `units`.
     `freedom` is that of the noise estimate, infinite without."""
@@ -454,6 +458,7 @@ def make_fit(
         discrepancy=discrepancy,
         noise_models=noise_models,
         origin=origin,
+        profiles=profiles,
     )
 
 

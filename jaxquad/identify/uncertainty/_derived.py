@@ -1,7 +1,7 @@
 """What follows from a fitted model, with its error: quantities, factors, curves, drawn models."""
 
 import functools as ft
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import NamedTuple, TYPE_CHECKING
 
 import equinox as eqx
@@ -69,7 +69,15 @@ def derive(fit: "Fit", quantity: Quantity, name: str, *, model_error: bool) -> C
             f"the standard error of {name} is lost in the rounding of those of "
             f"{', '.join(fit.names)}, which are many times as large: fix one of them"
         )
-    return Combination(name, value, float(np.sqrt(variance)), fit.freedom_of(slope))
+    error, rate = float(np.sqrt(variance)), slope / fit.units
+    derived = Combination(name, value, error, fit.freedom_of(slope))
+    for profile in fit.profiles:
+        numbers = np.array(
+            [float(number) for number, _ in _evaluated(fit, quantity, profile.values)]
+        )
+        sides = profile.sides_of(numbers, value, error, rate, model_error=model_error)
+        derived = derived.widened(sides)
+    return derived
 
 
 def tied_parameters(fit: "Fit") -> tuple[Tied, ...]:
@@ -89,18 +97,23 @@ def tied_parameters(fit: "Fit") -> tuple[Tied, ...]:
 
 def _propagate(fit: "Fit", quantity: Quantity) -> tuple[float, Vector, bool]:
     """A quantity, its slope by relative changes, and whether it moves where responses do not."""
-    verdict, places = fit.verdict, (fit.values, *fit.verdict.alternatives)
-    arguments = quantity, fit.parameters, fit.model
-    try:
-        value, *others = [_value_and_slope(*arguments, values) for values in places]
-    except jax.errors.ConcretizationTypeError:  # a quantity that asks for numbers
-        with jax.disable_jit():
-            value, *others = [_value_and_slope(*arguments, values) for values in places]
+    verdict = fit.verdict
+    value, *others = _evaluated(fit, quantity, (fit.values, *verdict.alternatives))
     value, slope = float(value[0]), np.asarray(value[1]) * fit.units
     differs = any(abs(float(other) - value) > 1e-6 * abs(value) for other, _ in others)
     along_null = np.abs(verdict.exact @ slope) > 1e-6 * np.linalg.norm(slope)
     on_curved = [slope[fit.names.index(name)] != 0 for name in verdict.curved]
     return value, slope, bool(differs or np.any(along_null) or any(on_curved))
+
+
+def _evaluated(fit: "Fit", quantity: Quantity, places: Iterable[Vector]) -> list[tuple]:
+    """A quantity and its slope at several values of the parameters."""
+    arguments = quantity, fit.parameters, fit.model
+    try:
+        return [_value_and_slope(*arguments, values) for values in places]
+    except jax.errors.ConcretizationTypeError:  # a quantity that asks for numbers
+        with jax.disable_jit():
+            return [_value_and_slope(*arguments, values) for values in places]
 
 
 @eqx.filter_jit

@@ -3,7 +3,7 @@
 import dataclasses
 from collections.abc import Callable, Sequence
 from fractions import Fraction
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, TYPE_CHECKING
 
 import equinox as eqx
 import numpy as np
@@ -15,10 +15,14 @@ from ..frequency_domain._parameters import Place
 from ._error_budget import Matrix, PriorRows
 
 
+if TYPE_CHECKING:
+    from ._zero_bounds import Profile
+
+
 Kind = Literal["identifiable", "not identifiable", "no minimum", "no model", "too few points"]
 NO_MINIMUM: Kind = "no minimum"  # of a remark, too
 LIMIT = 0.5  # standard error, relative, above which a parameter counts as undetermined
-USUAL = 0.95  # level of an interval
+USUAL, REACH = 0.95, 1.96  # level of an interval, and standard errors to its ends
 _VAGUE = 0.3  # as LIMIT, of a combination
 _MEMBER = 0.05  # share of a null direction from which a parameter takes part in it
 _MOVE = 0.4  # finite relative change along a null direction, to test products against sums
@@ -44,7 +48,7 @@ def reach_of_interval(degrees_of_freedom: float, level: float | int = USUAL) -> 
     _require_level(level)
     if not np.isinf(degrees_of_freedom):
         return float(stdtrit(degrees_of_freedom, 0.5 + level / 2))
-    return 1.96 if level == USUAL else float(ndtri(0.5 + level / 2))
+    return REACH if level == USUAL else float(ndtri(0.5 + level / 2))
 
 
 def _require_level(level: float | int) -> None:
@@ -68,10 +72,15 @@ class Combination(NamedTuple):
     degrees_of_freedom: float = np.inf  # of the noise estimate behind the standard error
     unit: str = ""  # where it is known
     sum_of: tuple[str, ...] = ()  # the parameters of a sum
+    sides: tuple[float, float] = (1.0, 1.0)  # of its interval, over what the error gives
 
     def content(self) -> dict[str, object]:
         """Its numbers and its unit, for JSON."""
-        return {name: value for name, value in self._asdict().items() if name != "sum_of"}
+        return {name: x for name, x in self._asdict().items() if not isinstance(x, tuple)}
+
+    def widened(self, sides: tuple[float, float]) -> "Combination":
+        """With an interval whose sides are these at least."""
+        return self._replace(sides=tuple(map(max, self.sides, sides)))
 
     @property
     def interval(self) -> tuple[float, float]:
@@ -81,7 +90,7 @@ class Combination(NamedTuple):
     def interval_at(self, level: float | int) -> tuple[float, float]:
         """The interval that holds the truth in this share of all flights, 0.9 for 90 %."""
         reach = reach_of_interval(self.degrees_of_freedom, level) * self.standard_error
-        return self.value - reach, self.value + reach
+        return self.value - self.sides[0] * reach, self.value + self.sides[1] * reach
 
     def __str__(self) -> str:
         low, high = self.interval
@@ -248,6 +257,7 @@ class Information(NamedTuple):
     values: Float[np.ndarray, " all"]
     units: Float[np.ndarray, " all"]
     same: Callable[[Vector], bool]
+    profiles: Sequence["Profile"] = ()
 
 
 def identifiability_of(
@@ -286,6 +296,7 @@ def _determine(information: Information, bounds: tuple[Bound, ...]) -> Verdict:
             values=information.values[kept],
             units=information.units[kept],
             same=lambda values: information.same(completed(values)),
+            profiles=[profile.among(free) for profile in information.profiles],
         )
         verdict = _determine(some, ())
         exact = np.zeros((len(verdict.exact), count))
@@ -304,6 +315,12 @@ def _determine(information: Information, bounds: tuple[Bound, ...]) -> Verdict:
     parts = (information.covariance, information.by_noise)
     errors = [np.sqrt(np.maximum(np.diagonal(part), 0.0)) for part in parts]
     imprecise = (errors[0] > 2 * LIMIT) | (errors[1] > LIMIT)
+    # Likewise where the cost does not rise on the way to three times the value.
+    sizes, units = np.abs([information.values[:count], information.units[:count]])
+    longest = sizes + REACH * np.maximum(2 * LIMIT * sizes, errors[0] * units)
+    for profile in information.profiles:
+        ends = [profile.interval(k, errors[0][k] * units[k]) for k in range(count)]
+        imprecise |= np.max(np.abs(ends), axis=1) > longest
     lost = np.any(null, axis=0) | imprecise
     left = imprecise & ~np.any(null, axis=0)
     if left.any():  # the direction of most variance of an imprecise parameter that is in none
@@ -444,8 +461,7 @@ def _combination(
         along = abs(float(simple @ weights)) / float(weights @ weights)
         return error(simple) <= 1.25 * error(weights) * along
 
-    logarithmic = bool(np.all(units == values))
-    powers = simplest(weights, 2) if logarithmic and "product" in kinds else None
+    powers = simplest(weights, 2) if "product" in kinds and np.all(units == values) else None
     sums = simplest(weights / units, 1) if "sum" in kinds else None
     powers = powers if powers is not None and as_sharp(powers) else None
     sums = sums if sums is not None and as_sharp(sums * units) else None
@@ -460,6 +476,7 @@ def _combination(
             name += sign + (n if abs(w) == 1 else f"{abs(w):g} {n}")
         value, members = float(np.sum(sums * values)), tuple(n for _, n in terms)
         combination = Combination(name, value, error(sums * units), sum_of=members)
+        slopes, of_places = sums, lambda numbers: numbers @ sums
     elif powers is not None:
         value, pairs = float(np.prod(np.abs(values) ** powers)), zip(names, powers, strict=True)
         texts = [(n if abs(p) == 1 else f"{n}^{abs(p):g}", p) for n, p in pairs]
@@ -468,7 +485,16 @@ def _combination(
         if below:
             name += " / " + (below[0] if len(below) == 1 else f"({' '.join(below)})")
         combination = Combination(name, value, value * error(powers))
+        slopes = value * powers / values
+        of_places = lambda numbers: np.prod(np.abs(numbers) ** powers, axis=1)
     else:
         return None
-    precise = combination.standard_error <= _VAGUE * abs(combination.value)
-    return combination if precise else None
+    slope = np.zeros(len(information.values))
+    slope[used] = slopes
+    for profile in information.profiles:
+        places = np.tile(information.values, (len(profile.values), 1))
+        places[:, :count] = profile.values
+        numbers = value, combination.standard_error, slope[:count]
+        combination = combination.widened(profile.sides_of(of_places(places[:, used]), *numbers))
+    widest = combination.standard_error * max(combination.sides)
+    return combination if widest <= _VAGUE * abs(value) else None

@@ -7,6 +7,7 @@ Source: Self and Liang (1987), Asymptotic properties of maximum likelihood estim
 ratio tests under nonstandard conditions.
 """
 
+import functools as ft
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -17,14 +18,16 @@ from jaxtyping import Float
 from ..frequency_domain._cost import mix
 from ..frequency_domain._problem import Problem
 from ..frequency_domain._solve import Solution, solution_at, solve
-from ._error_budget import ErrorBudget, Matrix, scaled_inverse, Units
-from ._verdict import Bound, LIMIT
+from ._error_budget import ErrorBudget, Matrix, scaled_inverse, Units, units_of
+from ._verdict import Bound, LIMIT, REACH
 
 
 _NEAR = 1e-2  # of the change that shows: a parameter below it is at zero
 _AT_ZERO = 1e-6  # likewise, where its slopes are evaluated
 _ROUNDS = 4  # of releasing parameters that do not belong at zero
-_POLISHES = 3  # steps
+_POLISHES = 10  # steps
+_SHORTER = 4  # tries, each of a quarter of the step before it
+_LITTLE = 1e-3  # fall of the cost, of that per residual, that no limit shows
 _SMALLEST = 60.0  # in ln, below the start: 1e-26 of it
 _RISE = 2.71  # of the cost, at the end of a one-sided 95 % interval
 _EVALUATIONS = 12  # of the profile
@@ -35,6 +38,12 @@ _FAR = 50.0  # standard deviations, beyond which the hazard's digits cancel
 _SLIGHT = 0.1
 _FEW = 0.1  # of the limit: below it the slopes at a value say little about the way to the limit
 _ONE_SIDED = 1.645  # standard errors that reach from the middle of a one-sided 95 % interval
+_WEAK = 6.0  # standard errors to zero, within which the cost is followed there
+_FINE = 10  # places between two points of a profile
+_FAR_OUT = 2.5  # standard errors, where a profile ends
+_OPEN = 100.0  # times as far, where the cost does not rise that much
+_MOST = 12  # places to either side of it
+_NULL = 1e-12  # of the largest eigenvalue of the scaled bread: of a null direction
 
 Vector = Float[np.ndarray, " parameters"]
 
@@ -116,22 +125,28 @@ def solve_within_bounds(
 def polish(
     problem: Problem, z: Vector, fixed: Sequence[int], start: Solution
 ) -> tuple[Solution, Linearised]:
-    """The optimum over the other parameters, from near it, by undamped Gauss-Newton steps."""
+    """The optimum over the other parameters, from near it, by Gauss-Newton steps that go down."""
     free = np.setdiff1d(np.arange(z.size), fixed)
     solution = solution_at(problem, z, steps=start.steps)
     local = linearise(problem, solution)
+    logarithmic = np.array(problem.parameters.logarithmic)[free]
     for _ in range(_POLISHES):
         if not (np.isfinite(local.cost) and np.all(np.isfinite(local.jacobian))):
             break  # so far out that the model has no numbers
         step = np.linalg.lstsq(local.jacobian[:, free], -local.residual, rcond=1e-10)[0]
-        z = z.copy()
-        z[free] += step
-        moved = solution_at(problem, z, steps=start.steps)
-        there = linearise(problem, moved)
-        if not there.cost <= local.cost:
+        for _ in range(_SHORTER):
+            z = solution.z.copy()
+            # The step of the values themselves, by a tenth of one at least.
+            z[free] += np.where(logarithmic, np.log(np.maximum(1 + step, 0.1)), step)
+            moved = solution_at(problem, z, steps=start.steps)
+            there = linearise(problem, moved)
+            if there.cost <= local.cost:
+                break
+            step = step / 4
+        else:
             break
-        solution, local = moved, there
-        if np.max(np.abs(step), initial=0.0) < 1e-9:
+        fall, solution, local = local.cost - there.cost, moved, there
+        if fall < _LITTLE * local.cost / local.residual.size:
             break
     return solution, local
 
@@ -201,7 +216,7 @@ def one_sided_limits(
 
     def growth_for(wanted: float, times: float) -> float:
         """By which factor parameter `k` grows until the cost has risen by what is wanted."""
-        low, high = 1.0, np.inf
+        (low, below), (high, above) = (1.0, 0.0), (np.inf, np.inf)
         for _ in range(_EVALUATIONS):
             z = np.asarray(solution.z).copy()
             z[k] += np.log(times)
@@ -209,8 +224,14 @@ def one_sided_limits(
             rise = cost - local.cost if np.isfinite(cost) else np.inf
             if abs(rise - wanted) <= _CLOSE * wanted:
                 return float(times)
-            low, high = (times, high) if rise < wanted else (low, times)
-            times *= np.clip(np.sqrt(wanted / max(rise, 1e-300)), 0.2, 5.0)
+            if rise < wanted:
+                low, below = times, max(rise, 0.0)
+            else:
+                high, above = times, rise
+            if np.isfinite(above):  # where a straight line of its root is there
+                times = np.interp(np.sqrt(wanted), np.sqrt([below, above]), [low, high])
+            else:
+                times *= np.clip(np.sqrt(wanted / max(rise, 1e-300)), 0.2, 5.0)
             if not low < times < high:
                 times = np.sqrt(low * min(high, 100 * low))
         return float(times if np.isfinite(high) else np.inf)
@@ -297,3 +318,152 @@ def one_sided(covariance: Matrix, k: int, optimum: float) -> Matrix:
         remaining = max(1 - below * (hazard - below), 0.0)
     along = covariance[:, k] / variance
     return covariance + np.outer(along, along) * (variance * remaining - variance)
+
+
+class Profile(NamedTuple):
+    """The cost along one weak parameter `k`, the others being where it is lowest.
+
+    What a small lag does beside a delay goes by its square: towards zero the cost rises by less
+    than its curvature says. Source: Venzon and Moolgavkar (1988), A method for computing
+    profile-likelihood-based confidence intervals.
+    """
+
+    k: int
+    values: Float[np.ndarray, "points parameters"]  # the estimate is one of the points
+    distances: Float[np.ndarray, " points"]  # from it, in standard errors by the curvature
+    inflations: Float[np.ndarray, " 2"]  # of these standard errors; by the noise alone
+    along: Float[np.ndarray, "2 parameters"]  # changes with one standard error of `k`; likewise
+
+    def interval(
+        self, j: int, error: float, reach: float = REACH, *, model_error: bool = True
+    ) -> tuple[float, float]:
+        """Of parameter `j` with this standard error, within `reach` of them."""
+        part = 0 if model_error else 1
+        quantity, along = self.values[:, j], float(self.along[part, j])
+        low, high = self._ends(quantity, error, along, reach, part)
+        # The last point towards zero is as good as there.
+        ends_at_zero = j == self.k and self.distances[0] > -reach * self.inflations[part]
+        return (min(low, 0.0), max(high, 0.0)) if ends_at_zero else (low, high)
+
+    def sides_of(
+        self, quantity: Float[np.ndarray, " points"], value: float, error: float, slope: Vector,
+        *, model_error: bool = True,
+    ) -> tuple[float, float]:  # fmt: skip
+        """The sides of a quantity's interval, over those by its `slope` where they are longer."""
+        part = 0 if model_error else 1
+        low, high = self._ends(quantity, error, float(slope @ self.along[part]), REACH, part)
+        usual = max(REACH * error, 1e-300)
+        return max((value - low) / usual, 1.0), max((high - value) / usual, 1.0)
+
+    def _ends(
+        self, quantity: Float[np.ndarray, " points"], error: float, along: float, reach: float,
+        part: int,
+    ) -> tuple[float, float]:  # fmt: skip
+        """Of an interval; `along` is the share of the error that goes with `k`."""
+        places = np.arange(self.distances.size)
+        fine = np.linspace(0, places[-1], _FINE * places[-1] + 1)
+        columns = self.distances / self.inflations[part], quantity
+        distance, value = (np.interp(fine, places, column) for column in columns)
+        inside = np.abs(distance) <= reach
+        aside = np.sqrt((reach**2 - distance[inside] ** 2) * max(error**2 - along**2, 0.0))
+        return float(np.min(value[inside] - aside)), float(np.max(value[inside] + aside))
+
+    def among(self, kept: np.ndarray) -> "Profile":
+        """With some of the parameters alone."""
+        place = int(np.argmax(kept == self.k)) if self.k in kept else -1
+        return self._replace(k=place, values=self.values[:, kept], along=self.along[:, kept])
+
+
+def profiles(
+    problem: Problem, solution: Solution, budget: ErrorBudget, near: Sequence[NearZero]
+) -> tuple[Profile, ...]:
+    """Of the parameters that keep their sign and lie within a few standard errors of zero, and of
+    one in each direction in which all run to infinity."""
+    variances, by_noise = np.diagonal(budget.covariance), np.diagonal(budget.by_noise)
+    weak = variances > 1 / _WEAK**2
+    weak[[one.k for one in near]] = True
+    weak[_of_null_directions(budget.bread)] = True
+    weak &= np.array(problem.parameters.logarithmic[: budget.count])
+    weak &= (by_noise > 0) & (np.diagonal(scaled_inverse(budget.bread)) > 0)
+    errors = np.asarray(solution.values)[: budget.count] * np.sqrt(variances)
+    for one in near:
+        if np.isfinite(one.bound.limit):
+            errors[one.k] = one.bound.limit / 2
+    some = np.flatnonzero(weak).tolist()
+    return tuple(_profile(problem, solution, budget, k, float(errors[k])) for k in some)
+
+
+def _profile(
+    problem: Problem, solution: Solution, budget: ErrorBudget, k: int, error: float
+) -> Profile:
+    """Of parameter `k`, whose standard error is about this."""
+    values, units = np.asarray(solution.values)[: budget.count], units_of(solution)[: budget.count]
+    parts = budget.covariance, budget.by_noise
+    inflations = np.sqrt([part[k, k] / scaled_inverse(budget.bread)[k, k] for part in parts])
+    far, value, estimate = (
+        _FAR_OUT * float(np.max(inflations)),
+        values[k],
+        _Place(solution.z, values),
+    )
+    solutions = ft.partial(_places_along, problem, solution, k, estimate, far)
+    below = solutions(value / 2, value / 1000) if value else []
+    above = solutions(value + error, value + 2.5 * error)
+    places = [*below[::-1], estimate, *above]
+    points = np.stack([place.values for place in places])
+    distances = np.array([place.distance for place in places])
+    distances[: len(below)] *= -1
+    last, distance = 2 * points[-1] - points[-2], 2 * distances[-1] - distances[-2]
+    if distances[-1] < far:  # nothing ends it
+        last, distance = points[-1].copy(), distances[-1]
+        last[k] = value + _OPEN * (points[-1, k] - value)
+    points, distances = np.concatenate([points, [last]]), np.append(distances, distance)
+    along = np.stack([units * part[k] / np.sqrt(part[k, k]) for part in parts])
+    return Profile(k, points, distances, inflations, along)
+
+
+def _of_null_directions(bread: Matrix) -> list[int]:
+    """The parameter of the largest share in each."""
+    scale = np.sqrt(np.maximum(np.diagonal(bread), 1e-300))
+    sizes, directions = np.linalg.eigh(bread / np.outer(scale, scale))
+    return np.argmax(np.abs(directions[:, sizes < _NULL * sizes[-1]]), axis=0).tolist()
+
+
+class _Place(NamedTuple):
+    """Of a profile."""
+
+    z: Vector
+    values: Vector
+    distance: float = 0.0
+
+
+def _places_along(
+    problem: Problem, solution: Solution, k: int, estimate: _Place, far: float, *aims: float
+) -> list[_Place]:
+    """Places of the profile of `k` on the way to the last of the `aims`, and beyond it up to the
+    distance `far`, so close to each other that straight lines connect them."""
+    best, scale = linearise(problem, solution).cost, float(np.asarray(problem.parameters.scale)[k])
+
+    def at(aim: float, nearest: _Place) -> _Place:
+        z = nearest.z.copy()
+        z[k] = np.log(abs(aim / scale))
+        there, local = polish(problem, z, [k], solution)
+        rise = max(local.cost - best, 0.0)
+        return _Place(there.z, np.asarray(there.values)[: z.size], float(np.sqrt(rise)))
+
+    places, start = [estimate], estimate.values[k]
+    for aim in aims:
+        places.append(at(aim, places[-1]))
+    while abs(aim) > abs(start) and places[-1].distance < far and len(places) < _MOST / 2:
+        aim = start + 2.5 * (aim - start)
+        places.append(at(aim, places[-1]))
+    while len(places) < _MOST:
+        distances = np.array([place.distance for place in places])
+        coarse = (np.diff(distances) > far / 3) & (distances[:-1] < far)
+        if not coarse.any():
+            break
+        n = int(np.argmax(coarse))
+        ends = places[n].values[k], places[n + 1].values[k]
+        alike = abs(ends[0]) < 4 * abs(ends[1])
+        middle = (ends[0] + ends[1]) / 2 if alike else np.sign(start) * np.sqrt(ends[0] * ends[1])
+        places.insert(n + 1, at(middle, places[n]))
+    return places[1:]
