@@ -315,12 +315,9 @@ def _determine(information: Information, bounds: tuple[Bound, ...]) -> Verdict:
     parts = (information.covariance, information.by_noise)
     errors = [np.sqrt(np.maximum(np.diagonal(part), 0.0)) for part in parts]
     imprecise = (errors[0] > 2 * LIMIT) | (errors[1] > LIMIT)
-    # Likewise where the cost does not rise on the way to three times the value.
-    sizes, units = np.abs([information.values[:count], information.units[:count]])
-    longest = sizes + REACH * np.maximum(2 * LIMIT * sizes, errors[0] * units)
+    values, units = information.values[:count], np.abs(information.units[:count])
     for profile in information.profiles:
-        ends = [profile.interval(k, errors[0][k] * units[k]) for k in range(count)]
-        imprecise |= np.max(np.abs(ends), axis=1) > longest
+        imprecise = profile.undetermined(values, errors[0] * units, imprecise)
     lost = np.any(null, axis=0) | imprecise
     left = imprecise & ~np.any(null, axis=0)
     if left.any():  # the direction of most variance of an imprecise parameter that is in none

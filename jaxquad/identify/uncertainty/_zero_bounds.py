@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from ..frequency_domain._cost import mix
 from ..frequency_domain._problem import Problem
@@ -41,7 +41,6 @@ _ONE_SIDED = 1.645  # standard errors that reach from the middle of a one-sided 
 _WEAK = 6.0  # standard errors to zero, within which the cost is followed there
 _FINE = 10  # places between two points of a profile
 _FAR_OUT = 2.5  # standard errors, where a profile ends
-_OPEN = 100.0  # times as far, where the cost does not rise that much
 _MOST = 12  # places to either side of it
 _NULL = 1e-12  # of the largest eigenvalue of the scaled bread: of a null direction
 
@@ -333,6 +332,7 @@ class Profile(NamedTuple):
     distances: Float[np.ndarray, " points"]  # from it, in standard errors by the curvature
     inflations: Float[np.ndarray, " 2"]  # of these standard errors; by the noise alone
     along: Float[np.ndarray, "2 parameters"]  # changes with one standard error of `k`; likewise
+    ends: bool  # whether the cost rises enough away from zero, too
 
     def interval(
         self, j: int, error: float, reach: float = REACH, *, model_error: bool = True
@@ -340,10 +340,12 @@ class Profile(NamedTuple):
         """Of parameter `j` with this standard error, within `reach` of them."""
         part = 0 if model_error else 1
         quantity, along = self.values[:, j], float(self.along[part, j])
-        low, high = self._ends(quantity, error, along, reach, part)
-        # The last point towards zero is as good as there.
-        ends_at_zero = j == self.k and self.distances[0] > -reach * self.inflations[part]
-        return (min(low, 0.0), max(high, 0.0)) if ends_at_zero else (low, high)
+        low, high = self._sides(quantity, error, along, reach, part)
+        if j == self.k and self.distances[0] > -reach * self.inflations[part]:
+            low, high = min(low, 0.0), max(high, 0.0)  # the last point towards zero is as good
+        if j == self.k and not self.ends:
+            return (low, np.inf) if self.values[-1, j] > 0 else (-np.inf, high)
+        return low, high
 
     def sides_of(
         self, quantity: Float[np.ndarray, " points"], value: float, error: float, slope: Vector,
@@ -351,11 +353,11 @@ class Profile(NamedTuple):
     ) -> tuple[float, float]:  # fmt: skip
         """The sides of a quantity's interval, over those by its `slope` where they are longer."""
         part = 0 if model_error else 1
-        low, high = self._ends(quantity, error, float(slope @ self.along[part]), REACH, part)
+        low, high = self._sides(quantity, error, float(slope @ self.along[part]), REACH, part)
         usual = max(REACH * error, 1e-300)
         return max((value - low) / usual, 1.0), max((high - value) / usual, 1.0)
 
-    def _ends(
+    def _sides(
         self, quantity: Float[np.ndarray, " points"], error: float, along: float, reach: float,
         part: int,
     ) -> tuple[float, float]:  # fmt: skip
@@ -367,6 +369,20 @@ class Profile(NamedTuple):
         inside = np.abs(distance) <= reach
         aside = np.sqrt((reach**2 - distance[inside] ** 2) * max(error**2 - along**2, 0.0))
         return float(np.min(value[inside] - aside)), float(np.max(value[inside] + aside))
+
+    def undetermined(
+        self, values: Vector, errors: Vector, imprecise: Bool[np.ndarray, " parameters"]
+    ) -> Bool[np.ndarray, " parameters"]:
+        """The imprecise parameters, those that may be three times as large, and what changes by
+        more than the limit along with one of them."""
+        sizes = np.abs(values)
+        ends = np.array([self.interval(j, float(error)) for j, error in enumerate(errors)])
+        longest = sizes + REACH * np.maximum(2 * LIMIT * sizes, errors)
+        imprecise = imprecise | (np.max(np.abs(ends), axis=1) > longest)
+        if self.k < 0 or not imprecise[self.k]:
+            return imprecise
+        ends = np.array([self.interval(j, 0.0) for j in range(values.size)])
+        return imprecise | (np.max(np.abs(ends - values[:, None]), axis=1) > LIMIT * sizes)
 
     def among(self, kept: np.ndarray) -> "Profile":
         """With some of the parameters alone."""
@@ -412,13 +428,12 @@ def _profile(
     points = np.stack([place.values for place in places])
     distances = np.array([place.distance for place in places])
     distances[: len(below)] *= -1
-    last, distance = 2 * points[-1] - points[-2], 2 * distances[-1] - distances[-2]
-    if distances[-1] < far:  # nothing ends it
-        last, distance = points[-1].copy(), distances[-1]
-        last[k] = value + _OPEN * (points[-1, k] - value)
-    points, distances = np.concatenate([points, [last]]), np.append(distances, distance)
+    ends = bool(distances[-1] >= far)
+    if ends:  # on along a straight line
+        points = np.concatenate([points, [2 * points[-1] - points[-2]]])
+        distances = np.append(distances, 2 * distances[-1] - distances[-2])
     along = np.stack([units * part[k] / np.sqrt(part[k, k]) for part in parts])
-    return Profile(k, points, distances, inflations, along)
+    return Profile(k, points, distances, inflations, along, ends)
 
 
 def _of_null_directions(bread: Matrix) -> list[int]:
