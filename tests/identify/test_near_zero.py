@@ -163,3 +163,17 @@ def test_an_interval_near_zero_ends_where_the_cost_has_risen(seed):
     assert fit.values[1] > 2.5 * fit.standard_errors[1]  # by the cost's curvature alone
     assert distance(low) == pytest.approx(1.96, rel=0.05) or (low == 0 and distance(0.0) < 1.96)
     assert distance(high) > 1.96
+    derived = fit.derived(lambda model: model.lag, model_error=False)
+    assert derived.interval == pytest.approx((low, high), abs=0.03 * fit.values[1])
+    assert derived.standard_error == pytest.approx(fit.noise_standard_errors[1])
+
+
+@pytest.mark.slow
+def test_parameters_that_leave_zero_stay_within_numbers():
+    """A lag, delay and lead of a sweep in noise: the step from zero was 2e7 in ln(delay)."""
+    from near_bounds import CASES, measured  # pyright: ignore
+
+    case = CASES["small lead"]
+    with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):  # as a user's
+        fit = jq.fit(case.start, measured(case, 110), free=case.free)
+    assert fit.verdict.fitted and not fit.identifiable

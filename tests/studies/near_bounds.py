@@ -4,8 +4,9 @@
 
 An interval, or a limit of what may be zero, is printed of each parameter that counts as determined;
 a number and its error of each sum; and a limit beside what is not determined. A miss, with a remark
-or without, is off by more than four of its claimed errors; a limit, by as many beyond the value.
-Seeds are fixed; the draws that are there already are not repeated.
+or without, is off by more than four of its claimed errors, each of them 1 / 1.96 of the interval's
+side there; a limit, by as many beyond the value. Seeds are fixed; draws that are there already are
+not repeated.
 """
 
 import argparse

@@ -342,6 +342,12 @@ def nearest_truth(setting: Setting, fitted: dict[str, float]) -> dict[str, float
     return min(truth, swapped | {"damping": 1 / lag}, key=far)
 
 
+def claimed_errors(value: float, ends: tuple[float, float], truth: float) -> float:
+    """By how many a value is off: its interval's side towards the truth is 1.96 of them."""
+    side = value - ends[0] if value > truth else ends[1] - value
+    return 1.96 * float(value - truth) / max(float(side), 1e-300)
+
+
 def judge(setting: Setting) -> dict:
     """One plant: all that is printed without a mark, against the truth."""
     try:
@@ -362,9 +368,7 @@ def judge(setting: Setting) -> dict:
         if not fit.determined[k]:
             continue
         low, high = fit.interval(name)
-        off = float(fit.values[k] - truth[name])
-        side = fit.values[k] - low if off > 0 else high - fit.values[k]
-        off *= 1.96 / max(float(side), 1e-300)
+        off = claimed_errors(fit.values[k], (low, high), truth[name])
         if name in bounds:  # its limit is 1.645 errors away
             off = -1.645 * abs(truth[name] / bounds[name].limit)
             off = off if abs(off) > 1.645 else 0.0
@@ -372,7 +376,7 @@ def judge(setting: Setting) -> dict:
     for each in fit.combinations:
         right = true_combination(each.name, each.sum_of, truth)
         low, high = each.interval
-        off = float((each.value - right) / each.standard_error)
+        off = claimed_errors(each.value, (low, high), right)
         numbers.append([each.name, off, bool(low <= right <= high)])
     remarks, informed = ([f"{x.kind}: {x}"[:160] for x in each.remarks] for each in (fit, response))
     return {

@@ -231,6 +231,8 @@ class Fit:
     ) -> tuple[float, float]:
         """The 95 % interval of one parameter; of one that keeps its sign, what has that sign.
 
+        Within six standard errors of zero its sides are those of the profile likelihood.
+
         **Arguments:**
 
         - `name`: of the parameter.

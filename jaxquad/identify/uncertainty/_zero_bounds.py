@@ -25,6 +25,7 @@ from ._verdict import Bound, LIMIT, REACH
 _NEAR = 1e-2  # of the change that shows: a parameter below it is at zero
 _AT_ZERO = 1e-6  # likewise, where its slopes are evaluated
 _ROUNDS = 4  # of releasing parameters that do not belong at zero
+_LONGEST = 1.0  # step of a logarithm, to where others go on from
 _POLISHES = 10  # steps
 _SHORTER = 4  # tries, each of a quarter of the step before it
 _LITTLE = 1e-3  # fall of the cost, of that per residual, that no limit shows
@@ -102,7 +103,7 @@ def solve_within_bounds(
         bounds, rows = (smallest, np.inf), local.jacobian * units
         step = lsq_linear(rows, -local.residual, bounds, method="bvls").x
         if any(step[k] > _NEAR for k in low):
-            change = step.copy()
+            change = np.where(logarithmic, np.clip(step, -_LONGEST, _LONGEST), step)
             change[low] = np.log(np.maximum(step[low], _AT_ZERO) * visible[low])
             solution = solve(problem, z + change, solver, max_steps)
             continue
