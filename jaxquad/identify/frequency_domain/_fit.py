@@ -344,8 +344,11 @@ def _fit(
 
 def _check_finite(solution: Solution, solver: eqx.Module | None) -> None:
     """Raise ValueError where the solver diverged."""
-    finite = all(np.all(np.isfinite(np.asarray(part))) for part in solution.sensitivity.misfits)
-    if not (finite and np.all(np.isfinite(np.asarray(solution.z)))):
+    parts, count = solution.sensitivity, solution.z.size
+    numbers = [solution.z, *parts.misfits, *(part[..., :count] for part in parts.slopes)]
+    with np.errstate(over="ignore"):  # the squares count, too
+        finite = all(np.all(np.isfinite(np.square(np.asarray(part)))) for part in numbers)
+    if not finite:
         reason = solution.message or "the response of the model is not finite"
         remedy = "«start from other values, or fit fewer parameters (free=)»"
         if solver is not None:

@@ -87,7 +87,7 @@ def solve_within_bounds(
         local, z = linearise(problem, solution), np.asarray(solution.z)
         # The change of each `z` that stands out from the scatter of the residuals.
         freedom = max(local.residual.size - z.size, 1)
-        with np.errstate(divide="ignore", invalid="ignore"):
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             visible = np.sqrt(local.cost / freedom) / np.sqrt(np.sum(local.jacobian**2, axis=0))
         # Parameters near zero could grow a hundred times without being seen.
         near = np.isfinite(visible) & (visible > 1 / _NEAR) & logarithmic
