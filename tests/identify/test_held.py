@@ -3,6 +3,7 @@
 import dataclasses
 from typing import cast
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.signal import cont2discrete
@@ -47,6 +48,23 @@ def test_a_held_input_is_fitted_exactly_with_the_plants_own_delay(response):
     fit = jq.fit(START, response, free=FREE)
     np.testing.assert_allclose(fit.values, [400.0, 1.2, 400.0, 0.031], rtol=1e-6)
     assert not any("keeps each value" in remark for remark in fit.remarks)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("samples", [3.03, 3.98])
+def test_a_delay_of_nearly_whole_samples_is_found_from_others(samples):
+    """Of a first-order lag, whose aliases decay slowly and hardly turn: sampled in closed form."""
+    lag, late, omega = 0.02, samples * DT, np.geomspace(1.0, 60.0, 60)
+    z, early = np.exp(1j * omega * DT), 4 * DT - late
+    ends, newer = np.exp(-DT / lag), 1 - np.exp(-early / lag)
+    exact = ((1 - newer - ends) * z**-4 + newer * z**-3) / (z - ends)
+    frf = response_of(jq.TransferFunction([1.0], [lag, 1.0], late), error=1e-4, omega=omega)
+    response = jnp.asarray(exact[:, None, None])
+    frf = dataclasses.replace(frf, response=response, hold=DT, dt=DT)
+    start = jq.TransferFunction([1.5], [0.03, 1.0], delay=3.5 * DT)
+    fit = jq.fit(start, frf, free=("numerator[0]", "denominator[0]", "delay"))
+    off = (fit.values - [1.0, lag, late]) / fit.noise_standard_errors
+    assert np.max(np.abs(off)) < 0.5
 
 
 @pytest.mark.slow

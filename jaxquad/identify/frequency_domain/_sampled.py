@@ -17,10 +17,11 @@ from ..output_error._simulated import HasStateSpace, HasTransferFunction, linear
 from ._parameters import namespace_of, Numbers
 
 
-_COUNTS = (16, 64)  # aliases to either side
+_COUNTS = (16, 64, 256)  # aliases to either side
 _NODES = (6, 12)  # frequencies between which the sum over the aliases is interpolated
 _TRIED = 32  # frequencies at which the two are chosen
 _TOLERANCE = 1e-8  # of the response, to which they are chosen
+_TURNS = 32  # delays within a hold at which they are compared, for a fit may go to any
 _FLAT = 0.3  # of the sum, over which its window stays at 1
 _SECOND = 0.7  # length of a second window over that of the first
 _WHOLE = 1e-9  # samples; a delay this close to whole samples is whole, whatever the rounding
@@ -176,14 +177,29 @@ def plan_aliases(model: PyTree, frf: FrequencyResponse) -> Aliases:
     samples = None if passing is None else np.asarray(whole_samples(passing[1], hold))
     top, middle = (np.abs(others[0, 0, k - 1]) for k in (_COUNTS[-1], _COUNTS[-1] // 8))
     is_level = passing is None and bool(np.any((top > _LEVEL * middle) & (middle > 0)))
-    best = total(_COUNTS[-1], None)
+    places = np.outer(np.arange(1, _COUNTS[-1] + 1), np.arange(_TURNS) / _TURNS)
+    turns = np.exp(-2j * np.pi * places)
+
+    def late(count: int) -> np.ndarray:
+        """The response at the last frequency, where most is missing, at other delays."""
+        some = others[:, -1, :count, ..., None] * turns[:count, None, None]
+        plan, there = _aliases_at(tried[-1:], hold, count), np.repeat(direct[-1:], _TURNS, axis=-1)
+        return np.asarray(plan.total(there, some.reshape(-1, *there.shape[1:])))
+
+    error = np.asarray(frf.random_error)
+    error = float(np.median(error[np.isfinite(error)])) if np.isfinite(error).any() else 0.0
+    latest, allowed = late(_COUNTS[-1]), max(error / np.sqrt(omega.size), _TOLERANCE)
+    enough = [bool(np.all(np.abs(late(n) - latest) <= allowed * abs(latest))) for n in _COUNTS]
+    count = _COUNTS[1] if enough[1] else _COUNTS[2]
+    best = total(count, None)
     close = lambda *plan: bool(np.all(np.abs(total(*plan) - best) <= _TOLERANCE * abs(best)))
-    count = next(count for count in _COUNTS if close(count, None))
+    if enough[0] and close(_COUNTS[0], None):
+        count = _COUNTS[0]
     for number in _NODES if omega.size > _NODES[-1] else ():
         # The frequencies nearest to Chebyshev's points between the first and the last.
-        turns = np.cos(np.pi * (np.arange(number) + 0.5) / number)
+        points = np.cos(np.pi * (np.arange(number) + 0.5) / number)
         left = list(range(tried.size))
-        for target in tried[0] + (tried[-1] - tried[0]) * (1 - turns) / 2:
+        for target in tried[0] + (tried[-1] - tried[0]) * (1 - points) / 2:
             left.remove(min(left, key=lambda k: abs(tried[k] - target)))
         nodes = np.setdiff1d(np.arange(tried.size), left)
         if close(count, nodes):
