@@ -417,11 +417,8 @@ def _profile(
     values, units = np.asarray(solution.values)[: budget.count], units_of(solution)[: budget.count]
     parts = budget.covariance, budget.by_noise
     inflations = np.sqrt([part[k, k] / scaled_inverse(budget.bread)[k, k] for part in parts])
-    far, value, estimate = (
-        _FAR_OUT * float(np.max(inflations)),
-        values[k],
-        _Place(solution.z, values),
-    )
+    far, value = _FAR_OUT * float(np.max(inflations)), values[k]
+    estimate = _Place(solution.z, values)
     solutions = ft.partial(_places_along, problem, solution, k, estimate, far)
     below = solutions(value / 2, value / 1000) if value else []
     above = solutions(value + error, value + 2.5 * error)
