@@ -53,7 +53,7 @@ from .frequency_domain._parameters import (
 from .frequency_domain._problem import make_problem, Problem, problem_normal
 from .frequency_domain._refits import check_options
 from .frequency_domain._result import Fit
-from .frequency_domain._sampled import behind_hold, direct_part, hold_of
+from .frequency_domain._sampled import behind_hold, count_aliases, direct_part, hold_of
 from .frequency_domain._solve import solution_at, stopped_early
 from .uncertainty._assess import assess
 from .uncertainty._error_budget import weighting_at
@@ -75,6 +75,7 @@ class Batch(NamedTuple):
     model: PyTree
     parameters: Parameters
     hold: float  # s
+    aliases: int  # of the hold, to either side
     omega: Float[Numbers, " frequencies"]
 
     @property
@@ -172,7 +173,7 @@ def _columns(
         model = _write(batch.model, batch.parameters.places, values)
         for place, tie in batch.parameters.ties:
             model = _write(model, (place,), [jnp.asarray(tie(model))])
-        return evaluate_response(behind_hold(model, batch.hold), omega[None])[0]
+        return evaluate_response(behind_hold(model, batch.hold, batch.aliases), omega[None])[0]
 
     here, columns = response(z), []
     for k in range(len(z)):
@@ -451,7 +452,8 @@ def fit_batch(
     weights, mixed = weigh(np.ones(measured.shape)), isinstance(cost, MaximumLikelihood)
     # Without a floor on the errors, they do not depend on the weights.
     mixings = [mixing_of(*x) for x in zip(points, weights, strict=True)] if mixed else ()
-    where = Batch(model, parameters, holds[0], _pad(omega))
+    aliases = count_aliases(model, frfs[0]) if holds[0] else 0
+    where = Batch(model, parameters, holds[0], aliases, _pad(omega))
     together, single = (np.asarray(part) for part in _both_ways(model, where.omega))
     if together.shape != (*where.omega.shape, *measured.shape[2:]):
         raise ValueError(
@@ -481,8 +483,9 @@ def fit_batch(
 @eqx.filter_jit
 def _sizes(where, z) -> Float[Array, "batch frequencies outputs inputs"]:
     def one(z):
-        model = behind_hold(where.parameters.insert(where.model, z), where.hold)
-        return jnp.abs(evaluate_response(model, where.omega))
+        model = where.parameters.insert(where.model, z)
+        sampled = behind_hold(model, where.hold, where.aliases)
+        return jnp.abs(evaluate_response(sampled, where.omega))
 
     return jax.vmap(one)(z)
 

@@ -177,19 +177,7 @@ def plan_aliases(model: PyTree, frf: FrequencyResponse) -> Aliases:
     samples = None if passing is None else np.asarray(whole_samples(passing[1], hold))
     top, middle = (np.abs(others[0, 0, k - 1]) for k in (_COUNTS[-1], _COUNTS[-1] // 8))
     is_level = passing is None and bool(np.any((top > _LEVEL * middle) & (middle > 0)))
-    places = np.outer(np.arange(1, _COUNTS[-1] + 1), np.arange(_TURNS) / _TURNS)
-    turns = np.exp(-2j * np.pi * places)
-
-    def late(count: int) -> np.ndarray:
-        """The response at the last frequency, where most is missing, at other delays."""
-        some = others[:, -1, :count, ..., None] * turns[:count, None, None]
-        plan, there = _aliases_at(tried[-1:], hold, count), np.repeat(direct[-1:], _TURNS, axis=-1)
-        return np.asarray(plan.total(there, some.reshape(-1, *there.shape[1:])))
-
-    error = np.asarray(frf.random_error)
-    error = float(np.median(error[np.isfinite(error)])) if np.isfinite(error).any() else 0.0
-    latest, allowed = late(_COUNTS[-1]), max(error / np.sqrt(omega.size), _TOLERANCE)
-    enough = [bool(np.all(np.abs(late(n) - latest) <= allowed * abs(latest))) for n in _COUNTS]
+    enough = _enough(direct[-1:], others[:, -1:], tried[-1:], frf)
     count = _COUNTS[1] if enough[1] else _COUNTS[2]
     best = total(count, None)
     close = lambda *plan: bool(np.all(np.abs(total(*plan) - best) <= _TOLERANCE * abs(best)))
@@ -208,6 +196,40 @@ def plan_aliases(model: PyTree, frf: FrequencyResponse) -> Aliases:
     else:
         plan = _aliases_at(omega, hold, count)
     return dataclasses.replace(plan, samples=samples, is_level=is_level)
+
+
+def _enough(
+    direct: Complex[np.ndarray, "1 outputs inputs"],
+    others: Complex[np.ndarray, "2 1 aliases outputs inputs"],
+    omega: Float[np.ndarray, " 1"],
+    frf: FrequencyResponse,
+) -> list[bool]:
+    """Whether so many aliases are, at whatever delay within a sample a fit may arrive: what is
+    missing is less than the random error of all frequencies together. `omega` is the highest one,
+    where most is missing."""
+    count, hold = others.shape[2], hold_of(frf)
+    shares = np.outer(np.arange(1, count + 1), np.arange(_TURNS) / _TURNS)
+    turned = others[..., None] * np.exp(-2j * np.pi * shares)[:, None, None]
+    direct = np.repeat(direct, _TURNS, axis=-1)
+
+    def total(count: int) -> Complex[np.ndarray, "1 outputs late"]:
+        plan, some = _aliases_at(omega, hold, count), turned[:, 0, :count]
+        return np.asarray(plan.total(direct, some.reshape(-1, *direct.shape[1:])))
+
+    error = np.asarray(frf.random_error)
+    error = float(np.median(error[np.isfinite(error)])) if np.isfinite(error).any() else 0.0
+    best, allowed = total(count), max(error / np.sqrt(len(frf.omega)), _TOLERANCE)
+    return [bool(np.all(np.abs(total(n) - best) <= allowed * abs(best))) for n in _COUNTS]
+
+
+def count_aliases(model: PyTree, frf: FrequencyResponse) -> int:
+    """How many aliases to either side a fit needs whose delay may be any."""
+    highest = np.asarray(frf.omega)[-1:]
+    aliases = _aliases_at(highest, hold_of(frf), _COUNTS[-1])
+    response = np.asarray(_evaluate(model, highest, aliases.omega)[0])
+    others = response[1:].reshape(2, *aliases.upper.shape, *response.shape[1:])
+    enough = _enough(response[:1], others, highest, frf)
+    return next(n for n, is_enough in zip(_COUNTS, enough, strict=True) if is_enough)
 
 
 def evaluate_sampled(
@@ -234,6 +256,7 @@ class SampledModel(eqx.Module):
 
     model: PyTree
     hold: float = eqx.field(static=True)  # s
+    aliases: int = eqx.field(static=True, default=_COUNTS[0])  # to either side
 
     def frequency_response(
         self, omega: Float[Array, " frequencies"]
@@ -241,7 +264,8 @@ class SampledModel(eqx.Module):
         """At frequencies below half the sample rate."""
         omega, direct = jnp.asarray(omega), direct_part(self.model)
         samples = None if direct is None else whole_samples(direct[1], self.hold)
-        aliases = dataclasses.replace(_aliases_at(omega, self.hold, _COUNTS[0]), samples=samples)
+        aliases = _aliases_at(omega, self.hold, self.aliases)
+        aliases = dataclasses.replace(aliases, samples=samples)
         return evaluate_sampled(self.model, omega, aliases)
 
 
@@ -253,9 +277,9 @@ def as_sampled(model: PyTree, frf: FrequencyResponse) -> PyTree:
     return behind_hold(model, hold_of(frf))
 
 
-def behind_hold(model: PyTree, hold: float) -> PyTree:
+def behind_hold(model: PyTree, hold: float, aliases: int = _COUNTS[0]) -> PyTree:
     """The model behind an input that is held for `hold` s; itself for 0."""
-    return SampledModel(model, hold) if hold else model
+    return SampledModel(model, hold, aliases) if hold else model
 
 
 def hold_of(frf: FrequencyResponse) -> float:
