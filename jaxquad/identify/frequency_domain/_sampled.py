@@ -1,6 +1,7 @@
 """What a sampled record shows of a model whose input is held: its response with all aliases."""
 
 import dataclasses
+import functools as ft
 from collections.abc import Sequence
 
 import equinox as eqx
@@ -96,6 +97,20 @@ def _aliases_at(omega, hold: float, count: int, nodes: np.ndarray | None = None)
         basis = lambda x: np.polynomial.chebyshev.chebvander((x - middle) / half, nodes.size - 1)
         across = np.linalg.solve(basis(nodes).T, basis(np.asarray(omega)).T).T
 
+    spread = turn[:, None] * across.astype(turn.dtype)
+    parts = turn / _imaginary(omega), spread, at + steps, steps - at
+    return Aliases(*parts, _weights(count), np.asarray(hold))
+
+
+@ft.lru_cache
+def _weights(count: int) -> Float[np.ndarray, " aliases"]:
+    """Of a sum over so many aliases.
+
+    A smooth end makes the rest of a sum that turns with a delay vanish faster than any power; of
+    one that does not turn it is a series in 1 / count, of which two lengths cancel the first term
+    (Richardson's extrapolation).
+    """
+
     def window(place: Float[np.ndarray, " aliases"]) -> Float[np.ndarray, " aliases"]:
         """From 1 to 0 at 1, with all derivatives."""
         x = np.clip((place - _FLAT) / (1 - _FLAT), 0, 1)
@@ -103,15 +118,8 @@ def _aliases_at(omega, hold: float, count: int, nodes: np.ndarray | None = None)
             rise, fall = np.exp(-1 / x), np.exp(-1 / (1 - x))
         return fall / (rise + fall)
 
-    # A smooth end makes the rest of a sum that turns with a delay vanish faster than any power; of
-    # one that does not turn it is a series in 1 / count, of which two lengths cancel the first term
-    # (Richardson's extrapolation).
     place = np.arange(1, count + 1) / (count + 1)
-    weights = (window(place) - _SECOND * window(place / _SECOND)) / (1 - _SECOND)
-    spread = turn[:, None] * across.astype(turn.dtype)
-    return Aliases(
-        turn / _imaginary(omega), spread, at + steps, steps - at, weights, np.asarray(hold)
-    )
+    return (window(place) - _SECOND * window(place / _SECOND)) / (1 - _SECOND)
 
 
 def direct_part(
@@ -154,7 +162,8 @@ def plan_aliases(model: PyTree, frf: FrequencyResponse) -> Aliases:
     """As many aliases and as few nodes as the response of this model needs, and ones near it."""
     hold, omega = hold_of(frf), np.asarray(frf.omega)
     tried = omega[np.unique(np.linspace(0, omega.size - 1, _TRIED).round().astype(int))]
-    aliases = _aliases_at(tried, hold, _COUNTS[-1])
+    enough = _enough(model, frf)
+    aliases = _aliases_at(tried, hold, _COUNTS[1] if enough[1] else _COUNTS[2])
     response, passing = jax.tree.map(np.asarray, _evaluate(model, tried, aliases.omega))
     bad = ~np.isfinite(response).all(axis=tuple(range(1, response.ndim)))
     if bad.any():
@@ -175,10 +184,9 @@ def plan_aliases(model: PyTree, frf: FrequencyResponse) -> Aliases:
         return np.asarray(plan.total(direct, some.reshape(-1, *direct.shape[1:])))
 
     samples = None if passing is None else np.asarray(whole_samples(passing[1], hold))
-    top, middle = (np.abs(others[0, 0, k - 1]) for k in (_COUNTS[-1], _COUNTS[-1] // 8))
+    top, middle = (np.abs(others[0, 0, k - 1]) for k in (_COUNTS[1], _COUNTS[1] // 8))
     is_level = passing is None and bool(np.any((top > _LEVEL * middle) & (middle > 0)))
-    enough = _enough(direct[-1:], others[:, -1:], tried[-1:], frf)
-    count = _COUNTS[1] if enough[1] else _COUNTS[2]
+    count = aliases.upper.shape[1]
     best = total(count, None)
     close = lambda *plan: bool(np.all(np.abs(total(*plan) - best) <= _TOLERANCE * abs(best)))
     if enough[0] and close(_COUNTS[0], None):
@@ -198,38 +206,29 @@ def plan_aliases(model: PyTree, frf: FrequencyResponse) -> Aliases:
     return dataclasses.replace(plan, samples=samples, is_level=is_level)
 
 
-def _enough(
-    direct: Complex[np.ndarray, "1 outputs inputs"],
-    others: Complex[np.ndarray, "2 1 aliases outputs inputs"],
-    omega: Float[np.ndarray, " 1"],
-    frf: FrequencyResponse,
-) -> list[bool]:
-    """Whether so many aliases are, at whatever delay within a sample a fit may arrive: what is
-    missing is less than the random error of all frequencies together. `omega` is the highest one,
-    where most is missing."""
-    count, hold = others.shape[2], hold_of(frf)
-    shares = np.outer(np.arange(1, count + 1), np.arange(_TURNS) / _TURNS)
-    turned = others[..., None] * np.exp(-2j * np.pi * shares)[:, None, None]
-    direct = np.repeat(direct, _TURNS, axis=-1)
-
-    def total(count: int) -> Complex[np.ndarray, "1 outputs late"]:
-        plan, some = _aliases_at(omega, hold, count), turned[:, 0, :count]
-        return np.asarray(plan.total(direct, some.reshape(-1, *direct.shape[1:])))
-
+def _enough(model: PyTree, frf: FrequencyResponse) -> list[bool]:
+    """Whether so many aliases are, at whatever delay within a sample a fit may arrive: what they
+    lack at the highest frequency, where it is most, is less than the random error of all."""
+    highest, most = np.max(np.asarray(frf.omega), keepdims=True), _COUNTS[-1]
+    aliases = _aliases_at(highest, hold_of(frf), most)
+    response = np.asarray(_evaluate(model, highest, aliases.omega)[0])
+    response = response.reshape(len(response), -1)
+    above, below = (response[1:] / _imaginary(aliases.omega)[:, None]).reshape(2, most, -1)
+    weights = np.stack([np.pad(_weights(n), (0, most - n)) for n in _COUNTS])[:, None]
+    turns = weights * np.exp(
+        -2j * np.pi / _TURNS * np.outer(np.arange(_TURNS), np.arange(1, most + 1))
+    )
+    sums = turns @ above + turns.conj() @ below.conj()  # count delay pair
+    totals = aliases.direct * response[0] + aliases.spread[0, 0] * sums
     error = np.asarray(frf.random_error)
     error = float(np.median(error[np.isfinite(error)])) if np.isfinite(error).any() else 0.0
-    best, allowed = total(count), max(error / np.sqrt(len(frf.omega)), _TOLERANCE)
-    return [bool(np.all(np.abs(total(n) - best) <= allowed * abs(best))) for n in _COUNTS]
+    allowed = max(error / np.sqrt(len(frf.omega)), _TOLERANCE) * np.abs(totals[-1])
+    return np.all(np.abs(totals - totals[-1]) <= allowed, axis=(1, 2)).tolist()
 
 
 def count_aliases(model: PyTree, frf: FrequencyResponse) -> int:
     """How many aliases to either side a fit needs whose delay may be any."""
-    highest = np.asarray(frf.omega)[-1:]
-    aliases = _aliases_at(highest, hold_of(frf), _COUNTS[-1])
-    response = np.asarray(_evaluate(model, highest, aliases.omega)[0])
-    others = response[1:].reshape(2, *aliases.upper.shape, *response.shape[1:])
-    enough = _enough(response[:1], others, highest, frf)
-    return next(n for n, is_enough in zip(_COUNTS, enough, strict=True) if is_enough)
+    return next(n for n, is_enough in zip(_COUNTS, _enough(model, frf), strict=True) if is_enough)
 
 
 def evaluate_sampled(
