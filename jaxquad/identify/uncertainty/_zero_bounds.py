@@ -402,7 +402,8 @@ def profiles(
     weak[_of_null_directions(budget.bread)] = True
     weak &= np.array(problem.parameters.logarithmic[: budget.count])
     weak &= (by_noise > 0) & (np.diagonal(scaled_inverse(budget.bread)) > 0)
-    errors = np.asarray(solution.values)[: budget.count] * np.sqrt(variances)
+    relative = np.sqrt(np.where(variances > 0, variances, 1.0))
+    errors = units_of(solution)[: budget.count] * relative
     for one in near:
         if np.isfinite(one.bound.limit):
             errors[one.k] = one.bound.limit / 2
