@@ -1,5 +1,7 @@
 """A parameter so near zero that its error exceeds it is known by a limit, in its own unit."""
 
+from pathlib import Path
+
 import jax
 import numpy as np
 import pytest
@@ -169,8 +171,9 @@ def test_an_interval_near_zero_ends_where_the_cost_has_risen(seed):
 
 
 @pytest.mark.slow
-def test_parameters_that_leave_zero_stay_within_numbers():
+def test_parameters_that_leave_zero_stay_within_numbers(monkeypatch):
     """A lag, delay and lead of a sweep in noise: the step from zero was 2e7 in ln(delay)."""
+    monkeypatch.syspath_prepend(Path(__file__).parents[1] / "studies")
     from near_bounds import CASES, measured  # pyright: ignore
 
     case = CASES["small lead"]
