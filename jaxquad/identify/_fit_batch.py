@@ -452,7 +452,7 @@ def fit_batch(
     weights, mixed = weigh(np.ones(measured.shape)), isinstance(cost, MaximumLikelihood)
     # Without a floor on the errors, they do not depend on the weights.
     mixings = [mixing_of(*x) for x in zip(points, weights, strict=True)] if mixed else ()
-    aliases = count_aliases(model, frfs[0]) if holds[0] else 0
+    aliases = count_aliases(model, frfs) if holds[0] else 0
     where = Batch(model, parameters, holds[0], aliases, _pad(omega))
     together, single = (np.asarray(part) for part in _both_ways(model, where.omega))
     if together.shape != (*where.omega.shape, *measured.shape[2:]):

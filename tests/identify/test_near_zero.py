@@ -172,7 +172,7 @@ def test_an_interval_near_zero_ends_where_the_cost_has_risen(seed):
 
 @pytest.mark.slow
 def test_parameters_that_leave_zero_stay_within_numbers(monkeypatch):
-    """A lag, delay and lead of a sweep in noise: the step from zero was 2e7 in ln(delay)."""
+    """A lag, delay and lead of a sweep in noise: Gauss-Newton steps 2e7 in ln(delay) from zero."""
     monkeypatch.syspath_prepend(Path(__file__).parents[1] / "studies")
     from near_bounds import CASES, measured  # pyright: ignore
 

@@ -220,15 +220,20 @@ def _enough(model: PyTree, frf: FrequencyResponse) -> list[bool]:
     )
     sums = turns @ above + turns.conj() @ below.conj()  # count delay pair
     totals = aliases.direct * response[0] + aliases.spread[0, 0] * sums
-    error = np.asarray(frf.random_error)
-    error = float(np.median(error[np.isfinite(error)])) if np.isfinite(error).any() else 0.0
-    allowed = max(error / np.sqrt(len(frf.omega)), _TOLERANCE) * np.abs(totals[-1])
+    allowed = max(_typical_error(frf) / np.sqrt(len(frf.omega)), _TOLERANCE) * np.abs(totals[-1])
     return np.all(np.abs(totals - totals[-1]) <= allowed, axis=(1, 2)).tolist()
 
 
-def count_aliases(model: PyTree, frf: FrequencyResponse) -> int:
-    """How many aliases to either side a fit needs whose delay may be any."""
-    return next(n for n, is_enough in zip(_COUNTS, _enough(model, frf), strict=True) if is_enough)
+def _typical_error(frf: FrequencyResponse) -> float:
+    error = np.asarray(frf.random_error)
+    finite = error[np.isfinite(error)]
+    return float(np.median(finite)) if finite.size else 0.0
+
+
+def count_aliases(model: PyTree, frfs: Sequence[FrequencyResponse]) -> int:
+    """How many aliases to either side the most precise of the responses needs, at any delay."""
+    enough = _enough(model, min(frfs, key=_typical_error))
+    return next((n for n, is_enough in zip(_COUNTS, enough, strict=True) if is_enough), _COUNTS[-1])
 
 
 def evaluate_sampled(

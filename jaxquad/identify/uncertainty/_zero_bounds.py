@@ -136,7 +136,7 @@ def polish(
         step = np.linalg.lstsq(local.jacobian[:, free], -local.residual, rcond=1e-10)[0]
         for _ in range(_SHORTER):
             z = solution.z.copy()
-            # The step of the values themselves, by a tenth of one at least.
+            # The step of the values themselves, none to less than a tenth of it.
             z[free] += np.where(logarithmic, np.log(np.maximum(1 + step, 0.1)), step)
             moved = solution_at(problem, z, steps=start.steps)
             there = linearise(problem, moved)
