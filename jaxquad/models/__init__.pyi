@@ -8,13 +8,11 @@ from ._attitude import (
     LinearAxis as LinearAxis,
     quaternion_derivative as quaternion_derivative,
     quaternion_from_euler as quaternion_from_euler,
-    rotation_matrix as rotation_matrix,
 )
 from ._convert import (
     feedthrough as feedthrough,
     from_control as from_control,
     realise as realise,
-    series as series,
     state_space as state_space,
 )
 from ._multirotor import (

@@ -107,18 +107,6 @@ def quaternion_derivative(quaternion: Four, rate: Vector) -> Four:
     return jnp.concatenate([along, across]) / 2
 
 
-def rotation_matrix(quaternion: Four) -> Float[Array, " 3 3 *ensemble"]:
-    """The matrix that turns body into earth vectors, from a unit `quaternion`."""
-    w, x, y, z = quaternion
-    return jnp.stack(
-        [
-            jnp.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)]),
-            jnp.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)]),
-            jnp.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]),
-        ]
-    )
-
-
 _CREEP = 0.01  # rad/s, at which the torque reaches 76 % of its level
 
 
@@ -188,13 +176,9 @@ class Attitude(eqx.Module):
         return -align(self.stiffness, euler) * euler
 
 
-def _per_axis(x: ArrayLike | Sequence) -> Array:
-    x = as_float(x)
-    return x if x.ndim else as_float(on_host(x)[None])
-
-
-def _per_axis_or_none(x: ArrayLike | Sequence | None) -> Array | None:
-    return None if x is None else _per_axis(x)
+def _per_axis(x: ArrayLike | Sequence | None) -> Array | None:
+    x = as_float_or_none(x)
+    return x if x is None or x.ndim else as_float(on_host(x)[None])
 
 
 class LinearAxis(eqx.Module):
@@ -246,10 +230,10 @@ class DecoupledAxes(eqx.Module):
 
     torque_gain: Axes = per_member(rank=1, converter=_per_axis)
     inertia: Axes = per_member(rank=1, converter=_per_axis)
-    lag: Axes | None = per_member(rank=1, converter=_per_axis_or_none, default=None)
+    lag: Axes | None = per_member(rank=1, converter=_per_axis, default=None)
     damping: Axes = per_member(rank=1, converter=_per_axis, default=0.0)
     stiffness: Axes = per_member(rank=1, converter=_per_axis, default=0.0)
-    coulomb: Axes | None = per_member(rank=1, converter=_per_axis_or_none, default=None)
+    coulomb: Axes | None = per_member(rank=1, converter=_per_axis, default=None)
 
     def __check_init__(self):
         _ = self.shape

@@ -1,4 +1,4 @@
-"""Models from others: realisations, series connections, models of python-control and scipy."""
+"""Models from others: realisations, and models of python-control and scipy."""
 
 import importlib
 import math
@@ -9,8 +9,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-
-from jaxquad._core import is_concrete
 
 from ._state_space import dot, explicit, Realisation, StateSpace
 from ._transfer_function import (
@@ -81,58 +79,6 @@ def feedthrough(
         return None
     gain, late = explicit(model)[3], model.lateness
     return gain, jnp.zeros_like(gain) if late is None else late
-
-
-def series(first: StateSpace, second: StateSpace) -> StateSpace:
-    """Two models in series: the outputs of `first` drive the inputs of `second`.
-
-    **Returns:** The model whose response is that of `second` times that of `first`.
-
-    **Raises:** `ValueError`: the numbers of outputs and inputs differ, or several signals between
-    the two models have different delays, which no delay of an input or output can replace.
-    """
-    produced, taken = first.H0.shape[0], second.G.shape[1]
-    if produced != taken:
-        raise ValueError(
-            f"The first model has {produced} outputs, the second {taken} inputs: pick channels "
-            "with model.select."
-        )
-    late, between = first.input_delay, _add_delays(first.output_delay, second.input_delay)
-    if between is not None:
-        if between.size > 1 and not (is_concrete(between) and np.ptp(np.asarray(between)) == 0):
-            raise ValueError(
-                f"The signals between the models have the delays {between} s: give them one known "
-                "delay, or put the delays on the first inputs and the last outputs."
-            )
-        late = _add_delays(late, jnp.broadcast_to(between[0], (first.G.shape[1],)))
-    M = None
-    if not (first.M is None and second.M is None and first.H1 is None):
-        H1 = jnp.zeros_like(first.H0) if first.H1 is None else first.H1
-        ones = [jnp.eye(len(model.F), dtype=model.F.dtype) for model in (first, second)]
-        M = _blocks(
-            ones[0] if first.M is None else first.M,
-            -dot(second.G, H1),
-            ones[1] if second.M is None else second.M,
-        )
-    none = lambda H: jnp.zeros((len(H), len(first.F)), H.dtype)
-    return StateSpace(
-        F=_blocks(first.F, dot(second.G, first.H0), second.F),
-        G=jnp.concatenate([first.G, jnp.zeros((len(second.F), first.G.shape[1]), first.G.dtype)]),
-        H0=jnp.concatenate([none(second.H0), second.H0], axis=1),
-        H1=None if second.H1 is None else jnp.concatenate([none(second.H1), second.H1], axis=1),
-        M=M,
-        input_delay=late,
-        output_delay=second.output_delay,
-    )
-
-
-def _blocks(upper: Array, across: Array, lower: Array) -> Float[Array, "states states"]:
-    none = jnp.zeros((len(upper), len(lower)), upper.dtype)
-    return jnp.block([[upper, none], [across, lower]])
-
-
-def _add_delays(a: Array | None, b: Array | None) -> Array | None:
-    return b if a is None else a if b is None else a + b
 
 
 _INDEPENDENT = 1e-8  # smallest singular value of the columns of B, beside the largest

@@ -16,7 +16,6 @@ from jaxquad.models import (
     euler_rates_matrix,
     quaternion_derivative,
     quaternion_from_euler,
-    rotation_matrix,
 )
 
 
@@ -25,6 +24,17 @@ RATE = jnp.array([1.0, 2.0, -1.5])
 STILL = jnp.zeros(3)
 ANGLES = jax.random.uniform(jax.random.key(0), (3, 20), minval=-1.4, maxval=1.4)
 RATES = jax.random.normal(jax.random.key(1), (3, 20))
+
+
+def rotation_matrix(quaternion):
+    """Turns body into earth vectors."""
+    w, x, y, z = quaternion
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return jnp.stack([jnp.stack(row) for row in rows])
 
 
 def flow(attitude, state, torque, spin):

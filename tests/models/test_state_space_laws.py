@@ -8,7 +8,7 @@ import pytest
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from jaxquad.models import series, StateSpace
+from jaxquad.models import StateSpace
 
 
 OMEGA = jnp.asarray(np.geomspace(0.01, 300.0, 30))
@@ -33,20 +33,6 @@ def system(seed):
 
 BOUNDED = arrays(float, (2,), elements=st.floats(-3, 3))
 CHECK = hypothesis.settings(deadline=None, max_examples=5, derandomize=True)
-
-
-@pytest.mark.slow
-@CHECK
-@hypothesis.given(seed=st.integers(0, 1000))
-def test_a_series_has_the_product_of_the_responses(seed):
-    first, second = system(seed), system(seed + 1)
-    first = eqx.tree_at(lambda m: m.output_delay, first, jnp.full(2, 0.02))
-    second = eqx.tree_at(lambda m: m.input_delay, second, jnp.full(2, 0.01))
-    found = np.asarray(series(first, second).frequency_response(OMEGA))
-    parts = [np.asarray(m.frequency_response(OMEGA)) for m in (second, first)]
-    # A random pole may lie near the axis or the terms of a sum cancel: relative to the largest.
-    scale = np.abs(parts[0]) @ np.abs(parts[1])
-    assert np.all(np.abs(found - parts[0] @ parts[1]) < 1e-9 * scale)
 
 
 @pytest.mark.slow
@@ -90,13 +76,3 @@ def test_channels_in_another_order_permute_the_response(seed, rows, columns):
     found = model.select(rows, columns).frequency_response(OMEGA)
     expected = np.asarray(model.frequency_response(OMEGA))[:, rows][:, :, columns]
     np.testing.assert_allclose(found, expected, rtol=1e-11)
-
-
-def test_signals_between_two_models_that_are_late_by_different_times_are_refused():
-    with pytest.raises(ValueError, match="have the delays .*one known delay"):
-        series(system(0), system(1))
-
-
-def test_a_series_of_models_that_do_not_fit_is_refused():
-    with pytest.raises(ValueError, match="has 1 outputs, the second 2 inputs"):
-        series(system(0).select([0], [0, 1]), system(1))
