@@ -302,16 +302,15 @@ def _response_jvp(primals, tangents):
     d, d_omega = jax.tree.map(lambda x: None if absent(x) else x, tangents, is_leaf=absent)
     solved = _solve_states(matrices, omega)
     value, states = _mark_rounding(matrices, omega, solved), solved.states
-    rate = _derivative(states, omega)
-    push = [_multiply(d.F, states), _negative(_multiply(d.M, rate))]
+    push = [_multiply(d.F, states), _multiply(d.M, _derivative(states, -omega))]
     if d.G is not None:
         real = jnp.broadcast_to(d.G[:, :, None], states.real.shape)
         push.append(Split(real, jnp.zeros_like(states.imag)))
-    change = [_multiply(d.H0, states), _multiply(d.H1, rate)]
+    change = [_multiply(d.H0, states), _multiply(d.H1, _derivative(states, omega))]
     if d_omega is not None:
-        turned = _derivative(states, d_omega)
-        push.append(_negative(turned if matrices.M is None else _multiply(matrices.M, turned)))
-        change.append(_multiply(matrices.H1, turned))
+        turned = _derivative(states, -d_omega)
+        push.append(turned if matrices.M is None else _multiply(matrices.M, turned))
+        change.append(_multiply(matrices.H1, _derivative(states, d_omega)))
     pushed = _add_present(push)
     if pushed is not None:
         change.append(no_fuse(_product, _output_of(matrices, omega, solved.resolvent), pushed))
@@ -379,10 +378,6 @@ def _multiply_real(matrix: Array, states: Split) -> Split:
     both = jnp.concatenate(states, axis=1)
     product, inputs = _dot(matrix, both), states.real.shape[1]
     return Split(product[:, :inputs], product[:, inputs:])
-
-
-def _negative(parts: Split | None) -> Split | None:
-    return None if parts is None else Split(-parts.real, -parts.imag)
 
 
 def _add_present(terms: Sequence[Split | None]) -> Split | None:
