@@ -3,7 +3,7 @@
 import dataclasses
 import functools as ft
 import math
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Sequence
 from typing import NamedTuple
 
 import equinox as eqx
@@ -50,6 +50,15 @@ def _require_rising(name: str, values: Array) -> None:
         raise ValueError(f"{name} are {values}: give two or more that rise.")
 
 
+def _interpolate(x: Signal, knots: Float[Array, " knots"], rows: Sequence[Gain] | Gain) -> Signal:
+    """Straight between knots and constant beyond them, without a search: a sum of clipped ramps."""
+    knots, y = knots.astype(x.dtype), jnp.broadcast_to(rows[0], x.shape)
+    for k in range(len(rows) - 1):
+        share = jnp.clip((x - knots[k]) / (knots[k + 1] - knots[k]), 0, 1)
+        y = y + (rows[k + 1] - rows[k]) * share
+    return y
+
+
 class FuzzyMap(eqx.Module):
     """b0' = b0 + db0(delta) by fuzzy inference, delta = J / nominal.
 
@@ -93,25 +102,11 @@ class FuzzyMap(eqx.Module):
         """The trailing shape of the map, () for one controller."""
         return ensemble_shape({"nominal": self.nominal, "b0": self.b0}, rank=1)
 
-    def memberships(self, delta: Signal) -> Float[Array, " sets axes *ensemble"]:
-        """Of each set, from 0 to 1."""
-        centres = self.centres.astype(delta.dtype)
-        inside = jnp.clip(delta, centres[0], centres[-1])
-        rise = [jnp.ones_like(delta)]
-        for k in range(len(self.centres) - 1):
-            rise.append((inside - centres[k]) / (centres[k + 1] - centres[k]))
-        fall = [1 - up for up in rise[1:]] + [jnp.ones_like(delta)]
-        return jnp.stack(
-            [jnp.clip(jnp.minimum(a, b), 0, 1) for a, b in zip(rise, fall, strict=True)]
-        )
-
     def __call__(self, inertia: Signal) -> Signal:
         """b0 in rad/s^2 per unit of command at an `inertia` in kg m^2."""
         require_common_shape({"inertia": inertia, "nominal": self.nominal, "b0": self.b0})
         delta = inertia / broadcast_gain(self.nominal, inertia)
-        P = self.memberships(delta)
-        increments = self.increments.astype(P.dtype).reshape((-1,) + (1,) * inertia.ndim)
-        db0 = jnp.sum(P * increments, axis=0) / jnp.sum(P, axis=0)  # the average weight method
+        db0 = _interpolate(delta, self.centres, self.increments.astype(delta.dtype))
         return broadcast_gain(self.b0, inertia) + db0
 
     def tunable(self) -> dict[str, Transform | None]:
@@ -196,13 +191,7 @@ class InertiaMap(eqx.Module):
         )
         nominal = broadcast_gain(self.nominal, inertia)
         x = jnp.log(jnp.maximum(inertia / nominal, 1e-6))
-        # Constant beyond the knots, without a search: a sum of clipped ramps.
-        knots, rows = self.knots.astype(x.dtype), [broadcast_gain(row, x) for row in self.values]
-        y = jnp.broadcast_to(rows[0], x.shape)
-        for k in range(len(rows) - 1):
-            share = jnp.clip((x - knots[k]) / (knots[k + 1] - knots[k]), 0, 1)
-            y = y + (rows[k + 1] - rows[k]) * share
-        return jnp.exp(y)
+        return jnp.exp(_interpolate(x, self.knots, [broadcast_gain(row, x) for row in self.values]))
 
     def tunable(self) -> dict[str, Transform | None]:
         """The values, which keep falling."""
