@@ -31,15 +31,12 @@ from ._protocols import (
     CurrentObserver,
     error_dynamics,
     Gain,
-    instability_in_words,
     LinearController,
-    list_range,
     Member,
     Observer,
     Reference,
     Setpoint,
     Signal,
-    slowness_in_words,
     Transform,
 )
 
@@ -301,9 +298,13 @@ class LADRC(eqx.Module):
         The feedback can hold an observer that diverges as soon as the command stays at its limit.
         Only half-gain factors bring that about.
         """
-        if self._has_full_gains:
+        if self._has_full_gains or (radius := float(np.max(self._radius))) < _STABLE:
             return ""
-        return instability_in_words(self._error, self._named_gains)
+        return (
+            f"The observer alone is unstable at {self._named_gains} (spectral radius {radius:.4g} "
+            "per sample): it would diverge while the command saturates. Raise observer_factor or "
+            "lower wo."
+        )
 
     def observer_slowness(self) -> str:
         """Why the observer alone is slower than the feedback; empty if it is not.
@@ -312,7 +313,15 @@ class LADRC(eqx.Module):
         """
         if self._has_full_gains:
             return ""
-        return slowness_in_words(self._error, self.wc, self.dt, self._named_gains)
+        decay = jnp.asarray(-np.log(self._radius) / self.dt)
+        ratio = np.asarray(multiply_gains(1 / self.wc, decay))
+        if np.all(ratio >= 1):
+            return ""
+        return (
+            f"The observer alone decays at {ratio.min():.3g} wc at {self._named_gains}, slower "
+            "than the feedback: after saturation its estimate would mislead. Raise "
+            "observer_factor or wo."
+        )
 
     def observer_barrier(self, free: Collection[str]) -> Float[Array, ""]:
         """-ln of the room that Jury's conditions leave the observer, until it is as slow as wc.
@@ -334,9 +343,17 @@ class LADRC(eqx.Module):
         return error_dynamics(self.observer, self.gains.correction, self.dt)
 
     @property
+    def _radius(self) -> Float[np.ndarray, "..."]:
+        return np.asarray(np.max(np.abs(np.linalg.eigvals(np.asarray(self._error))), axis=-1))
+
+    @property
     def _named_gains(self) -> str:
-        factor = list_range(self.observer_factor)
-        return f"wo = {list_range(self.wo)} rad/s and an observer_factor of {factor}"
+        ends = [
+            np.unique([np.min(x), np.max(x)])
+            for x in map(np.asarray, (self.wo, self.observer_factor))
+        ]
+        wo, factor = (" .. ".join(f"{x:.4g}" for x in pair) for pair in ends)
+        return f"wo = {wo} rad/s and an observer_factor of {factor}"
 
     def transfer_functions(
         self, axis: int = 0, member: Member = None
@@ -362,6 +379,7 @@ class LADRC(eqx.Module):
         return TransferFunction(jnp.stack(back) / b0, below), TransferFunction(ahead / b0, below)
 
 
+_STABLE = 1 - 1e-9  # the spectral radius below which an error of the observer decays
 _REMEDIES = {
     "wc": "give the closed loop's bandwidth in rad/s",
     "wo": "give the observer's bandwidth in rad/s, a few times wc",

@@ -340,34 +340,6 @@ def error_dynamics(observer: Observer, correction: Rows, dt: float) -> Matrices:
     return jnp.broadcast_to(predict, shape) - observed
 
 
-_STABLE = 1 - 1e-9  # the spectral radius below which an error of the observer decays
-
-
-def _radius(error: Matrices) -> Float[np.ndarray, "..."]:
-    return np.asarray(np.max(np.abs(np.linalg.eigvals(np.asarray(error))), axis=-1))
-
-
-def instability_in_words(error: Matrices, named: str) -> str:
-    """Empty for an observer whose error decays; `named` are its gains."""
-    if (radius := float(np.max(_radius(error)))) < _STABLE:
-        return ""
-    return (
-        f"The observer alone is unstable at {named} (spectral radius {radius:.4g} per sample): it "
-        "would diverge while the command saturates. Raise observer_factor or lower wo."
-    )
-
-
-def slowness_in_words(error: Matrices, wc: Gain, dt: float, named: str) -> str:
-    """Empty for an observer whose error decays at least as fast as exp(-wc t)."""
-    ratio = np.asarray(multiply_gains(1 / wc, jnp.asarray(-np.log(_radius(error)) / dt)))
-    if np.all(ratio >= 1):
-        return ""
-    return (
-        f"The observer alone decays at {ratio.min():.3g} wc at {named}, slower than the feedback: "
-        "after saturation its estimate would mislead. Raise observer_factor or wo."
-    )
-
-
 def barrier(error: Matrices, full: Matrices, wc: Gain, dt: float) -> Float[Array, ""]:
     """-ln of the room left to an observer before it is as slow as wc; near 0 for a fast one.
 
@@ -391,9 +363,3 @@ def _room(error: Matrices, decay: Gain, dt: float) -> list[Gain]:
     minors = 0.5 * (trace**2 - square)
     real = 1 - trace + minors - determinant
     return [real, 1 - minors + determinant * (trace - determinant)]
-
-
-def list_range(values: Gain) -> str:
-    """One number, or the lowest and the highest of several."""
-    low, high = np.min(np.asarray(values)), np.max(np.asarray(values))
-    return f"{low:.4g}" if low == high else f"{low:.4g} .. {high:.4g}"
