@@ -388,7 +388,9 @@ def multisine_signals(
     orders: Orders, phase: Lines, amplitudes: Amplitudes, points: int
 ) -> Float[np.ndarray, "signals points"]:
     """One period of each multisine, at evenly spaced points; `phase` in rad."""
-    return _synthesise(orders, amplitudes * np.exp(1j * phase), points)
+    spectrum = np.zeros((len(amplitudes), points // 2 + 1), complex)
+    spectrum[:, orders] = 0.5 * points * (amplitudes * np.exp(1j * phase))
+    return np.fft.irfft(spectrum, points, axis=1)
 
 
 def _log_norm(
@@ -396,7 +398,7 @@ def _log_norm(
 ) -> tuple[float, Lines]:
     """Logarithm of the norm over all signals and points, and its gradient."""
     turned = amplitudes * np.exp(1j * phase)
-    signals = _synthesise(orders, turned, points)
+    signals = multisine_signals(orders, phase, amplitudes, points)
     top = np.abs(signals).max()
     unit = signals / top
     powers = unit ** (norm - 2)
@@ -404,11 +406,3 @@ def _log_norm(
     through = np.fft.rfft(powers * unit / (top * total), axis=1)[:, orders]
     slope = np.real(1j * turned * np.conj(through)).sum(axis=0)
     return float(np.log(total / unit.size) / norm + np.log(top)), slope
-
-
-def _synthesise(
-    orders: Orders, amplitudes: Amplitudes, points: int
-) -> Float[np.ndarray, "signals points"]:
-    spectrum = np.zeros((len(amplitudes), points // 2 + 1), complex)
-    spectrum[:, orders] = 0.5 * points * amplitudes
-    return np.fft.irfft(spectrum, points, axis=1)
