@@ -14,8 +14,6 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
 
-from jaxquad._core import require_x64
-
 
 Grid = Float[np.ndarray, " frequencies"]
 Layout = tuple[tuple[int, tuple[int, ...]], ...]  # length and starts of each set of windows
@@ -66,14 +64,6 @@ def lattice_windows(
     samples: int, lengths: tuple[int, ...], overlap: float, highest: float
 ) -> Layout:
     """Windows near `lengths`, with about the `overlap`, of whole blocks that all share."""
-    if not 0 <= overlap < 1:
-        raise ValueError(f"overlap {overlap} is not in [0, 1): 0.5 or 0.8 are usual")
-    for length in lengths:
-        if not 2 <= length <= samples:
-            raise ValueError(
-                f"a window of {length} samples does not fit a record of {samples}: give lengths "
-                f"of 2 to {samples} samples"
-            )
     long = [length for length in lengths if length >= 16 * _BLOCKS[0]]
     common = 1
     if long:  # the block that divides all lengths, or else changes them by least
@@ -116,26 +106,7 @@ def fourier_sums(
     the "linear" trend of every window before the taper, or "none". Accurate to about 2e-13 of the
     largest sum. In memory, the windows of one channel are neighbours.
     """
-    require_x64("a transform")
-    angle = np.asarray(angle, float)
-    samples = len(signals[0])
-    if detrend not in _TRENDS:
-        raise ValueError(f"detrend is {detrend!r}: use none, constant or linear")
-    if not angle.size or not np.all(np.abs(angle) <= np.pi):
-        worst = max(angle.tolist(), key=abs, default=None)
-        raise ValueError(
-            f"angle {worst} rad per sample is not within -pi to pi, the Nyquist frequency: give at "
-            "least one frequency, and none above half the sample rate"
-        )
-    if not windows:
-        raise ValueError("there are no windows: give at least one pair (length, starts)")
-    for length, starts in windows:
-        if length < 2 or not starts or min(starts) < 0 or max(starts) + length > samples:
-            raise ValueError(
-                f"windows of {length} samples that start at {min(starts, default=None)} to "
-                f"{max(starts, default=None)} do not fit a record of {samples} samples: starts "
-                f"must lie between 0 and {samples - length}, and a window must hold 2 samples"
-            )
+    angle, samples = np.asarray(angle, float), len(signals[0])
     rows, end = np.empty((sum(x.shape[1] for x in signals), samples)), 0
     for part in signals:
         columns = np.asarray(part, float).T

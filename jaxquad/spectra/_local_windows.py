@@ -71,10 +71,6 @@ def make_windows(
             f"need; the local fit needs {coefficients + _FREEDOM}. Record longer, or use a lower "
             "order"
         )
-    if not (omega.size and np.all(np.diff(omega) > 0)):
-        raise ValueError(
-            f"{omega.size} frequencies: give one or more, in increasing order, in rad/s"
-        )
     if omega[0] < 0.999 * bins.omega[0] or omega[-1] > 1.001 * bins.omega[-1]:
         raise ValueError(
             f"the frequencies run from {omega[0]:.4g} to {omega[-1]:.4g} rad/s, but the records "

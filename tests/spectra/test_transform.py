@@ -210,28 +210,3 @@ def test_sums_of_several_records_equal_those_term_by_term(estimator):
                         assert_sums(sums[:, mine, channel], expected[:, :, channel], 1e-11)
         origin += record.samples + longest
     assert done == [len(starts) for _, starts in segments.groups]
-
-
-@pytest.mark.parametrize(
-    ("angle", "windows", "options", "words"),
-    [
-        ([0.1], ((100, (0, 31)),), {}, "starts must lie between 0 and 30"),
-        ([0.1], ((100, ()),), {}, "do not fit"),
-        ([0.1], ((1, (0,)),), {}, "hold 2 samples"),
-        ([0.1], (), {}, "no windows"),
-        ([3.2], ((100, (0,)),), {}, "3.2 rad per sample"),
-        ([np.nan], ((100, (0,)),), {}, "nan rad per sample"),
-        ([], ((100, (0,)),), {}, "at least one frequency"),
-        ([0.1], ((100, (0,)),), {"detrend": "cubic"}, "'cubic'"),
-        ([0.1], ((100, (0,)),), {"shape": "flat"}, "no window 'flat'"),
-    ],
-)
-def test_unusable_input_is_named(angle, windows, options, words):
-    with pytest.raises(ValueError, match=words):
-        transform_windows(RECORD[:130], np.array(angle), windows, **options)
-
-
-@pytest.mark.parametrize(("length", "overlap", "words"), [(200, 0.5, "200"), (50, 1.0, "1.0")])
-def test_unusable_lattices_are_named(length, overlap, words):
-    with pytest.raises(ValueError, match=words):
-        lattice_windows(130, (length,), overlap, 0.1)
