@@ -138,15 +138,12 @@ def condition(products: Products, channels: Channels, counts: Counts) -> Conditi
     )  # fmt: skip
 
 
-class Combined(NamedTuple):
-    response: Responses
-    coherence: Pairs
-    share: Shares  # of each length in the response
+def combine(
+    parts: Conditioned, scales: Counts, freedom: Counts, resolved: Resolved
+) -> tuple[Responses, Pairs, Shares]:
+    """Response, coherence and the share of each window length in the response.
 
-
-def combine(parts: Conditioned, scales: Counts, freedom: Counts, resolved: Resolved) -> Combined:
-    """Weight spectra of several window lengths by W_i = (eps_i / eps_min)^-4 and fit one set to
-    them.
+    The spectra are weighted by W_i = (eps_i / eps_min)^-4, and one set is fitted to them.
 
     The cost (Tischler & Remple eq. 10.4), each part relative to its mean under W_i^2 (G_xx~ ...),
     is
@@ -186,11 +183,8 @@ def combine(parts: Conditioned, scales: Counts, freedom: Counts, resolved: Resol
     a, b, r = u
     moved = np.sum(mean * parts.instrument_share[:, :, None, :], axis=0)
     share = mean * gain / np.sum(mean * gain, axis=0, keepdims=True)
-    return Combined(
-        along * (r / a * xy / xx / size),
-        np.minimum(r**2 / (a * b) * level, moved),
-        np.moveaxis(share, 0, -1),
-    )
+    response = along * (r / a * xy / xx / size)
+    return response, np.minimum(r**2 / (a * b) * level, moved), np.moveaxis(share, 0, -1)
 
 
 class Slopes(NamedTuple):

@@ -384,19 +384,12 @@ def joint_fit(fit: LocalFit, inputs: int) -> LocalFit:
 
 def _power_beside(power: np.ndarray, inputs: int) -> np.ndarray:
     """That of the first references, less what the others explain of it."""
-    first, crossed, others = (
-        power[:, :inputs, :inputs],
-        power[:, :inputs, inputs:],
-        power[:, inputs:, inputs:],
-    )
+    first, crossed = power[:, :inputs, :inputs], power[:, :inputs, inputs:]
+    others = power[:, inputs:, inputs:]
     if not others.shape[1]:
         return first
-    others = (
-        others
-        + _ROUNDING
-        * np.eye(others.shape[1])
-        * np.trace(others, axis1=1, axis2=2).real[:, None, None]
-    )
+    size = np.trace(others, axis1=1, axis2=2).real[:, None, None]
+    others = others + _ROUNDING * size * np.eye(others.shape[1])
     return first - crossed @ np.linalg.solve(others, adjoint(crossed))
 
 
