@@ -33,7 +33,6 @@ from ._estimators import (
     Remark,
     Response,
     Welch,
-    Where,
 )
 from ._fourier_sums import coefficients
 from ._frequency_response import Estimate, FrequencyResponse
@@ -81,7 +80,8 @@ def remarks_on_feedback(
     for (o, output), (i, source) in itertools.product(enumerate(outputs), enumerate(inputs)):
         pair, place = (output, source), (slice(None), o, i)
         direct, finite = estimate.direct_coherence[place], np.isfinite(estimate.response[place])
-        dominated = dominated_by_feedback(direct, estimate.coherence[place])
+        # Coherent, although the reference explains neither.
+        dominated = (direct >= COHERENT) & (estimate.coherence[place] < COHERENT)
         if method == "joint" and 2 * np.sum(dominated) > np.sum(direct >= COHERENT):
             text = (
                 "feedback-dominated: input and output are coherent at "
@@ -129,11 +129,6 @@ def remarks_on_feedback(
             text = _FED_BACK.format(share=power, where="{where}")
             remarks.append(Remark(text, used, pair, DOMINATED))
     return tuple(dict.fromkeys(remarks))
-
-
-def dominated_by_feedback(direct: Grid, by_reference: Grid) -> Where:
-    """Where input and output are coherent although the reference explains neither."""
-    return (direct >= COHERENT) & (by_reference < COHERENT)
 
 
 class PhaseSlope(NamedTuple):

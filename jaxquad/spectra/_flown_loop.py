@@ -288,7 +288,8 @@ def estimate_step(
             )
         )
     names = reference or record.reference_names[0], output or record.output_names[0]
-    length, dt = default_length(record) if length is None else float(length), record.dt
+    usual = min(_LONGEST, 2 * record.duration / ((_WINDOWS + 1) * _LENGTHS))
+    length, dt = usual if length is None else float(length), record.dt
     size = int(round(_LENGTHS * length / dt))
     if size < 32 or size > record.samples:
         raise ValueError(
@@ -333,11 +334,6 @@ def estimate_step(
     model = (steps[2], scatter[1]) if simulated is not None else (None, None)
     fields = time, steps[1], scatter[0], windows, steps[0], len(source), names
     return StepResponse(*fields, *model)
-
-
-def default_length(record: Record) -> float:
-    """Length in s of the response that `estimate_step` looks for."""
-    return min(_LONGEST, 2 * record.duration / ((_WINDOWS + 1) * _LENGTHS))
 
 
 def _windows(values: Samples, size: int) -> Float[np.ndarray, "windows size"]:

@@ -7,7 +7,6 @@ from scipy import signal
 from jaxquad.records import read, Record, RecordWarning
 from jaxquad.spectra import DOMINATED, frequency_response, JointInputOutput, Welch
 from jaxquad.spectra._feedback import (
-    dominated_by_feedback,
     lagged_products,
     phase_slope,
     share_from_output,
@@ -86,12 +85,6 @@ def test_a_reference_that_explains_neither_is_remarked():
     estimator = JointInputOutput(WELCH)
     found = frequency_response(closed_loop(0, sweep=0.1), OMEGA, estimator=estimator)
     assert any(remark.kind == DOMINATED for remark in found.remarks)
-
-
-def test_feedback_dominates_where_only_input_and_output_are_coherent():
-    direct, by_reference = np.array([0.9, 0.9, 0.3, 0.3]), np.array([0.9, 0.1, 0.9, 0.1])
-    found = dominated_by_feedback(direct, by_reference)
-    assert found.tolist() == [False, True, False, False]
 
 
 def tilted(delay, *, scatter=0.05, coherence=0.9):
