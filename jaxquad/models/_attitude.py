@@ -176,9 +176,13 @@ class Attitude(eqx.Module):
         return -align(self.stiffness, euler) * euler
 
 
-def _per_axis(x: ArrayLike | Sequence | None) -> Array | None:
-    x = as_float_or_none(x)
-    return x if x is None or x.ndim else as_float(on_host(x)[None])
+def _per_axis(x: ArrayLike | Sequence) -> Array:
+    x = as_float(x)
+    return x if x.ndim else as_float(on_host(x)[None])
+
+
+def _per_axis_or_none(x: ArrayLike | Sequence | None) -> Array | None:
+    return None if x is None else _per_axis(x)
 
 
 class LinearAxis(eqx.Module):
@@ -230,10 +234,10 @@ class DecoupledAxes(eqx.Module):
 
     torque_gain: Axes = per_member(rank=1, converter=_per_axis)
     inertia: Axes = per_member(rank=1, converter=_per_axis)
-    lag: Axes | None = per_member(rank=1, converter=_per_axis, default=None)
+    lag: Axes | None = per_member(rank=1, converter=_per_axis_or_none, default=None)
     damping: Axes = per_member(rank=1, converter=_per_axis, default=0.0)
     stiffness: Axes = per_member(rank=1, converter=_per_axis, default=0.0)
-    coulomb: Axes | None = per_member(rank=1, converter=_per_axis, default=None)
+    coulomb: Axes | None = per_member(rank=1, converter=_per_axis_or_none, default=None)
 
     def __check_init__(self):
         _ = self.shape
