@@ -209,19 +209,12 @@ class ProbeTones(eqx.Module):
         return broadcast_gain(amplitude, like)
 
 
-class LockInSolution(NamedTuple):
-    inertia: Signal  # kg m^2
-    variance: Signal  # (kg m^2)^2
-    stiffness: Signal  # N m/rad
-    informed: Signal  # 1 where enough tones stand out
-
-
 def solve(
     acceleration: Float[Array, " parts tones places axes *ensemble"],
     torque: Float[Array, " parts tones places axes *ensemble"],
     square: Float[Array, " tones *ones"], *, contrast: float, stiff: bool,
-) -> LockInSolution:  # fmt: skip
-    """Inertia from the correlations of torque and acceleration with each tone.
+) -> tuple[LastEstimate, Signal]:  # fmt: skip
+    """Inertia, and stiffness in N m/rad, from the correlations of both sides with each tone.
 
     The parts are a tone's cosine and sine; the places a frequency below it, its own, one above.
     At a tone torque / acceleration = J - k / w^2 + j (damping, lag), with w^2 the `square`: the
@@ -250,10 +243,9 @@ def solve(
     some = total > 0
     variance = jnp.where(some, 1 / jnp.where(some, total, 1), 0)
     inertia = jnp.sum(weight * ratio, axis=0) * variance
+    none = jnp.zeros_like(inertia)
     if not stiff:
-        return LockInSolution(
-            inertia, variance, jnp.zeros_like(inertia), some.astype(inertia.dtype)
-        )
+        return LastEstimate(inertia, variance, none, some.astype(inertia.dtype)), none
     # Weighted least squares of the ratios on 1 and -1/w^2.
     away = -1 / square - jnp.sum(weight / -square, axis=0)[None] * variance[None]
     spread = jnp.sum(weight * away**2, axis=0)
@@ -262,7 +254,7 @@ def solve(
     stiffness = jnp.sum(weight * away * ratio, axis=0) * inverse
     centre = jnp.sum(weight / -square, axis=0) * variance
     inertia, variance = inertia - centre * stiffness, variance + centre**2 * inverse
-    return LockInSolution(inertia, variance, stiffness, some.astype(stiffness.dtype))
+    return LastEstimate(inertia, variance, none, some.astype(stiffness.dtype)), stiffness
 
 
 BESIDE = 2  # periods per window: the nearest that a Hann window separates from the tone
@@ -426,13 +418,12 @@ class LockInInertia(AbstractInertia):
         # w^2 in (rad/s)^2, as the second difference of a sampled sine shows it.
         square = (2 / self.dt * np.sin(np.pi * self.periods / self.samples)) ** 2
         square = jnp.asarray(square, valid.dtype).reshape((-1,) + (1,) * valid.ndim)
-        solved = solve(
+        new = solve(
             done[:, :, :, 0], done[:, :, :, 1], square,
             contrast=self.contrast, stiff=bool(self.nuisance),
         )  # fmt: skip
-        new = LastEstimate(solved.inertia, solved.variance, jnp.zeros_like(valid), solved.informed)
-        renew = ft.partial(jnp.where, (valid > 0) & (solved.informed > 0))
-        return jax.tree.map(renew, (new, solved.stiffness), (last, stiffness))
+        renew = ft.partial(jnp.where, (valid > 0) & (new[0].informed > 0))
+        return jax.tree.map(renew, new, (last, stiffness))
 
     def stiffness(self, state: LockInState) -> Signal:
         """In N m/rad beside the inertia; 0 unless the nuisance is "angle"."""

@@ -234,9 +234,7 @@ Matrices = Float[Array, "... states states"]
 
 
 class _ZeroOrderHold(eqx.Module):
-    @property
-    def fastest(self) -> float:
-        return math.pi
+    fastest = math.pi
 
     def correction(self, wo: Gain, dt: float, order: int) -> Rows:
         off = _off_unity(wo, dt)
@@ -261,9 +259,7 @@ class CurrentObserver(_ZeroOrderHold):
     active disturbance rejection control" (2013) and arXiv 1908.04610.
     """
 
-    @property
-    def current(self) -> bool:
-        return True
+    current = True
 
     def gains(self, wo: Gain, dt: float, order: int) -> Rows:
         """l of z[k] = (I - l C) (Ad z[k-1] + Bd b0 u[k-1]) + l y[k]; `wo` in rad/s."""
@@ -276,9 +272,7 @@ class PredictiveObserver(_ZeroOrderHold):
     All poles at exp(-wo dt), exactly. Source: docs/control.md.
     """
 
-    @property
-    def current(self) -> bool:
-        return False
+    current = False
 
     def gains(self, wo: Gain, dt: float, order: int) -> Rows:
         """l of z[k+1] = (Ad - l C) z[k] + Bd b0 u[k] + l y[k], that is, Ad times the current."""
@@ -295,13 +289,8 @@ class EulerObserver(eqx.Module):
     sampling (docs/control.md).
     """
 
-    @property
-    def current(self) -> bool:
-        return False
-
-    @property
-    def fastest(self) -> float:
-        return 2.0  # the observer alone diverges beyond it
+    current = False
+    fastest = 2.0  # the observer alone diverges beyond it
 
     def gains(self, wo: Gain, dt: float, order: int) -> Rows:
         """dt times the continuous gains [3 wo, 3 wo^2, wo^3], or [2 wo, wo^2]."""

@@ -289,9 +289,7 @@ class Criterion(Protocol):
 class DOptimal(eqx.Module):
     """The smallest joint confidence region: log det M, over the number of parameters."""
 
-    @property
-    def exponent(self) -> float:
-        return 1.0
+    exponent = 1.0
 
     def log_information(self, information: Information, names: tuple[str, ...]) -> Share:
         return jnp.linalg.slogdet(information)[1] / len(names)
@@ -305,9 +303,7 @@ class AOptimal(eqx.Module):
 
     names: tuple[str, ...] = eqx.field(static=True, default=())
 
-    @property
-    def exponent(self) -> float:
-        return 0.5
+    exponent = 0.5
 
     def log_information(self, information: Information, names: tuple[str, ...]) -> Share:
         for name in self.names:
