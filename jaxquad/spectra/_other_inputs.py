@@ -43,12 +43,24 @@ def remarks_on_clock(records: Sequence[Record], estimate: Estimate) -> tuple[Rem
     omega = estimate.omega[np.any(usable, axis=(1, 2))]
     if omega.size < FEWEST:
         return ()
-    rate, clear = _clock_drift(records, omega)
+    parts = [part for record in records for part in _compare(record, omega[0], omega[-1])]
+    if not parts:
+        return ()
+    left, drift, power, leverage = (np.concatenate(part) for part in zip(*parts, strict=True))
+    size = np.sum(np.abs(drift) ** 2)
+    if not size > _DISTINCT * np.sum(power):
+        return ()
+    value = complex(np.sum(np.conj(drift) * left) / size)
+    rate, seconds = value.real, max(record.samples for record in records) * records[0].dt
+    # Of residuals of any variance (MacKinnon and White, 1985, HC3).
+    scores = np.real(np.conj(drift) * (left - value * drift)) / (1 - leverage)
+    clear = abs(rate) * size > _CLEAR * max(float(np.sqrt(np.sum(scores**2))), 1e-300)
     error = np.where(usable, estimate.random_error, np.inf)
     precision = np.sum((estimate.omega[:, None, None] / error) ** 2, axis=0)  # inverse variances
-    seconds = max(record.samples for record in records) * records[0].dt
     late = rate * seconds
-    if not (clear > _CLEAR and abs(rate) < _MOST and (0.5 * late) ** 2 * np.max(precision) > 1):
+    if not (clear and _OTHER * abs(value.imag) < abs(rate) < _MOST):
+        return ()
+    if not (0.5 * late) ** 2 * np.max(precision) > 1:
         return ()
     text = (
         f"the output's time stamps drift against the input's by {1e6 * rate:+.2g} ppm, "
@@ -57,23 +69,6 @@ def remarks_on_clock(records: Sequence[Record], estimate: Estimate) -> tuple[Rem
         f"one clock, or divide the output's times by {1 + rate:.7g}"
     )
     return (Remark(text, kind="clock"),)
-
-
-def _clock_drift(records: Sequence[Record], omega: Grid) -> tuple[float, float]:
-    """The rate at which the outputs' stamps gain, and how clear it is, in standard errors."""
-    parts = [part for record in records for part in _compare(record, omega[0], omega[-1])]
-    if not parts:
-        return 0.0, 0.0
-    left, drift, power, leverage = (np.concatenate(part) for part in zip(*parts, strict=True))
-    size = np.sum(np.abs(drift) ** 2)
-    if not size > _DISTINCT * np.sum(power):
-        return 0.0, 0.0
-    value = np.sum(np.conj(drift) * left) / size
-    # Of residuals of any variance (MacKinnon and White, 1985, HC3).
-    scores = np.real(np.conj(drift) * (left - value * drift)) / (1 - leverage)
-    error = max(float(np.sqrt(np.sum(scores**2)) / size), 1e-300)
-    alone = abs(value.real) > _OTHER * abs(value.imag)
-    return float(value.real), abs(float(value.real)) / error if alone else 0.0
 
 
 def _compare(record: Record, low: float, high: float) -> list[tuple[np.ndarray, ...]]:
