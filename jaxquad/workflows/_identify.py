@@ -126,7 +126,7 @@ def identify_opened(opened: OpenedLogs) -> Identification:
     bands = explanation = None
     if fit.verdict.fitted and fit.verdict.kind != "no minimum":
         bands = attempt(HALVES, fit.bands)
-        changes = any(remark.kind in ("drift", spectra.TWO_LAGS) for remark in fit.remarks)
+        changes = any(remark.kind in ("drift", "clock", spectra.TWO_LAGS) for remark in fit.remarks)
         if settings.explain and (changes or fit.chi_squared > fitting.MISFIT**2):
             explanation = attempt(EXPLAINED, fit.explain)
     if settings.reference:

@@ -85,8 +85,8 @@ class IdentifySettings(Settings):
       one length; local by default
     - `window`: length of welch's window, which it selects; a fifth of the record by default
     - `cost`: maximum likelihood, or CIFER's coherence-weighted cost, Eq. (14); ml by default
-    - `explain`: where the misfit exceeds 1.5 random errors, or the gain seems to drift, fit again
-      with one more pole, zero, pair, damping, or drift, and say which of them explains it
+    - `explain`: where the misfit exceeds 1.5 random errors, or gain or clock seem to drift, fit
+      again with one more pole, zero, pair, damping, or drift, and say which of them explains it
 
     **A second record:**
 

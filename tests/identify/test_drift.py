@@ -1,4 +1,4 @@
-"""A gain that changes while a sweep lasts."""
+"""A gain that changes, and a clock that drifts, while a sweep lasts."""
 
 import dataclasses
 
@@ -16,16 +16,18 @@ LENGTH = 60.0  # s
 TIMES = (LENGTH * np.linspace(-0.5, 0.5, OMEGA.size))[:, None]  # of a logarithmic sweep
 
 
-def swept(change, seed, times=TIMES):
-    """The response to a sweep during which the gain changes by a share."""
+def swept(change, seed, times=TIMES, late=0.0):
+    """The response to a sweep during which the gain changes by a share, and the output's stamps
+    come later by `late` (s)."""
     frf = response_of(TRUTH, error=0.01, seed=seed)
-    factor = 1 + change * times[:, :, None] / LENGTH
+    share = times[:, :, None] / LENGTH
+    factor = (1 + change * share) * np.exp(-1j * OMEGA[:, None, None] * late * share)
     response = jnp.asarray(np.asarray(frf.response) * factor)
     return dataclasses.replace(frf, response=response, swept_at=times)
 
 
-def drifts(fit):
-    return [remark for remark in fit.remarks if remark.kind == "drift"]
+def drifts(fit, kind="drift"):
+    return [remark for remark in fit.remarks if remark.kind == kind]
 
 
 def test_a_sweep_has_each_frequency_at_its_time():
@@ -56,8 +58,30 @@ def test_a_drift_of_the_gain_is_remarked_with_its_size(change):
 
 
 def test_a_steady_gain_and_a_response_without_a_sweep_are_not():
-    assert not any(drifts(jq.fit(START, swept(0.0, seed))) for seed in range(40))
+    for seed in range(40):
+        fit = jq.fit(START, swept(0.0, seed))
+        assert not drifts(fit) and not drifts(fit, "clock")
     assert not drifts(jq.fit(START, dataclasses.replace(swept(-0.15, 0), swept_at=None)))
+
+
+@pytest.mark.parametrize("late", [-0.02, 0.02])
+def test_a_clock_that_drifts_is_remarked_with_its_size(late):
+    for seed in range(5):
+        fit = jq.fit(START, swept(0.0, seed, late=late))
+        (text,) = drifts(fit, "clock")
+        shown, error = (float(text.split(x)[1].split(" ms")[0]) for x in ("drifted by ", "error "))
+        assert abs(shown - 1e3 * late) < 3.5 * error < 8 and not drifts(fit)
+
+
+@pytest.mark.slow
+def test_explain_offers_the_clock_and_the_fit_with_it_holds_the_truth():
+    for seed in range(3):
+        found = jq.fit(START, swept(0.0, seed, late=0.02)).explain()
+        assert found.candidates[0].title == "a clock that drifts", str(found)
+        errors = np.asarray(found.best.standard_errors)
+        truth = np.array([80.0, 0.06, 0.03, 0.02])
+        assert np.all(np.abs(np.asarray(found.best.values) - truth) < 3.5 * errors)
+        assert errors[3] < 0.003
 
 
 @pytest.mark.slow

@@ -219,3 +219,19 @@ def test_exact_data_end_a_fit_without_a_remark():
         )
         fit = jq.fit(start, response_of(truth, omega=np.geomspace(0.5, 200.0, 60)))
         assert fit.cost < 1e-15 and fit.identifiable and not fit.remarks
+
+
+def test_what_noise_makes_of_a_response_beyond_its_excitation_is_left_out():
+    truth, start = jq.LaggedIntegrator(80.0, 0.06, 0.03), jq.LaggedIntegrator(60.0, 0.04, 0.04)
+    clean = response_of(truth, seed=0)
+
+    def with_last(size: float, error: float) -> jq.identify.Fit:
+        response, errors = np.array(clean.response), np.array(clean.random_error)
+        response[-1] *= size
+        errors[-1] = error
+        changed = {"response": jnp.asarray(response), "random_error": jnp.asarray(errors)}
+        return jq.fit(start, dataclasses.replace(clean, **changed))
+
+    inside = jq.fit(start, clean, band=(OMEGA[0], OMEGA[-2]))
+    np.testing.assert_array_equal(with_last(300.0, 0.6).values, inside.values)
+    assert np.any(with_last(0.5, 0.4).values != inside.values)  # low by chance

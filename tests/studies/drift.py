@@ -7,7 +7,8 @@ without feedback or under a controller. Then the outputs' stamps gain some ppm, 
 8 or 15 % over the record, or the motor has .02 s up and .05 s down. One table, no file; seeds from
 0. Of a gain that changes, `at best` is the share that the most powerful test of the same chance
 finds, which knows the plant and the noise up to small changes (Cramer-Rao bound); and the last
-columns are coverage by the fit with a drift as a term, by `Fit.explain`, of the first draws.
+columns are coverage by the fit with the drift, of the gain or of the clock, as a term, by
+`Fit.explain`, of the first draws.
 """
 
 import argparse
@@ -50,6 +51,8 @@ SETTINGS = [
     Setting("clock -50 ppm, PID", ppm=-50, controller="PID"),
     Setting("clock 50 ppm, PID, command of 50 steps", ppm=50, controller="PID", quantum=0.02),
     Setting("clock 50 ppm, open loop", ppm=50, controller="none", noise=0.5),
+    Setting("clock 200 ppm, open loop", ppm=200, controller="none", noise=0.5),
+    Setting("clock 50 ppm, open loop, quiet", ppm=50, controller="none", noise=0.1),
     Setting("healthy, P, calm", gust=0.02),
     Setting("gain -15 %, P", fall=0.15),
     Setting("gain -15 %, P, calm", fall=0.15, gust=0.02),
@@ -129,8 +132,9 @@ def power_at_best(setting: Setting, time: np.ndarray, u: np.ndarray) -> float:
     return float(norm.cdf(abs(setting.fall) / error - norm.isf(chance)))
 
 
-def covers(fit: jq.identify.Fit, prefix: str = "") -> list[bool]:
-    ends = [(fit.interval(f"{prefix}{name}"), value) for name, value in TRUE.items()]
+def covers(fit: jq.identify.Fit, prefix: str = "", late: float = 0.0) -> list[bool]:
+    truth = TRUE | {"delay": TRUE["delay"] + late}
+    ends = [(fit.interval(f"{prefix}{name}"), value) for name, value in truth.items()]
     return [low <= value <= high for (low, high), value in ends]
 
 
@@ -153,9 +157,11 @@ def main() -> None:
             clock, every = clock + ("clock" in kinds), every + bool(kinds)
             drift += "drift" in kinds
             inside.append(covers(fit))
-            if setting.fall and len(inside) <= EXPLAINED:
-                [term] = [x for x in fit.explain().candidates if x.title == "a gain that drifts"]
-                with_term.append(covers(term.fit, "model."))
+            if (setting.fall or setting.ppm) and len(inside) <= EXPLAINED:
+                title = f"a {'gain' if setting.fall else 'clock'} that drifts"
+                terms = [x for x in fit.explain().candidates if x.title == title]
+                late = 1e-6 * setting.ppm * time[-1] / 2  # the term is 0 at mid-record
+                with_term += [covers(term.fit, "model.", late) for term in terms]
         percent = lambda values: f"{100 * np.mean(values):.0f}"
         line = [setting.name, " ".join(percent(x / draws) for x in (clock, drift, every))]
         line.append(percent(power_at_best(setting, time, inputs[0])) if setting.fall else "-")

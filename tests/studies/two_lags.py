@@ -90,6 +90,7 @@ SETTINGS = [
     DAMPED._replace(name="damped rate, u^2 of 20 %", bend=-0.2),
     Setting("rate, P, 5 steps", steps=5),
     Setting("rate, P, 8 steps", steps=8),
+    Setting("rate, P, 5 steps, quiet", steps=5, noise=0.01, gust=0.02),
     DAMPED._replace(name="damped rate, open, 5 steps", steps=5, noise=0.05),
     DAMPED._replace(name="damped rate, open, 4.7 steps", steps=4.7, noise=0.05),
     DAMPED._replace(name="damped rate, open, 8 steps", steps=8, noise=0.05),

@@ -166,7 +166,8 @@ def usable(frf: FrequencyResponse, band: Band, least: float) -> Mask:
     """Which points of a response a fit uses, with `band` as in `jq.fit`.
 
     Those within the band of their pair whose coherence, averaged over a third of an octave, is at
-    `least` this, and whose random error, averaged likewise, is below 30 %.
+    `least` this, and whose random error, averaged likewise, is below 30 %. Not those whose error
+    exceeds the response as sharper neighbours show it, as beyond the end of an excitation.
     """
     omega, error = np.asarray(frf.omega), np.asarray(frf.random_error)
     kernel = _third_of_an_octave(omega.tobytes())
@@ -174,6 +175,11 @@ def usable(frf: FrequencyResponse, band: Band, least: float) -> Mask:
     finite = np.isfinite(np.asarray(frf.response)) & np.isfinite(error)
     coherent = mean(np.asarray(frf.coherence)) >= least
     sharp = mean(np.fmin(error, 1.0)) <= _LARGEST
+    weights = np.where(finite, np.maximum(np.where(finite, error, 1.0), 1e-3) ** -2.0, 0.0)
+    size = np.log(np.maximum(np.abs(np.where(finite, np.asarray(frf.response), 1.0)), 1e-300))
+    around = mean(weights * size) / np.maximum(mean(weights), 1e-300)
+    usual = np.log(np.fmax(error, 1e-300)) + size <= around
+    chosen = finite & coherent & sharp & usual
 
     def within(limits: Range | None) -> np.ndarray:  # annotations of shapes take time at each call
         low, high = limits or (0.0, np.inf)
@@ -186,7 +192,7 @@ def usable(frf: FrequencyResponse, band: Band, least: float) -> Mask:
         return inside
 
     if not isinstance(band, Mapping):
-        return finite & coherent & sharp & within(band)[:, None, None]
+        return chosen & within(band)[:, None, None]
     inside, names = np.ones(error.shape, dtype=bool), (frf.output_names, frf.input_names)
     pairs = list(itertools.product(*names))
     for pair, limits in band.items():
@@ -196,7 +202,7 @@ def usable(frf: FrequencyResponse, band: Band, least: float) -> Mask:
             )
         o, i = (side.index(name) for side, name in zip(names, pair, strict=True))
         inside[:, o, i] = limits is not None and within(limits)
-    return finite & coherent & sharp & inside
+    return chosen & inside
 
 
 @ft.lru_cache(maxsize=16)

@@ -213,12 +213,12 @@ def fit_bands(fit: PyTree) -> Bands:
 
 
 class _Term(NamedTuple):
-    """A factor of the response, by s or by when a sweep has it; `starts` are by the band's edges
-    and middle (rad/s)."""
+    """A factor of the response, by s, and of what drifts by when a sweep has s; `starts` are by the
+    band's edges and middle (rad/s)."""
 
     title: str
     formula: str
-    factor: Callable[[Array, Float[Array, " extra"]], Array]
+    factor: Callable[..., Array]
     names: tuple[str, ...]
     starts: Callable[[float, float, float], list[list[float]]]
 
@@ -261,13 +261,20 @@ _TERMS = (
 )  # fmt: skip
 _DRIFT = _Term(
     "a gain that drifts", "1 + change t / T (t from mid-record, T the length of the sweep)",
-    lambda time, x: 1 + x[0] * time, ("change",), lambda low, mid, high: [[-0.01]],
+    lambda s, x, time: 1 + x[0] * time, ("change",), lambda low, mid, high: [[-0.01]],
 )  # fmt: skip
+_CLOCK = _Term(
+    "a clock that drifts", "e^(-late s t / T) (t from mid-record, T the length of the sweep)",
+    lambda s, x, time: jnp.exp(-x[0] * s[:, None] * time), ("late",),
+    lambda low, mid, high: [[0.01 / high]],
+)  # fmt: skip
+_REAL = ("T", "change", "late")  # of either sign
+_OF_SWEEPS = (_DRIFT, _CLOCK)
 
 
 class Extended(eqx.Module):
-    """A model whose responses are all multiplied by one further factor. A gain that drifts has it
-    in the response to a sweep alone (`swept`: omega, and when each input has it)."""
+    """A model whose responses are all multiplied by one further factor. What drifts has it in the
+    response to a sweep alone (`swept`: omega, and when each input has it)."""
 
     model: PyTree
     extra: Float[Array, " extra"]
@@ -277,15 +284,16 @@ class Extended(eqx.Module):
     def frequency_response(self, omega: Float[Array, " f"]) -> Complex[Array, "f ..."]:
         """Of the model, times the factor."""
         response = self.model.frequency_response(omega)
-        if self.term is _DRIFT:
+        s = jax.lax.complex(jnp.zeros_like(omega), omega)
+        extra = self.extra.astype(s.dtype)
+        if self.term in _OF_SWEEPS:
             if self.swept is None:
                 return response
             time = ft.partial(jnp.interp, jnp.abs(omega), self.swept[0])
             times = jax.vmap(time, in_axes=1, out_axes=1)(self.swept[1])
-            factor = self.term.factor(times, self.extra).astype(response.dtype)
+            factor = self.term.factor(s, extra, times.astype(s.dtype))
             return response * jnp.expand_dims(factor, range(1, response.ndim - 1))
-        s = jax.lax.complex(jnp.zeros_like(omega), omega)
-        factor = self.term.factor(s, self.extra.astype(s.dtype))
+        factor = self.term.factor(s, extra)
         return response * factor.reshape(-1, *(1,) * (response.ndim - 1))
 
 
@@ -391,15 +399,16 @@ def explain_misfit(fit: PyTree) -> Explanation:
     model, middle = model_to_start_from(fit), float(np.sqrt(low * high))
     plain = origin.fit_again(model, _options(fit, origin, None), 0) or fit
     tried = []
-    for term in (*_TERMS, *([_DRIFT] if _sweeps(origin) else [])):
+    for term in (*_TERMS, *(_OF_SWEEPS if _sweeps(origin) else ())):
         options, fits = _options(fit, origin, term), []
         for start in term.starts(low, middle, high):
-            other = origin.fit_again(Extended(model, jnp.asarray(start), term), options, 0)
+            with np.errstate(all="ignore"):  # of a term that runs away, dropped below
+                other = origin.fit_again(Extended(model, jnp.asarray(start), term), options, 0)
             if other is None or not np.isfinite(other.cost):
                 continue
             # A frequency far from the band makes the term a gain, or nothing.
             place = float(np.asarray(other.model.extra)[0])
-            if term.names[0] in ("T", "change") or low / _FAR < place < high * _FAR:
+            if term.names[0] in _REAL or low / _FAR < place < high * _FAR:
                 fits.append(other)
         tried.append((term, min(fits, key=lambda other: other.cost, default=None)))
     # A misfit that is left in all of them counts as noise here. The refit may end in a poorer
@@ -440,7 +449,7 @@ def _options(fit: PyTree, origin: Origin, term: _Term | None) -> Options:
     options = options._replace(cost=MaximumLikelihood(), starts=1, free=free)
     if term is None:
         return options
-    sizes = {"T": 1 / origin.band[1], "change": 1.0}
+    sizes = dict(zip(_REAL, (1 / origin.band[1], 1.0, 1 / origin.band[1]), strict=True))
     extra = [
         Real(f"extra[{k}]", sizes[name]) if name in sizes else Positive(f"extra[{k}]")
         for k, name in enumerate(term.names)
@@ -450,7 +459,7 @@ def _options(fit: PyTree, origin: Origin, term: _Term | None) -> Options:
         tied = {f"model.{name}": ft.partial(_of_model, tie) for name, tie in tied.items()}
     if conditions is not None:
         conditions = [c if c is None else ft.partial(_change_model, c) for c in conditions]
-    if term is _DRIFT:
+    if term in _OF_SWEEPS:
         changes = require_conditions(fit.model, conditions, len(origin.frfs))
         conditions = list(map(_During, changes, _sweeps(origin) or []))
     for prior in options.priors:

@@ -307,9 +307,9 @@ class Fit:
         """Which further term the responses want, where the model does not explain them.
 
         The model is fitted again with one more pole or zero, a pair of them, rate damping, the slow
-        pair of a hovering vehicle, or, of a sweep, a gain that drifts with time; the lowest
-        information criterion (BIC) decides. Where a remark says that the actuator has two lags, all
-        this is behind such an actuator.
+        pair of a hovering vehicle, or, of a sweep, a gain or a clock that drifts with time; the
+        lowest information criterion (BIC) decides. Where a remark says that the actuator has two
+        lags, all this is behind such an actuator.
 
         **Raises:** ValueError where the fit is not one of `jq.fit`.
         """

@@ -197,8 +197,8 @@ def assess(
                 f"does not explain the whole response{minimum if ratio > _POOR else ''}",
             )
         drift = None if stopped or near else find_drift(alone)
-        if drift and drift.is_clear(misfit):
-            remark("drift", str(drift))
+        if drift and drift.is_clear(misfit) and all(one.kind != drift.kind for one in remarks):
+            remark(drift.kind, str(drift))
         # Parameters at zero that the data want to have the other sign, by random errors.
         unbounded, steps = without_bounds(budget.by_noise, budget, zeros)
         pulls = {k: -x / float(np.sqrt(max(unbounded[k, k], 1e-300))) for k, x in steps.items()}
@@ -307,9 +307,10 @@ def runaways(problem: Problem, solution: Solution, verdict: Verdict) -> list[Mes
         for k in solution.at_zero
         if names[k] in lost
     ]
-    for k in np.flatnonzero(np.asarray(solution.z) - start > 2 * _FAR):
-        if problem.parameters.logarithmic[k] and names[k] in lost:
-            texts.append(f"{names[k]} ran to infinity: «start from other values», or leave it out")
+    rose = np.flatnonzero(np.asarray(solution.z) - start > _FAR)
+    if far := [names[k] for k in rose if problem.parameters.logarithmic[k] and names[k] in lost]:
+        other = "«start from other values», or fit a simpler model"
+        texts.append(f"{', '.join(far)} ran to infinity: {other}")
     return [Message(text, "runaway") for text in texts]
 
 

@@ -9,8 +9,9 @@ its own (`log_noise_covariance`). The least probability of all windows, times th
 that of a false alarm (Bonferroni).
 Source: Glaz, Naus & Wallenstein (2001), Scan Statistics.
 
-A sweep has each frequency at one time, so a gain that drifts with time does so along frequency. Its
-score test is the next step of the fit with such a drift as one more parameter.
+A sweep has each frequency at one time, so what drifts with time does so along frequency: a gain, or
+the clock of the output, whose stamps come later and later. Its score test is the next step of the
+fit with such a drift as one more parameter.
 Source: Rao (1948), Large sample tests of statistical hypotheses.
 """
 
@@ -27,6 +28,7 @@ from ..frequency_domain._cost import mix, Points
 from ._error_budget import ErrorBudget, PriorRows, scaled_inverse, SHARES
 
 
+DRIFT, CLOCK = "drift", "clock"  # kinds of remarks
 MISFIT = 1.5  # ratio of misfit to random error from which the model's structure is in doubt
 DOUBT = 0.05  # probability that the model is right, below which a misfit is remarked
 _CHANCE = 0.002  # of a local misfit somewhere, where the model is right
@@ -35,8 +37,8 @@ _MOST = 0.5  # share of the misfit beyond the noise
 _FEWEST = 2.0  # degrees of freedom of a window
 _PLACES, _DAMPINGS = 24, (0.1, 0.2, 0.4)  # of the resonances that are tried
 _OUTSIDE = 1.3  # times the window's ends: resonances up to there show within it
-_DISTINCT = 1e-8  # share of a resonance, or of a drift, that the parameters do not take up
-_FALLS, _RISES = 0.004, 0.0005  # chance of a remark on a steady gain: batteries fall
+_DISTINCT = 1e-8  # share of a resonance that the parameters do not take up
+_FALLS, _RISES = 0.004, 0.0005  # chance of a remark on what is steady: batteries fall
 _LOOKED_AT = 2.0  # standard errors of a drift from which its covariance is computed
 _EXPLAINED = 0.2  # of a large misfit, which a drift may leave
 
@@ -169,32 +171,51 @@ def with_resonance(budget: ErrorBudget, local: LocalMisfit | None) -> ErrorBudge
 
 
 class Drift(NamedTuple):
-    """A change of the gain while a sweep lasts, as the residual shows it."""
+    """What changes while a sweep lasts, as the residual shows it: the gain, relative, or by how
+    much the output's stamps are late, in s."""
 
-    change: float  # of the gain, relative
+    kind: str  # of the remark
+    change: float
     standard_error: float
     seconds: float  # that the sweep lasts
-    chance: float  # of as much where the gain is steady, on this side
+    chance: float  # of as much where nothing changes, on this side
     misfit_ratio: float  # with it
 
     def is_clear(self, misfit: float) -> bool:
         """Whether it is beyond chance and explains the fit's `misfit`."""
-        clear = self.chance < (_FALLS if self.change < 0 else _RISES)
+        falls = self.kind == DRIFT and self.change < 0
+        clear = self.chance < (_FALLS if falls else _RISES)
         return clear and self.misfit_ratio < max(MISFIT**2, _EXPLAINED * misfit)
 
     def __str__(self) -> str:
+        number, error = self.change, self.standard_error
+        if self.kind == DRIFT:
+            what = f"gain changed by {100 * number:+.2g} % (standard error {100 * error:.2g} %)"
+            remedy = "Sweep in both directions, or with a full battery"
+        else:
+            rate = 1e6 * number / self.seconds
+            what = (
+                f"output's time stamps drifted by {1e3 * number:+.2g} ms (standard error "
+                f"{1e3 * error:.2g} ms; {rate:+.2g} ppm)"
+            )
+            remedy = "Stamp input and output by one clock, or sweep in both directions"
         return (
-            "the misfit changes along the sweep, as if the gain changed by "
-            f"{100 * self.change:+.2g} % (standard error {100 * self.standard_error:.2g} %) in "
-            f"{self.seconds:.3g} s, which the intervals do not include; or the model lacks a term "
-            "(«Fit.explain()» tries both). Sweep in both directions, or with a full battery"
+            f"the misfit changes along the sweep, as if the {what} in {self.seconds:.3g} s, which "
+            "the intervals do not include; or the model lacks a term («Fit.explain()» tries "
+            f"both). {remedy}"
         )
 
 
 def find_drift(budget: ErrorBudget) -> Drift | None:
-    """The drift of the gain that the residual of sweeps shows; None of other excitation."""
+    """The clearest drift that the residual of sweeps shows; None of other excitation."""
     if any(record.frf.swept_at is None for record in budget.records):
         return None
+    drifts = [_score_drift(budget, kind) for kind in (DRIFT, CLOCK)]
+    return min(filter(None, drifts), key=lambda drift: drift.chance, default=None)
+
+
+def _score_drift(budget: ErrorBudget, kind: str) -> Drift | None:
+    """The next step of the fit with one kind of drift; None where it is within the noise."""
     from scipy.special import stdtr
 
     records, count, times = [], budget.count, []
@@ -202,7 +223,11 @@ def find_drift(budget: ErrorBudget) -> Drift | None:
         time = np.asarray(record.frf.swept_at)[:, None, :]
         times.append(time[np.any(record.used, axis=1, keepdims=True) & np.isfinite(time)])
         column = np.zeros((*record.misfit.shape, 1))
-        column[..., 0, 0] = np.where(record.used, time, 0.0)
+        if kind == DRIFT:
+            column[..., 0, 0] = np.where(record.used, time, 0.0)
+        else:
+            turn = -np.asarray(record.frf.omega)[:, None, None] * time
+            column[..., 1, 0] = np.where(record.used, turn, 0.0)
         slopes = np.concatenate([record.slopes[..., :count], column], axis=-1)
         records.append(dataclasses.replace(record, slopes=slopes, count=count + 1))
     priors = np.pad(budget.prior.slopes[:, :count], ((0, 0), (0, 1)))
@@ -216,4 +241,4 @@ def find_drift(budget: ErrorBudget) -> Drift | None:
     left = more.data_cost - float(more.gradient @ step)
     ratio = left / max(more.noise.cost - more.fitted_noise, 1e-300)
     seconds = max(float(np.ptp(time)) for time in times)
-    return Drift(-float(step[-1]) * seconds, error * seconds, seconds, chance, ratio)
+    return Drift(kind, -float(step[-1]) * seconds, error * seconds, seconds, chance, ratio)
