@@ -419,3 +419,13 @@ def test_a_limit_that_rounding_hides_is_infinite_and_a_model_without_numbers_no_
     for far in (700.0, 800.0, np.inf):
         z = np.where(np.arange(2) == k, far, solution.z)
         assert not np.isfinite(polish(problem, z, [k], solution)[1].cost)
+
+
+def test_a_pole_that_runs_away_is_named_with_all_that_goes_with_it():
+    names = ("numerator[0]", "denominator[1]", "denominator[2]")
+    truth = jq.TransferFunction([30.0], [1.0, 3.0], delay=0.01)
+    start = jq.TransferFunction([900.0], [1.0, 40.0, 90.0], delay=0.01)
+    fit = jq.fit(start, response_of(truth, seed=0), free=names)
+    assert fit.verdict.undetermined == names
+    (ran,) = [remark for remark in fit.remarks if remark.kind == "runaway"]
+    assert ran.startswith(", ".join(names))
