@@ -99,7 +99,6 @@ from ._rate_loops import (
     RateLoops as RateLoops,
 )
 from ._replay import (
-    FlownController as FlownController,
     hold_response as hold_response,
     predict_loop as predict_loop,
     replay_terms as replay_terms,

@@ -20,7 +20,7 @@ from jaxquad.spectra import frequency_response, JointInputOutput, LocalPolynomia
 
 from ._flight_channels import FlightChannels, FlownAutopilot, IdentifiedPlant
 from ._law import FlownLoop, pick_axis
-from ._replay import fly_again, HeldPlant, replay_terms
+from ._replay import fly_again, replay_terms
 
 
 Samples = Float[np.ndarray, " samples"]
@@ -327,12 +327,10 @@ def check_loop(plant: IdentifiedPlant, flown: FlownAutopilot) -> LoopCheck:
     law = check_law(flown.loop, flown.axis, flight)
     forward, injected = flight.terms.get("F"), flight.injected
     added = flight.not_carried if injected is None else injected
-    values = {name: float(np.asarray(value)) for name, value in vars(plant.fit.model).items()}
     per_radian = np.pi / 180 if plant.records[0].output_units[0] == "deg/s" else 1.0
-    gain, damping = per_radian * values["gain"], values.get("damping", 0.0)
+    model = dataclasses.replace(plant.fit.model, gain=per_radian * plant.fit.model.gain)
     again = fly_again(
-        pick_axis(flown.loop, flown.axis),
-        HeldPlant(gain, values["lag"], values["delay"], damping), flight.setpoint, flight.followed,
+        pick_axis(flown.loop, flown.axis), model, flight.setpoint, flight.followed,
         dt=flight.dt, late=law.late, feed_forward=forward, injected=added,
     )  # fmt: skip
     drive, count = flight.setpoint if injected is None else injected, len(again)

@@ -6,7 +6,7 @@ its replay. Source: docs/autopilots.md, "Which gains flew".
 
 import dataclasses
 from collections.abc import Callable, Sequence
-from typing import Literal, NamedTuple, Protocol, runtime_checkable
+from typing import Literal, NamedTuple
 
 import equinox as eqx
 import jax
@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, PyTree
 
 from jaxquad._core import plain_content
-from jaxquad.control import LinearController, Setpoint
+from jaxquad.control import LinearController, LinearisableController, Setpoint
 from jaxquad.identify import (
     as_sampled,
     filter_response,
@@ -25,6 +25,7 @@ from jaxquad.identify import (
     model_response,
     usable,
 )
+from jaxquad.models import LaggedIntegrator
 from jaxquad.records import Record, select
 from jaxquad.spectra import frequency_response, FrequencyResponse, LocalPolynomial
 
@@ -34,15 +35,6 @@ from ._law import FlownLoop, linear_responses
 Samples = Float[Array | np.ndarray, "samples axes"]
 Series = Float[Array | np.ndarray, " samples"]
 _BLOCK = 1 << 15  # samples of the loop: programs of other lengths would be compiled anew
-
-
-class HeldPlant(NamedTuple):
-    """K e^(-delay s) / ((s + damping) (lag s + 1)), from a held command to the rate in rad/s."""
-
-    gain: float  # rad/s^2 per unit of the command
-    lag: float  # s
-    delay: float = 0.0  # s
-    damping: float = 0.0  # 1/s
 
 
 class _Row(NamedTuple):
@@ -99,12 +91,13 @@ def replay_terms(
 
 
 def fly_again(
-    flown: FlownLoop, plant: HeldPlant, setpoint: Series, throttle: Series, *, dt: float,
+    flown: FlownLoop, plant: LaggedIntegrator, setpoint: Series, throttle: Series, *, dt: float,
     feed_forward: Series | None = None, injected: Series | None = None, late: float = 0.0,
 ) -> Float[np.ndarray, " samples"]:  # fmt: skip
     """The rate before the gyro's filters that law and plant make of a logged set-point, in rad/s.
 
-    The closed loop in time, undisturbed; `injected` is added to the command behind the law.
+    The closed loop in time, undisturbed; `injected` is added to the command behind the law, and
+    `plant` is from the held command to the rate in rad/s.
     """
     from scipy.linalg import expm
 
@@ -114,15 +107,16 @@ def fly_again(
     forward = None if feed_forward is None else column(feed_forward)
     rows = grid.rows(column(setpoint), throttle, late, forward, grid.fine(column(added), late))
     # Torque and rate over a sample, exactly: by the state, the command before and the one now.
-    lag, late_part = max(plant.lag, 1e-3 * dt_loop), plant.delay % dt_loop
+    gain, lag, delay, damping = map(float, (plant.gain, plant.lag, plant.delay, plant.damping))
+    lag, late_part = max(lag, 1e-3 * dt_loop), delay % dt_loop
     generator = np.zeros((3, 3))
-    generator[0, 0], generator[0, 2] = -1 / lag, plant.gain / lag
-    generator[1, 0], generator[1, 1] = 1.0, -plant.damping
+    generator[0, 0], generator[0, 2] = -1 / lag, gain / lag
+    generator[1, 0], generator[1, 1] = 1.0, -damping
     over = lambda span: expm(span * generator)
     rest = over(dt_loop - late_part)
     before = rest[:2, :2] @ over(late_part)[:2, 2]
     step = over(dt_loop)[:2, :2], before, rest[:2, 2]
-    wait = max(int(np.floor(plant.delay / dt_loop + 1e-9)), 0)
+    wait = max(int(np.floor(delay / dt_loop + 1e-9)), 0)
     return grid.coarse(np.asarray(_flown_again(flown, step, wait, rows))[:, 0])
 
 
@@ -238,15 +232,6 @@ Frequencies = Float[np.ndarray, " frequencies"]
 Response = Complex[np.ndarray, " frequencies"]
 
 
-@runtime_checkable
-class FlownController(Protocol):
-    """A controller with a linear form, as those of `jq.autopilot` are."""
-
-    def linear(self, axis: int = 0) -> LinearController:
-        """One axis, for small signals."""
-        ...
-
-
 class Reproduction(eqx.Module):
     """The response from set-point to rate: measured, and predicted of a controller and a plant.
 
@@ -348,7 +333,8 @@ class Reproduction(eqx.Module):
 
 
 def reproduce_flight(
-    fit: Fit, controller: FlownController, flown: Record | Sequence[Record] | FrequencyResponse, *,
+    fit: Fit, controller: LinearisableController,
+    flown: Record | Sequence[Record] | FrequencyResponse, *,
     plant: Callable[[PyTree], PyTree] | None = None, unit: Literal["rad/s", "deg/s"] = "rad/s",
     filters: Sequence[KnownFilter] = (), axis: int = 0, band: tuple[float, float] | None = None,
 ) -> Reproduction:  # fmt: skip
@@ -376,7 +362,7 @@ def reproduce_flight(
 
     - `ValueError`: the controller has no linear form, or the record no reference.
     """
-    if not isinstance(controller, FlownController):
+    if not isinstance(controller, LinearisableController):
         raise ValueError(
             f"the controller is a {type(controller).__name__}: give one with a method linear(), "
             "such as jq.autopilot.BetaflightPID"
