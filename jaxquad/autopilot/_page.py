@@ -22,7 +22,7 @@ from ._flight_channels import FlightChannels
 from ._identified_log import StepGrid
 from ._law import RateLoop
 from ._parameters import gains_in, gains_of, ParameterChange, WordChange
-from ._rate_loops import DesignSettings, gyro_chain_response, law_paths, Stage, WAYS
+from ._rate_loops import DesignSettings, draw_loops, gyro_chain_response, law_paths, Stage, WAYS
 
 
 if TYPE_CHECKING:
@@ -354,7 +354,9 @@ def step_bands(proposal: "AutopilotProposal", designs: Designs) -> dict[str, Ste
     """From set-point to rate, of plants drawn from the fit: by their responses."""
     flown, seed = proposal.flown, proposal.settings.seed + _SEED
     grid, steps = StepGrid.of(flown.law.dt), {}
-    loops = proposal.plants.loops(flown, _PLANTS, seed, omega=grid.omega)
+    loops = draw_loops(
+        proposal.identification, proposal.throttle, flown, _PLANTS, seed, omega=grid.omega
+    )
     for name, (law, gains) in designs.items():
         mine = loops if law is flown.law else loops.of_law(law, flown.axis)
         [back], [ahead] = mine.paths(gains[None])

@@ -19,7 +19,7 @@ from ._identified_log import ThrottleVerdict
 from ._law_check import LoopCheck
 from ._page import limits_text, pilot_page, PilotPage, write_pilot_page
 from ._parameters import change_table, ParameterChange, propose_changes, ProposedParameters
-from ._rate_loops import DesignSettings, Kind, Limits, OuterStage, PlantSource, Stage, WAYS
+from ._rate_loops import DesignSettings, Kind, Limits, OuterStage, Stage, WAYS
 
 
 @dataclasses.dataclass(frozen=True)
@@ -70,14 +70,6 @@ class AutopilotProposal:
         """Firmware, version and axis."""
         name, version = self.flown.firmware, ".".join(map(str, self.flown.version))
         return f"{name} {version}, rate loop of {AXES[self.flown.axis]}".replace(" ,", ",")
-
-    @property
-    def plants(self) -> PlantSource:
-        """What the log leaves possible."""
-        fit, unit = self.identification.fit, self.identification.records[0].output_units[0]
-        at = self.throttle
-        over, span = (None, (0.0, 1.0)) if at is None else (at.gains, at.span)
-        return PlantSource(fit, unit, over, span, self.flown.measured)
 
     @property
     def old(self) -> dict[str, float]:

@@ -34,7 +34,16 @@ from ._parameters import (
     propose_changes,
 )
 from ._proposal import AutopilotProposal, BELIEVED, FilterVerdict, judge, SWINGING
-from ._rate_loops import certify_angle, certify_gains, Gains, grouped, OneGains, RateLoops, Stage
+from ._rate_loops import (
+    certify_angle,
+    certify_gains,
+    draw_loops,
+    Gains,
+    grouped,
+    OneGains,
+    RateLoops,
+    Stage,
+)
 
 
 _THIRD = 1 / 3
@@ -107,7 +116,7 @@ class _Design:
         flight, throttle = proposal.flown.flight, proposal.throttle
         assert flight is not None and throttle is not None
         self.settings, self.flown, self.throttle = proposal.settings, proposal.flown, throttle
-        self.source, self.edge = proposal.plants, proposal.identification.band[1]  # rad/s
+        self.plant, self.edge = proposal.identification, proposal.identification.band[1]  # rad/s
         self.before = gains_of(self.flown.law, self.flown.axis)
         self.swings = float(np.mean(flight.limited))  # of the flight, a motor at its limit
         # What flew, at each throttle that is certified.
@@ -145,7 +154,7 @@ class _Design:
     def _groups(self, count: int, seed: int) -> list[RateLoops]:
         places, seed = self.throttle.certified or (None,), self.settings.seed + seed
         groups = [
-            self.source.loops(flown, count, seed, throttle=throttle)
+            draw_loops(self.plant, self.throttle, flown, count, seed, throttle=throttle)
             for flown, throttle in zip(self.flown_there, places, strict=True)
         ]
         if self.noise is None:

@@ -14,10 +14,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Complex, Float
 
-from jaxquad.identify import draw_models, filter_response, Fit, GainOverThrottle, KnownFilter
+from jaxquad.identify import draw_models, filter_response, KnownFilter
 
 from ._firmware import OuterLoop
-from ._flight_channels import FlownAutopilot
+from ._flight_channels import FlownAutopilot, IdentifiedPlant
+from ._identified_log import ThrottleVerdict
 from ._law import law_responses, RateLoop
 from ._parameters import FIELDS
 
@@ -287,56 +288,41 @@ _FREQUENCIES = 300
 _AT_ONCE = 256  # draws: each other number would be compiled anew
 
 
-@dataclasses.dataclass(frozen=True)
-class PlantSource:
-    """What plants are drawn from."""
+def draw_loops(
+    plant: IdentifiedPlant, over: ThrottleVerdict | None, flown: FlownAutopilot, count: int,
+    seed: int, *, omega: Frequencies | None = None, throttle: float | None = None,
+) -> RateLoops:  # fmt: skip
+    """The loops of what flew with plants drawn from the fit, or from the gain `over` the throttle.
 
-    fit: Fit  # up to what the gyro's filters are given
-    unit: str  # of its rate
-    over: GainOverThrottle | None = None  # its plants take the place of those of `fit`
-    span: tuple[float, float] = (0.0, 1.0)  # the lowest and the highest throttle of these
-    filters: Sequence[KnownFilter] | None = None  # of the gyro, as measured; None: the law's
+    All are at one `throttle`, or each is at its own, evenly over the span.
 
-    def loops(
-        self, flown: FlownAutopilot, count: int, seed: int, *,
-        omega: Frequencies | None = None, throttle: float | None = None,
-    ) -> RateLoops:  # fmt: skip
-        """The loops of what flew with so many plants.
-
-        All are at one `throttle`, or each is at its own, evenly over the span.
-
-        Raises ValueError where a drawn gain is not above 0.
-        """
-        law = flown.law
-        if omega is None:
-            omega = np.geomspace(_LOWEST, 0.999 * np.pi / law.dt, _FREQUENCIES)
-        gain, lag, delay, damping = self._drawn(count, seed, throttle)
-        if np.any(gain <= 0):
-            raise ValueError(
-                f"the gain from the command to the rate is not above 0 in {int(np.sum(gain <= 0))} "
-                f"of {count} plants drawn from the fit: check the sign of the input, or fly more "
-                "excitation"
-            )
-        per_radian = np.pi / 180 if self.unit == "deg/s" else 1.0
-        plants = hold_plants(per_radian * gain, lag, delay, omega, law.dt, damping)
-        return RateLoops.of(law, flown.axis, plants, omega, self.filters, flown.angle)
-
-    def _drawn(
-        self, count: int, seed: int, throttle: float | None
-    ) -> tuple[Column, Column, Column, Column]:
-        if self.over is None:
-            names = len(self.fit.names)
-            scores = np.zeros((names, -(-count // _AT_ONCE) * _AT_ONCE))
-            scores[:, :count] = np.random.default_rng(seed).standard_normal((names, count))
-            models = draw_models(self.fit, jnp.asarray(scores))
-            wide = lambda x: np.broadcast_to(np.asarray(x, float), scores[0].shape)[:count, None]
-            return wide(models.gain), wide(models.lag), wide(models.delay), wide(models.damping)
-        at = np.linspace(*self.span, count) if throttle is None else np.array([throttle])
-        drawn = self.over.draw(at, count, seed=seed)
+    Raises ValueError where a drawn gain is not above 0.
+    """
+    law, fit = flown.law, plant.fit
+    if omega is None:
+        omega = np.geomspace(_LOWEST, 0.999 * np.pi / law.dt, _FREQUENCIES)
+    if over is None or over.gains is None:
+        scores = np.zeros((len(fit.names), -(-count // _AT_ONCE) * _AT_ONCE))
+        scores[:, :count] = np.random.default_rng(seed).standard_normal((len(fit.names), count))
+        models = draw_models(fit, jnp.asarray(scores))
+        wide = lambda x: np.broadcast_to(np.asarray(x, float), scores[0].shape)[:count]
+        gain, lag, delay = wide(models.gain), wide(models.lag), wide(models.delay)
+        damping = wide(models.damping)
+    else:
+        at = np.linspace(*over.span, count) if throttle is None else np.array([throttle])
+        drawn = over.gains.draw(at, count, seed=seed)
         gain = np.diagonal(drawn.gain) if throttle is None else drawn.gain[0]
-        lag, delay = drawn.lag[:, None], drawn.delay[:, None]
-        damping = float(np.asarray(vars(self.fit.model).get("damping", 0.0)))
-        return gain[:, None], lag, delay, np.full_like(lag, damping)
+        lag, delay, damping = drawn.lag, drawn.delay, np.full(count, float(fit.model.damping))
+    if np.any(gain <= 0):
+        raise ValueError(
+            f"the gain from the command to the rate is not above 0 in {int(np.sum(gain <= 0))} of "
+            f"{count} plants drawn from the fit: check the sign of the input, or fly more "
+            "excitation"
+        )
+    per_radian = np.pi / 180 if plant.records[0].output_units[0] == "deg/s" else 1.0
+    gain, lag, delay, damping = (x[:, None] for x in (per_radian * gain, lag, delay, damping))
+    plants = hold_plants(gain, lag, delay, omega, law.dt, damping)
+    return RateLoops.of(law, flown.axis, plants, omega, flown.measured, flown.angle)
 
 
 Kind = Literal["proposed", "kept", "cannot tell", "not to be flown"]
