@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Complex, Float, Int
 
+from jaxquad.plot import Spectrum
 from jaxquad.records import Record
 from jaxquad.spectra import find_line, SpectralLine
 
@@ -38,24 +39,17 @@ _STEADY = 0.1  # of its frequency, within which a line stays
 _FOLLOWS = 0.6  # rank correlation with the throttle, from which a line moves with it
 
 
-class Density(NamedTuple):
-    """A one-sided power spectral density, in (rad/s)^2/Hz."""
-
-    hertz: Frequencies
-    power: Frequencies
-
-
 @dataclasses.dataclass(frozen=True)
 class GyroNoise:
     """The noise of the three gyros as the filters that flew passed it.
 
-    What the set-point explains is taken out, and below `least_hz`, where motion is taken for noise,
-    the level above it is used.
+    Densities are one-sided, in (rad/s)^2/Hz. What the set-point explains is taken out, and below
+    `least_hz`, where motion is taken for noise, the level above it is used.
     """
 
-    before: Density  # the filters that flew, of the tuned axis, up to `known_hz`
-    behind: Density
-    others: dict[int, Density]  # behind them, of the other two axes by their index
+    before: Spectrum  # the filters that flew, of the tuned axis, up to `known_hz`
+    behind: Spectrum
+    others: dict[int, Spectrum]  # behind them, of the other two axes by their index
     known_hz: float  # up to which the log shows it
     least_hz: float
     source: str  # in words
@@ -68,7 +62,7 @@ class GyroNoise:
         }  # fmt: skip
         return {"source": self.source, "known_hz": self.known_hz, "line": line}
 
-    def powers(self, density: Density, omega: Frequencies) -> Frequencies:
+    def powers(self, density: Spectrum, omega: Frequencies) -> Frequencies:
         """The power around each frequency in (rad/s)^2; 0 beyond `known_hz`."""
         total = np.concatenate([[0.0], np.cumsum(density.power) * np.diff(density.hertz[:2])])
         edges = np.concatenate([density.hertz[:1], density.hertz + np.diff(density.hertz[:2])])
@@ -88,42 +82,34 @@ def gyro_noise(flight: FlightChannels, law: RateLoop, axis: int, least_hz: float
     least = max(least_hz, SLOWEST)
     chain = lambda hertz: np.abs(gyro_chain_response(law, 2 * np.pi * hertz)) ** 2
     sources = {k: _source(flight, k, chain, least, law.dt) for k in range(len(flight.rates))}
-    tuned = sources.pop(axis if axis in sources else 0)
+    before, behind, reach, is_raw = sources.pop(axis if axis in sources else 0)
     # Whether much of what reaches the command lies beyond what is known.
     hertz = np.linspace(1.0, 0.499 / law.dt, 400)
     through = gains_of(law, axis) @ law_paths(law, axis, 2 * np.pi * hertz)[0]
     passed = np.abs(through * gyro_chain_response(law, 2 * np.pi * hertz)) ** 2
-    within = float(np.sum(passed[hertz <= tuned.reach]) / np.sum(passed))
+    within = float(np.sum(passed[hertz <= reach]) / np.sum(passed))
     if within < _SHARE:
         needed = hertz[np.searchsorted(np.cumsum(passed), _SHARE * np.sum(passed))]
-        what = "gyro" if tuned.is_raw else "filtered gyro"
+        what = "gyro" if is_raw else "filtered gyro"
         raise NoNoise(
-            f"the {what} of the log shows its noise up to {tuned.reach:.0f} Hz, where "
+            f"the {what} of the log shows its noise up to {reach:.0f} Hz, where "
             f"{100 * within:.0f} % of what reaches the command of white noise lies: log the "
             f"unfiltered gyro at {2 * needed / _REACH:.0f} Hz or faster"
         )
-    name = flight.names[1] if tuned.is_raw else flight.names[0]
-    how = "unfiltered" if tuned.is_raw else "filtered, divided by the filters that flew"
+    name = flight.names[1] if is_raw else flight.names[0]
+    how = "unfiltered" if is_raw else "filtered, divided by the filters that flew"
     return GyroNoise(
-        tuned.before, tuned.behind, {k: source.behind for k, source in sources.items()},
-        tuned.reach, least, f"{name} ({how}), up to {tuned.reach:.0f} Hz",
+        before, behind, {k: source[1] for k, source in sources.items()},
+        reach, least, f"{name} ({how}), up to {reach:.0f} Hz",
         _steady_line(flight, axis, least),
     )  # fmt: skip
-
-
-class _Source(NamedTuple):
-    """The noise of one gyro, behind the filters as it was logged, and before them."""
-
-    before: Density
-    behind: Density
-    reach: float  # Hz
-    is_raw: bool
 
 
 def _source(
     flight: FlightChannels, k: int, chain: Callable[[Frequencies], Frequencies], least: float,
     loop_dt: float,
-) -> _Source:  # fmt: skip
+) -> tuple[Spectrum, Spectrum, float, bool]:  # fmt: skip
+    """A gyro's noise before and behind the filters, its reach in Hz, whether it is unfiltered."""
     # All of the loop's band where the gyro was logged as fast as the loop ran.
     reach_of = lambda dt: 0.5 / loop_dt if dt < 1.01 * loop_dt else _REACH * 0.5 / dt
     rate, most = flight.rates[k], reach_of(flight.dt)
@@ -142,12 +128,12 @@ def _source(
         through = chain(high)
         both = (through >= _CLEAR) & (high <= most)
         behind = np.where(both, np.interp(high, hertz, power), level * through)
-        before = Density(high, _flat_below(high, level, least))
-        return _Source(before, Density(high, _flat_below(high, behind, least)), reach, True)
+        before = Spectrum(high, _flat_below(high, level, least))
+        return before, Spectrum(high, _flat_below(high, behind, least)), reach, True
     behind = _flat_below(hertz, power, least)
     # In a notch the level is that beside it.
     before = np.interp(hertz, hertz[clear], behind[clear] / passed[clear])
-    return _Source(Density(hertz, before), Density(hertz, behind), min(limit, most), False)
+    return Spectrum(hertz, before), Spectrum(hertz, behind), min(limit, most), False
 
 
 def _residual(rate: Samples, setpoint: Samples, dt: float) -> tuple[Frequencies, Frequencies]:
@@ -253,21 +239,17 @@ def filter_choices(
     return tuple(choice for choice in choices if len(choice.options) > 1)
 
 
-class _OtherAxis(NamedTuple):
-    """What an axis that is not tuned makes of its gyro's noise."""
+def _other_axes(
+    law: RateLoop, noise: GyroNoise, omega: Frequencies
+) -> list[tuple[Response, Response, Frequencies]]:
+    """What P and I, and D, make of the noise of the other axes' gyros, and that noise.
 
-    slow: Response  # by P and I
-    quick: Response  # by D
-    noise: Frequencies
-
-
-def _other_axes(law: RateLoop, noise: GyroNoise, omega: Frequencies) -> list[_OtherAxis]:
-    """Those whose gyro is in the log, under a law; behind the gyro's filters of that law."""
+    Behind the gyro's filters of the law.
+    """
     others = []
     for k, density in noise.others.items():
         gains, (back, _) = gains_of(law, k), law_paths(law, k, omega)
-        power = noise.powers(density, omega)
-        others.append(_OtherAxis(gains[:2] @ back[:2], gains[2] * back[2], power))
+        others.append((gains[:2] @ back[:2], gains[2] * back[2], noise.powers(density, omega)))
     return others
 
 
@@ -315,9 +297,9 @@ class FilterBank:
         if not all(choice.shared for choice in self.choices):  # those of the tuned axis' D term
             filters = filters._replace(derivative=np.ones_like(filters.derivative))
         growth = [np.zeros(len(filters.gyro))]
-        for axis in self._others:
-            through = (axis.slow + axis.quick * filters.derivative) * filters.gyro
-            growth.append(noise_growth(through, axis.slow + axis.quick, axis.noise, self.measured))
+        for slow, quick, noise in self._others:
+            through = (slow + quick * filters.derivative) * filters.gyro
+            growth.append(noise_growth(through, slow + quick, noise, self.measured))
         return np.max(growth, axis=0)
 
     def parameters(self, picks: Int[np.ndarray, " choices"]) -> dict[str, float]:
@@ -357,9 +339,9 @@ def shared_change(
     measured, growth = omega / (2 * np.pi) <= noise.known_hz, [0.0]
     ratio = gyro_chain_response(changed, omega) / gyro_chain_response(law, omega)
     both = zip(_other_axes(law, noise, omega), _other_axes(changed, noise, omega), strict=True)
-    for before, after in both:
-        through, flown = (after.slow + after.quick) * ratio, before.slow + before.quick
-        growth.append(float(noise_growth(through[None], flown, before.noise, measured)[0]))
+    for (slow, quick, power), (later_slow, later_quick, _) in both:
+        through = (later_slow + later_quick) * ratio
+        growth.append(float(noise_growth(through[None], slow + quick, power, measured)[0]))
     at, phases = np.array([_SLOW]), []
     for one in (law, changed):
         gyro, back = gyro_chain_response(one, at), law_paths(one, (axis + 1) % 3, at)[0]

@@ -44,7 +44,7 @@ from ._flight_channels import (
     RecordSettings,
     settings_of,
 )
-from ._law import law_responses, RateLoop
+from ._law import linear_responses, RateLoop
 from ._parameters import find_parameter, ParameterChange, propose_changes
 
 
@@ -210,7 +210,7 @@ def loop_of_law(
 
     def paths(omega: Frequencies) -> tuple[Response, Response, Response]:
         """The law from set-point and from logged rate to plus and minus the command; filters."""
-        ahead, back = units[unit] * law_responses(law, axis, omega)
+        ahead, back = units[unit] * linear_responses(law.linear(axis), omega)
         return ahead, -back, filter_response(filters, omega)
 
     used = np.asarray(usable(frf, None, _COHERENT))[:, 0, 0]

@@ -360,17 +360,10 @@ def bounded(value: Signal, limit: Array) -> Signal:
     return jnp.clip(value, -most, most)
 
 
-def law_responses(
-    law: RateLoop, axis: int, omega: Float[np.ndarray, " frequencies"]
-) -> Complex[np.ndarray, "2 frequencies"]:
-    """From the set-point and from the rate, both in rad/s, to the command."""
-    return linear_responses(law.linear(axis), omega)
-
-
 def linear_responses(
     linear: LinearController, omega: Float[np.ndarray, " frequencies"]
 ) -> Complex[np.ndarray, "2 frequencies"]:
-    """Likewise, of one axis' linear form."""
+    """From the set-point and from the measurement to the command."""
     A, c = np.asarray(linear.A), np.asarray(linear.C)
     into = np.stack([linear.reference_in, linear.measurement_in], axis=1)
     through = np.array([linear.reference_through, linear.measurement_through])

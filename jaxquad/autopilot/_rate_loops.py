@@ -19,7 +19,7 @@ from jaxquad.identify import draw_models, filter_response, KnownFilter
 from ._firmware import OuterLoop
 from ._flight_channels import FlownAutopilot, IdentifiedPlant
 from ._identified_log import ThrottleVerdict
-from ._law import law_responses, RateLoop
+from ._law import linear_responses, RateLoop
 from ._parameters import FIELDS
 
 
@@ -243,7 +243,7 @@ def law_paths(law: RateLoop, axis: int, omega: Frequencies) -> tuple[Parts, Part
         gains = [jnp.full_like(vars(law)["p"], float(field == name)) for field in fields]
         # What `replace` would check anew is known to be right.
         alone = eqx.tree_at(lambda law: [vars(law)[field] for field in fields], bare, gains)
-        responses.append(law_responses(alone, axis, omega))
+        responses.append(linear_responses(alone.linear(axis), omega))
     ahead, back = np.stack(responses, axis=1)
     return -back, ahead
 
@@ -260,7 +260,7 @@ def forward_path(law: RateLoop, axis: int, omega: Frequencies) -> Response | Non
         lambda x: [vars(x)[name] for name in FIELDS],
         law.without_gyro_filters(), [jnp.zeros_like(vars(law)["p"])] * len(FIELDS),
     )  # fmt: skip
-    return law_responses(without, axis, omega)[0]
+    return linear_responses(without.linear(axis), omega)[0]
 
 
 def hold_plants(

@@ -24,7 +24,7 @@ from jaxquad.identify import (
 from jaxquad.records import AXES
 
 from .._filters import FilterChain, PT2
-from .._law import FlownLoop, law_responses
+from .._law import DEGREES, FlownLoop, linear_responses
 from .._parameters import list_parameters
 from .._rate_loops import (
     cells_of,
@@ -177,7 +177,6 @@ def _three(values: Mapping[str, str], name: str) -> list[float]:
     return [float(x) for x in values[name].split(",")]
 
 
-_DEGREES = 180 / np.pi
 _LOWEST, _FREQUENCIES = 0.05, 300  # rad/s
 
 
@@ -235,7 +234,7 @@ class ADRCLoops(RateLoops):
         if frame.setpoint_hz > 0:  # adrc_td_hz, a pt1
             w = 2 * np.pi * frame.setpoint_hz * dt
             ahead = ahead * (w / (w + 1) / (1 - np.exp(-1j * self.omega * dt) / (w + 1)))
-        return _DEGREES * back, _DEGREES * ahead
+        return DEGREES * back, DEGREES * ahead
 
 
 def adrc_loops(
@@ -247,9 +246,9 @@ def adrc_loops(
     if omega is None:
         omega = np.geomspace(_LOWEST, 0.999 * np.pi / law.dt, _FREQUENCIES)
     gain, lag, delay = (x[:, None] for x in draw_at(plant, throttle, plants, seed))
-    per_radian = 1.0 if plant.output_unit == "rad/s" else 1 / _DEGREES
+    per_radian = 1.0 if plant.output_unit == "rad/s" else 1 / DEGREES
     responses = hold_plants(per_radian * gain, lag, delay, omega, law.dt)
-    ahead, back = law_responses(law, axis, omega)
+    ahead, back = linear_responses(law.linear(axis), omega)
     observer = FilterChain((PT2(frame.lowpass_hz),) if frame.lowpass_hz > 0 else (), 1 / law.dt)
     chains = [x for x in law.gyro_chains() if x.filters]
     passed = filter_response([*chains, observer], omega)
@@ -444,7 +443,7 @@ def frame_of(
         frame = ADRCFrame(B0Schedule(_LAW, max(0.05, round(lowest, 2))))
     schedule = frame.schedule
     if plant.throttle.size == 1:
-        degrees = 1.0 if plant.output_unit == "deg/s" else 180 / np.pi
+        degrees = 1.0 if plant.output_unit == "deg/s" else DEGREES
         scale = float(schedule.scale(plant.throttle[0]))
         return frame, None, degrees * plant.b0(0).value / scale
     scaled = plant.adrc_b0(schedule.hover, largest=schedule.high)
