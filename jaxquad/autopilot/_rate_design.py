@@ -39,10 +39,13 @@ from ._rate_loops import (
     certify_gains,
     draw_loops,
     Gains,
-    grouped,
     OneGains,
     RateLoops,
     Stage,
+    together,
+    with_more_plants,
+    with_plants,
+    worst_plants,
 )
 
 
@@ -63,23 +66,25 @@ def design_gains(proposal: AutopilotProposal, filters: Mapping[str, float]) -> A
     law, axis, noise = flown.law, flown.axis, design.noise
     loops, gains = design.loops(settings.members, 0), None
     # Gains that made a loop swing may be left further than others.
-    stable = float(np.mean(loops.qualities(design.before[None]).stable))
+    stable = float(np.mean(together(x.qualities(design.before[None]) for x in loops).stable))
     change = settings.change ** (2 if stable < BELIEVED and design.swings > SWINGING else 1)
-    bank = None if filters else design.bank(loops)
+    bank = None
+    if noise is not None and design.choices and not filters:
+        bank = FilterBank(design.choices, law, noise, loops[0].omega)
     why = design.no_noise or "the firmware's filters are off, so there is none to change"
     verdict = FilterVerdict(f"as they flew: {why}")
     if filters:
         text = f"{', '.join(filters)} as changed for another axis"
         verdict = FilterVerdict(text, design.flown_filters(filters), "for another axis")
     for attempt in range(1, _CERTIFICATES + 1):
-        fresh = design.fresh(attempt)
-        announce(f"searching gains on {len(loops.plants)} plants")
+        fresh = design.groups(settings.fresh, attempt)
+        announce(f"searching gains on {len(loops[0].plants)} plants")
         behind = design.filtered(loops, filters) if filters else loops
         gains = _Search(design, behind, loops, change).gains(gains)
         best = design.certified(fresh, parameters_of(law, axis, gains), filters)
         if bank is not None and noise is not None:
             announce("searching gains and filters together")
-            hard, alone = loops.worst(gains[None], _HARD), best
+            hard, alone = with_plants(loops, worst_plants(loops, gains[None], _HARD)), best
             search = _Search(design, hard, hard, change, bank)
             both, picks = search.gains_and_filters(gains, settings.seed)
             if changed := bank.parameters(picks):
@@ -92,7 +97,9 @@ def design_gains(proposal: AutopilotProposal, filters: Mapping[str, float]) -> A
         if kind != "not to be flown":
             break
         hardest = fresh if filters else best.loops[-1]
-        loops = loops.joined(hardest.worst(best.gains[-1][None], _WORST))
+        more = worst_plants(hardest, best.gains[-1][None], _WORST)
+        more = more if len(loops) > 1 else [np.concatenate(more)]
+        loops = with_more_plants(loops, more)
     return dataclasses.replace(
         proposal, kind=kind, verdict=text, stages=best.stages, filters=verdict, noise=noise,
         new=best.new if kind == "proposed" else {},
@@ -106,7 +113,7 @@ class _Certified(NamedTuple):
     new: dict[str, float]
     filters: dict[str, float]
     gains: list[np.ndarray]
-    loops: list[RateLoops]
+    loops: list[list[RateLoops]]
 
 
 class _Design:
@@ -127,7 +134,7 @@ class _Design:
         self.no_noise = "asked for by `keep_filters`"  # why filters stay
         if not self.settings.keep_filters:
             announce("the gyro's noise")
-            crossover = self.loops(1, 0).qualities(self.before[None]).crossover[0, 0]
+            crossover = self.loops(1, 0)[0].qualities(self.before[None]).crossover[0, 0]
             least_hz = 2 * float(crossover) / (2 * np.pi)
             try:
                 self.noise = gyro_noise(flight, self.flown.law, self.flown.axis, least_hz)
@@ -135,23 +142,20 @@ class _Design:
             except NoNoise as error:
                 self.no_noise = str(error)
 
-    def loops(self, count: int, seed: int) -> RateLoops:
+    def loops(self, count: int, seed: int) -> list[RateLoops]:
         """Of what flew, with the noise of the log where it shows it.
 
         Where the log has several levels of throttle, the plants are spread over those that are
         certified.
         """
-        groups = self._groups(-(-count // len(self.flown_there)), seed)
+        groups = self.groups(-(-count // len(self.flown_there)), seed)
         if all(flown.law is self.flown.law for flown in self.flown_there):  # one group is quicker
             plants = np.concatenate([group.plants for group in groups])
-            return dataclasses.replace(groups[0], plants=plants)
-        return grouped(groups)
+            return [dataclasses.replace(groups[0], plants=plants)]
+        return groups
 
-    def fresh(self, attempt: int) -> RateLoops:
-        """Other plants, all of them at each throttle that is certified."""
-        return grouped(self._groups(self.settings.fresh, attempt))
-
-    def _groups(self, count: int, seed: int) -> list[RateLoops]:
+    def groups(self, count: int, seed: int) -> list[RateLoops]:
+        """Likewise, with so many plants at each throttle that is certified."""
         places, seed = self.throttle.certified or (None,), self.settings.seed + seed
         groups = [
             draw_loops(self.plant, self.throttle, flown, count, seed, throttle=throttle)
@@ -177,12 +181,6 @@ class _Design:
             line_hz=None if line is None else line.omega / (2 * np.pi),
         )  # fmt: skip
 
-    def bank(self, loops: RateLoops) -> FilterBank | None:
-        """What they do; None where the log does not show the noise, or all are off."""
-        if self.noise is None or not self.choices:
-            return None
-        return FilterBank(self.choices, self.flown.law, self.noise, loops.omega)
-
     def flown_filters(self, names: Mapping[str, float]) -> dict[str, float]:
         """What flew of these filters; a notch may be for a line of another axis alone."""
         if not names:
@@ -194,14 +192,13 @@ class _Design:
             flown |= choice.flown_parameters
         return {name: flown[name] for name in names}
 
-    def filtered(self, loops: RateLoops, filters: Mapping[str, float]) -> RateLoops:
+    def filtered(self, loops: Sequence[RateLoops], filters: Mapping[str, float]) -> list[RateLoops]:
         """The loops with other filters, at each throttle."""
         laws = [flown.with_filters(filters) for flown in self.flown_there]
-        pairs = zip(loops.groups, laws, strict=True)
-        return grouped(group.of_law(law, self.flown.axis) for group, law in pairs)
+        return [x.of_law(law, self.flown.axis) for x, law in zip(loops, laws, strict=True)]
 
     def certified(
-        self, fresh: RateLoops, gains: Mapping[str, float], filters: Mapping[str, float]
+        self, fresh: Sequence[RateLoops], gains: Mapping[str, float], filters: Mapping[str, float]
     ) -> _Certified:
         """What flew, a third of the way and all of it, with their filters, as stored."""
         announce(f"certifying the rounded numbers on {self.settings.fresh} new plants")
@@ -209,14 +206,15 @@ class _Design:
         new = dict(gains) | dict(filters)
         ways = self._third(new, filters), new
         ceiling = ceiling_in(law, axis, ways)
-        loops = [grouped(dataclasses.replace(group, ceiling=ceiling) for group in fresh.groups)]
+        loops = [[dataclasses.replace(group, ceiling=ceiling) for group in fresh]]
         for way in ways:
             parts = {name: way[name] for name in filters}
             loops.append(self.filtered(loops[0], parts) if filters else loops[0])
         designs = [self.before, *(gains_in(law, axis, way) for way in ways)]
         stages = certify_gains(loops, designs)
         if angle is not None:
-            last = self._angle_value(loops[-1].worst(designs[-1][None], _WORST), designs[-1], angle)
+            worst = worst_plants(loops[-1], designs[-1][None], _WORST)
+            last = self._angle_value(with_plants(loops[-1], worst), designs[-1], angle)
             if last != angle.value:
                 new[angle.name] = last
             values = angle.value, self._third(new, filters).get(angle.name, angle.value), last
@@ -226,7 +224,7 @@ class _Design:
             ]
         return _Certified(tuple(stages), new, dict(filters), designs, loops)
 
-    def _angle_value(self, loops: RateLoops, gains: OneGains, angle: OuterLoop) -> float:
+    def _angle_value(self, loops: Sequence[RateLoops], gains: OneGains, angle: OuterLoop) -> float:
         """The greatest stored gain, up to what flew, with which the angle loop keeps the limits."""
         limits, row = self.settings, find_parameter(self.flown.firmware, angle.name)
         values = angle.value * np.geomspace(1.0, 1 / limits.change, _ANGLES)
@@ -265,7 +263,7 @@ class _Design:
                 f"% more; {heard}"
             )
             return plain, FilterVerdict(text, gains_alone=alone)
-        omega, changed = plain.loops[0].omega, self.flown.with_filters(both.filters)
+        omega, changed = plain.loops[0][0].omega, self.flown.with_filters(both.filters)
         shared = shared_change(law, changed, noise, omega, self.flown.axis)
         flown, (gyro, slope) = self.flown_filters(both.filters), shared.delay_ms
         elsewhere = (
@@ -333,14 +331,14 @@ class _Search:
     """Designs by their score: what is beyond a limit comes after all that keep them."""
 
     def __init__(
-        self, design: _Design, loops: RateLoops, before: RateLoops, change: float,
-        bank: FilterBank | None = None,
+        self, design: _Design, loops: Sequence[RateLoops], before: Sequence[RateLoops],
+        change: float, bank: FilterBank | None = None,
     ):  # fmt: skip
         """`before` are the loops of what flew, where `loops` are behind other filters."""
         self.loops, self.bank, self.flown = loops, bank, design.before
         self.limits, self.edge = design.settings, design.edge
-        self.noise = before.qualities(self.flown[None]).noise
-        self.through = loops.paths(self.flown[None])[0][0]
+        self.noise = together(x.qualities(self.flown[None]) for x in before).noise
+        self.through = loops[0].paths(self.flown[None])[0][0]
         self.free = np.flatnonzero(self.flown > 0)
         firmware = design.flown.firmware
         names = names_by_field(firmware, design.flown.axis)
@@ -397,7 +395,7 @@ class _Search:
         """Of free gains, and picked filters."""
         gains = np.tile(self.flown, (len(points), 1))
         gains[:, self.free] = points
-        plants = sum(len(group.plants) for group in self.loops.groups)
+        plants = sum(len(loop.plants) for loop in self.loops)
         count = max(1, _TOGETHER // max(plants, 1))
         parts = np.array_split(np.arange(len(gains)), -(-len(gains) // count))
         return np.concatenate(
@@ -406,7 +404,7 @@ class _Search:
 
     def _of(self, gains: Gains, picks: Picks | None) -> Float[np.ndarray, " designs"]:
         filters = None if picks is None or self.bank is None else self.bank.filters(picks)
-        qualities, limits = self.loops.qualities(gains, filters), self.limits
+        qualities, limits = together(x.qualities(gains, filters) for x in self.loops), self.limits
         beyond = [
             np.max(qualities.peak, axis=1) / (_RESERVE * limits.sensitivity),
             np.max(qualities.resonance, axis=1) / (_RESERVE * limits.resonance),
@@ -414,7 +412,8 @@ class _Search:
             np.max(qualities.crossover, axis=1) / self.edge,
         ]
         if self.bank is not None and picks is not None and filters is not None:
-            through, quiet = self.loops.paths(gains, filters)[0], np.zeros_like(self.loops.noise)
+            first = self.loops[0]
+            through, quiet = first.paths(gains, filters)[0], np.zeros_like(first.noise)
             unseen = noise_growth(through, self.through, quiet, self.bank.measured)
             beyond += [
                 unseen / limits.noise, self.bank.other_noise(filters) / limits.noise,

@@ -7,7 +7,7 @@ Source: docs/autopilots.md.
 
 import dataclasses
 from collections.abc import Iterable, Sequence
-from typing import Any, Literal, NamedTuple, Protocol, runtime_checkable
+from typing import Any, Literal, NamedTuple, Protocol, runtime_checkable, TypeVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -28,7 +28,7 @@ Response = Complex[np.ndarray, " frequencies"]
 Responses = Complex[np.ndarray, "plants frequencies"]
 Paths = Complex[np.ndarray, "designs frequencies"]
 Parts = Complex[np.ndarray, "gains frequencies"]
-Loops = Float[np.ndarray, "designs plants frequencies"]
+Parted = Float[np.ndarray, "designs plants frequencies"]  # of 1 + L
 Gains = Float[np.ndarray, "designs gains"]
 OneGains = Float[np.ndarray, " gains"]
 Column = Float[np.ndarray, "plants 1"]
@@ -74,7 +74,6 @@ class RateLoops:
     relaxed: bool = False  # whether the integral can be held in flight (iterm_relax)
     forward: Response | None = None  # of the law's feed-forward, from the set-point to the command
     angle: Response | None = None  # of the angle loop around this one: `OuterLoop.path`
-    others: tuple["RateLoops", ...] = ()  # at other throttles, under the law there
 
     @classmethod
     def of(
@@ -91,11 +90,6 @@ class RateLoops:
             None if angle is None else angle.path(omega),
         )  # fmt: skip
 
-    @property
-    def groups(self) -> tuple["RateLoops", ...]:
-        """For each throttle its own."""
-        return dataclasses.replace(self, others=()), *self.others
-
     def of_law(self, law: RateLoop, axis: int) -> "RateLoops":
         """The plants of this throttle under a law with other filters."""
         back, ahead = law_paths(law, axis, self.omega)
@@ -104,52 +98,20 @@ class RateLoops:
         forward = forward_path(law, axis, self.omega)
         return dataclasses.replace(self, feedback=back, ahead=ahead, forward=forward)
 
-    def worst(self, gains: Gains, count: int) -> "RateLoops":
-        """With those plants alone that have the greatest peaks under these gains."""
-        groups, peaks = self.groups, []
-        for group in groups:
-            x = group.qualities(gains)
-            peaks.append(np.where(x.stable, np.maximum(x.peak, x.resonance), np.inf).max(axis=0))
-        chosen = np.zeros(sum(map(len, peaks)), bool)
-        chosen[np.argsort(np.concatenate(peaks), kind="stable")[-count:]] = True
-        parts = np.split(chosen, np.cumsum([len(peak) for peak in peaks])[:-1])
-        return grouped(
-            dataclasses.replace(group, plants=group.plants[part])
-            for group, part in zip(groups, parts, strict=True)
-        )
-
-    def joined(self, others: "RateLoops") -> "RateLoops":
-        """With the plants of `others`, each at its throttle, under the laws of these."""
-        plants = [group.plants for group in others.groups]
-        plants = plants if self.others else [np.concatenate(plants)]
-        return grouped(
-            dataclasses.replace(group, plants=np.concatenate([group.plants, more]))
-            for group, more in zip(self.groups, plants, strict=True)
-        )
-
     def qualities(self, gains: Gains, filters: Filters | None = None) -> LoopQualities:
         """What each row of P, I and D gives; stability and peaks with D at its ceiling, too."""
         qualities = self._qualities(*self.paths(gains, filters))
         if self.ceiling != 1:
             raised = gains * np.array([[1.0, 1.0, self.ceiling]])
             qualities = qualities.or_worse(self._qualities(*self.paths(raised, filters)))
-        parts = [qualities, *(loops.qualities(gains, filters) for loops in self.others)]
-        return together(parts) if self.others else qualities
-
-    def relaxed_qualities(self, gains: Gains) -> LoopQualities:
-        """Likewise, with the integral held where it can be held in flight."""
-        still = lambda group: gains * np.array([[1.0, 0.0 if group.relaxed else 1.0, 1.0]])
-        return together([group.qualities(still(group)) for group in self.groups])
+        return qualities
 
     def outer_loops(self, gains: OneGains, angle_gain: float) -> Responses:
-        """Of the angle with a gain in 1/s, of all groups; the true rate is before the filters."""
-        loops = []
-        for group in self.groups:
-            assert group.angle is not None
-            ahead = gains @ group.ahead + (0 if group.forward is None else group.forward)
-            rate = ahead * group.plants / group.passed / (1 + gains @ group.feedback * group.plants)
-            loops.append(angle_gain * group.angle * rate)
-        return np.concatenate(loops)
+        """Of the angle with a gain in 1/s; the true rate is before the filters."""
+        assert self.angle is not None
+        ahead = gains @ self.ahead + (0 if self.forward is None else self.forward)
+        rate = ahead * self.plants / self.passed / (1 + gains @ self.feedback * self.plants)
+        return angle_gain * self.angle * rate
 
     def paths(self, gains: Gains, filters: Filters | None = None) -> tuple[Paths, Paths]:
         """The law from the logged rate to minus the command, and from the set-point to it."""
@@ -187,12 +149,31 @@ class RateLoops:
         )
 
 
-def grouped(groups: Iterable[RateLoops]) -> RateLoops:
-    first, *others = groups
-    return dataclasses.replace(first, others=tuple(others))
+Loops = TypeVar("Loops", bound=RateLoops)
 
 
-def together(parts: Sequence[LoopQualities]) -> LoopQualities:
+def with_plants(loops: Iterable[Loops], plants: Iterable[Responses]) -> list[Loops]:
+    """The loops, each with other plants."""
+    return [dataclasses.replace(x, plants=y) for x, y in zip(loops, plants, strict=True)]
+
+
+def with_more_plants(loops: Sequence[Loops], more: Iterable[Responses]) -> list[Loops]:
+    pairs = zip(loops, more, strict=True)
+    return with_plants(loops, (np.concatenate([loop.plants, x]) for loop, x in pairs))
+
+
+def worst_plants(loops: Sequence[RateLoops], gains: Gains, count: int) -> list[Responses]:
+    """Those of all loops that have the greatest peaks under these gains."""
+    peaks = []
+    for x in (loop.qualities(gains) for loop in loops):
+        peaks.append(np.where(x.stable, np.maximum(x.peak, x.resonance), np.inf).max(axis=0))
+    chosen = np.zeros(sum(map(len, peaks)), bool)
+    chosen[np.argsort(np.concatenate(peaks), kind="stable")[-count:]] = True
+    parts = np.split(chosen, np.cumsum([len(peak) for peak in peaks])[:-1])
+    return [loop.plants[part] for loop, part in zip(loops, parts, strict=True)]
+
+
+def together(parts: Iterable[LoopQualities]) -> LoopQualities:
     """Of the plants of all parts."""
     return LoopQualities(*(np.concatenate(column, axis=1) for column in zip(*parts, strict=True)))
 
@@ -207,7 +188,7 @@ def cells_of(omega: Frequencies) -> Frequencies:
     return np.diff(edges)
 
 
-def is_stable(real: Loops, imaginary: Loops) -> Bool[np.ndarray, "designs plants"]:
+def is_stable(real: Parted, imaginary: Parted) -> Bool[np.ndarray, "designs plants"]:
     """Whether 1 + L turns from -pi, of the double integrator, to 0; 2 pi for each unstable pair."""
     size = imaginary.shape[-1]
     upper = (imaginary >= 0).ravel()
@@ -395,29 +376,33 @@ class Stage(NamedTuple):
         return {**self._asdict(), "angle": None if self.angle is None else self.angle._asdict()}
 
 
-def certify_angle(loops: RateLoops, gains: OneGains, angle: OuterLoop, value: float) -> OuterStage:
+def certify_angle(
+    loops: Sequence[RateLoops], gains: OneGains, angle: OuterLoop, value: float
+) -> OuterStage:
     """The angle loop with a value of its parameter around the rate loop with these gains."""
-    around = loops.outer_loops(gains, angle.unit * value)
+    around = np.concatenate([loop.outer_loops(gains, angle.unit * value) for loop in loops])
     distance = 1 + around
     stable = is_stable(np.real(distance)[None], np.imag(distance)[None])
     peak = np.max(1 / np.abs(distance).min(axis=1))
     resonance = np.max(np.abs(around / distance).max(axis=1))
-    margin = np.min(delay_margin(around, loops.omega))
+    margin = np.min(delay_margin(around, loops[0].omega))
     numbers = map(float, (np.mean(stable), peak, resonance, margin))
     return OuterStage(angle.name, value, angle.closed, *numbers)
 
 
-def certify_gains(loops: Sequence[RateLoops], designs: Sequence[OneGains]) -> list[Stage]:
+def certify_gains(loops: Sequence[Sequence[RateLoops]], designs: Sequence[OneGains]) -> list[Stage]:
     """What each of the designs gives under its own law, the first of which is what flew."""
     rms, stages, flown = lambda x: float(np.sqrt(np.mean(x**2))), [], None
-    for loop, gains in zip(loops, designs, strict=True):
-        parts = [group.qualities(gains[None]) for group in loop.groups]
-        qualities = together(parts)
+    for groups, gains in zip(loops, designs, strict=True):
+        parts = [group.qualities(gains[None]) for group in groups]
+        qualities, still = together(parts), None
         flown = flown or qualities
-        relaxed = any(group.relaxed for group in loop.groups)
-        still = loop.relaxed_qualities(gains[None]) if relaxed else None
-        stable = qualities.stable if still is None else qualities.stable & still.stable
-        opened = np.concatenate([gains @ x.feedback * x.plants for x in loop.groups])
+        stable = qualities.stable
+        if any(group.relaxed for group in groups):  # with the integral held
+            free = lambda group: np.array([[1.0, 0.0 if group.relaxed else 1.0, 1.0]])
+            still = together(group.qualities(gains * free(group)) for group in groups)
+            stable = stable & still.stable
+        opened = np.concatenate([gains @ x.feedback * x.plants for x in groups])
         stages.append(
             Stage(
                 tuple(map(float, gains)), float(np.mean(stable)), float(np.max(qualities.peak)),
@@ -426,7 +411,7 @@ def certify_gains(loops: Sequence[RateLoops], designs: Sequence[OneGains]) -> li
                 rms(qualities.noise) / rms(flown.noise),
                 tuple(float(np.max(part.peak)) for part in parts),
                 None if still is None else float(np.max(still.peak)),
-                float(np.min(delay_margin(opened, loop.omega))),
+                float(np.min(delay_margin(opened, groups[0].omega))),
             )
         )  # fmt: skip
     return stages

@@ -83,7 +83,7 @@ def test_the_angle_loop_is_stable_up_to_the_gain_at_which_a_simulated_one_is():
     assert angle is not None and angle.closed and angle.unit * angle.value == 4.5
     plants = hold_plants(column(GAIN), column(LAG), column(0.0), OMEGA, DT)
     loops = RateLoops.of(law, 0, plants, OMEGA, angle=angle)
-    stable = lambda value: certify_angle(loops, GAINS, angle, value).stable == 1
+    stable = lambda value: certify_angle([loops], GAINS, angle, value).stable == 1
     low, high = 1.0, 200.0
     assert stable(low) and not stable(high)
     for _ in range(12):

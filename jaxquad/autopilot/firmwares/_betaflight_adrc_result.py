@@ -40,7 +40,7 @@ from .._parameters import (
 )
 from .._proposal import beyond_limits, write_result
 from .._rate_design import best_on_grid, stored_near
-from .._rate_loops import DesignSettings, Kind, Limits
+from .._rate_loops import DesignSettings, Kind, Limits, with_more_plants, with_plants, worst_plants
 from .._replay import Reproduction
 from ._betaflight_adrc import (
     adrc_loops,
@@ -137,7 +137,7 @@ def propose_adrc(
     for attempt in range(1, _CERTIFICATES + 1):
         announce(f"searching wc, wo and b0 at {len(grid)} throttles")
         score = score_of(loops, targets, edge, before)
-        first = [dataclasses.replace(loop, plants=loop.plants[:1]) for loop in loops]
+        first = with_plants(loops, (loop.plants[:1] for loop in loops))
         rough, ends = score_of(first, targets, edge, before), (np.log(low), np.log(high))
         middle, half = np.log(low * high) / 2, np.log(high / low) / 2
         for level in range(_LEVELS):
@@ -152,11 +152,8 @@ def propose_adrc(
         beyond = beyond_limits(stages["what flew"], third, stages["proposed"], targets, edge)
         if not beyond:
             break
-        worst = [x.worst(best[None], _WORST).plants for x in certified]
-        loops = [
-            dataclasses.replace(x, plants=np.concatenate([x.plants, more]))
-            for x, more in zip(loops, worst, strict=True)
-        ]
+        worst = (worst_plants([x], best[None], _WORST)[0] for x in certified)
+        loops = with_more_plants(loops, worst)
     kind, verdict = judge_adrc(stages, beyond, targets, fresh, grid)
     values = {row.name: float(x) for row, x in zip(rows, best, strict=True)} | frame.parameters()
     stored = store_parameters("betaflight", values if kind == "proposed" else {})
