@@ -233,8 +233,8 @@ def filter_choices(
         names, second = free[0]
         notches = [FilterOption(dict(zip(names, (0.0, second), strict=True)), None)]
         for half_width in _WIDTHS if line < _HIGHEST * rate_hz else ():
-            pair = line, kind.notch_width(line, half_width)
-            notches.append(FilterOption(dict(zip(names, pair, strict=True)), kind.notch(*pair)))
+            width, notch = kind.notch(line, half_width)
+            notches.append(FilterOption(dict(zip(names, (line, width), strict=True)), notch))
         choices.append(FilterChoice("gyro", True, rate_hz, tuple(notches), 0))
     return tuple(choice for choice in choices if len(choice.options) > 1)
 

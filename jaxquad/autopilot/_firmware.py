@@ -226,12 +226,8 @@ class Firmware(abc.ABC):
             for x in chain.filters if np.any(d > 0) else ():
                 yield LowPass("derivative", {row.name: cutoff_of(x)}, x, chain.rate_hz, shared)
 
-    def notch(self, centre_hz: float, second: float) -> Filter:
-        """A static notch by the values of two parameters, see `notches`."""
-        raise NotImplementedError
-
-    def notch_width(self, centre_hz: float, half_width: float) -> float:
-        """The second parameter of a notch whose half width is this share of its centre."""
+    def notch(self, centre_hz: float, half_width: float) -> tuple[float, Filter]:
+        """A static notch whose half width is this share of its centre, and its second parameter."""
         raise NotImplementedError
 
     def flown_notches(self, values: Mapping[str, str]) -> list[tuple[float, float]]:

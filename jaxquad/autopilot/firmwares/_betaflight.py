@@ -90,10 +90,6 @@ class FlownBetaflight(FlownLoop[BetaflightPID]):
             integral_share=integral_share,
         )  # fmt: skip
 
-    def without_gyro_filters(self) -> "FlownBetaflight":
-        law = self.law.without_gyro_filters()
-        return dataclasses.replace(self, law=law, gyro_dynamic=None)
-
     def at_moment(self, *moment: Array) -> BetaflightPID:
         throttle, surge, integral_share = moment
         return self.at(throttle, surge=surge, integral_share=integral_share)
@@ -131,7 +127,7 @@ _SURGED_I, _SURGED_P = 0.34, 0.0034  # what anti-gravity's measure adds to Ki, a
 
 def _retuned(filters: tuple[Filter, ...], ends: Ends | None, throttle: Ratio) -> tuple[Filter, ...]:
     """The filters with the first one's cutoff at a throttle; None leaves it."""
-    if ends is None or not isinstance(filters[0], PT1 | PT2 | PT3 | Butterworth):
+    if ends is None or not filters or not isinstance(filters[0], PT1 | PT2 | PT3 | Butterworth):
         return filters
     cutoff = dynamic_cutoff(throttle, *ends)
     return (dataclasses.replace(filters[0], cutoff_hz=cutoff), *filters[1:])
@@ -394,12 +390,9 @@ class Betaflight(Firmware):
                     cutoffs = {f"{name}_dyn_min_hz": ends[0], f"{name}_dyn_max_hz": ends[1]}
                 yield LowPass(stage, cutoffs, low_pass, rate)
 
-    def notch(self, centre_hz: float, second: float) -> Filter:
-        return Notch(centre_hz, betaflight_quality(centre_hz, second))
-
-    def notch_width(self, centre_hz: float, half_width: float) -> float:
-        """The lower cutoff."""
-        return float(np.rint((1 - half_width) * centre_hz))
+    def notch(self, centre_hz: float, half_width: float) -> tuple[float, Filter]:
+        lower = float(np.rint((1 - half_width) * centre_hz))
+        return lower, Notch(centre_hz, betaflight_quality(centre_hz, lower))
 
     def flown_notches(self, values: Mapping[str, str]) -> list[tuple[float, float]]:
         split = lambda name: [float(x) for x in values.get(name, "").split(",") if x]

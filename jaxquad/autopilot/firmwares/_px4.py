@@ -258,11 +258,9 @@ class PX4(Firmware):
         name = f"MC_{AXES[axis].upper()}_P"
         return OuterLoop.of(values, name, 1.0, 0.5 * _ESTIMATE + dt, closed=True)
 
-    def notch(self, centre_hz: float, second: float) -> Filter:
-        return BandwidthNotch(centre_hz, second)
-
-    def notch_width(self, centre_hz: float, half_width: float) -> float:
-        return float(np.rint(2 * half_width * centre_hz))
+    def notch(self, centre_hz: float, half_width: float) -> tuple[float, Filter]:
+        width = float(np.rint(2 * half_width * centre_hz))
+        return width, BandwidthNotch(centre_hz, width)
 
     def parameter_file(self, values, title, *, version, profile, raised, words):
         rows = [f"# {title}"] if title else []
