@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxquad._core import Number
-from jaxquad.identify import Fit, KnownFilter, measured_chain, MeasuredChain
+from jaxquad.identify import Fit, KnownFilter, measured_chain
 from jaxquad.records import (
     AXES,
     channels,
@@ -118,12 +118,6 @@ class FlightChannels:
         low, high = self.motor_ends
         near = _AT_END * (high - low)
         return np.any((self.motors <= low + near) | (self.motors >= high - near), axis=1) * 1.0
-
-    @property
-    def mixer_range(self) -> Samples | None:
-        """Highest less lowest motor, over what a motor can be."""
-        reach = np.ptp(self.motor_ends)
-        return None if self.motors is None else np.ptp(self.motors, axis=1) / reach
 
 
 def read_channels_if_any(
@@ -267,11 +261,6 @@ class FlownAutopilot:
     angle: OuterLoop | None  # around the rate loop; None where the firmware has none
     filters: tuple[KnownFilter, ...]  # of the gyro, or as measured where the law lacks some
     filters_text: str  # which of both
-
-    @property
-    def measured(self) -> tuple[KnownFilter, ...] | None:
-        """The gyro's filters as measured; None where they are those of the law."""
-        return self.filters if any(isinstance(x, MeasuredChain) for x in self.filters) else None
 
     def with_filters(self, parameters: Mapping[str, Number]) -> RateLoop:
         """The law as it is read from a log with these cutoffs and notches."""

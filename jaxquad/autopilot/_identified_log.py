@@ -30,7 +30,6 @@ from jaxquad.identify import (
 )
 from jaxquad.plot import StepBand
 from jaxquad.records import AXES, Proposal, propose, Record, RecordWarning
-from jaxquad.records.firmware import firmware_names
 from jaxquad.report import LawLoop, reason_of
 from jaxquad.spectra import BrokenLoop, FrequencyResponse
 
@@ -284,12 +283,6 @@ class ThrottleVerdict:
         """The throttles at which gains are certified; empty without a gain over the throttle."""
         low, high = self.span
         return () if self.gains is None else (low, (low + high) / 2, high)
-
-    @property
-    def table(self) -> str:
-        """The gain over the throttle, without other firmwares' parameters."""
-        names = tuple(firmware_named(name).thrust_curve or "-" for name in firmware_names())
-        return "\n".join(x for x in str(self.gains).splitlines() if not x.startswith(names))
 
     def content(self) -> dict[str, object]:
         return {

@@ -152,11 +152,13 @@ def _checked(law: FlownLoop, flight: FlightChannels, late: float) -> LawCheck:
         [x, *(x + _rounding_error(x, step, roundings) for _ in range(_COPIES))], axis=1
     )
     repeated = lambda x: np.repeat(x[:, None], many, axis=1)
+    motors, reach = flight.motors, np.ptp(flight.motor_ends)
     terms = replay_terms(
         law, copies(flight.setpoint, of_rate), copies(flight.rates[flight.axis], of_rate),
         flight.followed, dt=flight.dt, feed_forward=None if forward is None else repeated(forward),
         integral=copies(flight.terms["I"], of_term) if "I" in flight.terms else None,
-        mixer_range=flight.mixer_range, late=late, restart=_WINDOW,
+        mixer_range=None if motors is None else np.ptp(motors, axis=1) / reach, late=late,
+        restart=_WINDOW,
     )  # fmt: skip
     if flight.slewed is not None:
         terms |= {name: terms[name] * flight.slewed[:, None] for name in "PD"}

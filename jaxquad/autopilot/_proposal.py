@@ -10,6 +10,7 @@ import numpy as np
 
 from jaxquad._core import announce, Message, plain_content, staged_files
 from jaxquad.records import AXES
+from jaxquad.records.firmware import firmware_names
 from jaxquad.report import Provenance, provenance, write_json
 
 from ._filter_bank import GyroNoise, SharedChange
@@ -221,7 +222,9 @@ class AutopilotProposal:
         if throttle is not None:
             curve = throttle.curve
             lines += ["", f"throttle: {throttle.text}"]
-            lines += [] if throttle.gains is None else [throttle.table]
+            if throttle.gains is not None:  # without other firmwares' parameters
+                names = tuple(firmware_named(x).thrust_curve or "-" for x in firmware_names())
+                lines += [x for x in str(throttle.gains).splitlines() if not x.startswith(names)]
         if throttle is not None and throttle.gains is not None and self.stages:
             row = lambda name, numbers: f"{name:<20} " + " ".join(f"{x:6.2f}" for x in numbers)
             lines += ["", row("worst Ms at throttle", throttle.logged)]

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Complex, Float
 
-from jaxquad.identify import draw_models, filter_response, KnownFilter
+from jaxquad.identify import draw_models, filter_response, KnownFilter, MeasuredChain
 
 from ._firmware import OuterLoop
 from ._flight_channels import FlownAutopilot, IdentifiedPlant
@@ -44,12 +44,6 @@ class LoopQualities(NamedTuple):
     # Root of the integrated square of the rate after a step of torque, relative.
     rejection: Float[np.ndarray, "designs plants"]
     noise: Float[np.ndarray, "designs plants"]  # rms of the command of the gyro's noise, relative
-
-    def or_worse(self, other: "LoopQualities") -> "LoopQualities":
-        """The worse of each plant; effects of torque and of noise are those of the first."""
-        names = ("peak", "resonance", "crossover")
-        greater = {x: np.maximum(getattr(self, x), getattr(other, x)) for x in names}
-        return self._replace(stable=self.stable & other.stable, **greater)
 
 
 class Filters(NamedTuple):
@@ -103,7 +97,10 @@ class RateLoops:
         qualities = self._qualities(*self.paths(gains, filters))
         if self.ceiling != 1:
             raised = gains * np.array([[1.0, 1.0, self.ceiling]])
-            qualities = qualities.or_worse(self._qualities(*self.paths(raised, filters)))
+            other = self._qualities(*self.paths(raised, filters))
+            names = ("peak", "resonance", "crossover")
+            worse = {x: np.maximum(getattr(qualities, x), getattr(other, x)) for x in names}
+            qualities = qualities._replace(stable=qualities.stable & other.stable, **worse)
         return qualities
 
     def outer_loops(self, gains: OneGains, angle_gain: float) -> Responses:
@@ -303,7 +300,9 @@ def draw_loops(
     per_radian = np.pi / 180 if plant.records[0].output_units[0] == "deg/s" else 1.0
     gain, lag, delay, damping = (x[:, None] for x in (per_radian * gain, lag, delay, damping))
     plants = hold_plants(gain, lag, delay, omega, law.dt, damping)
-    return RateLoops.of(law, flown.axis, plants, omega, flown.measured, flown.angle)
+    measured = any(isinstance(x, MeasuredChain) for x in flown.filters)
+    filters = flown.filters if measured else None
+    return RateLoops.of(law, flown.axis, plants, omega, filters, flown.angle)
 
 
 Kind = Literal["proposed", "kept", "cannot tell", "not to be flown"]
