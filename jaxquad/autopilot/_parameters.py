@@ -123,11 +123,10 @@ def with_parameters(law: Law, values: Mapping[str, Number]) -> Law:
             )
         row, flown = rows[name], _value_at(law, rows[name].field)
         assert isinstance(flown, Array)
-        changed = jnp.asarray(value, flown.dtype)
-        if row.field != "gyro":  # one axis, or all of them; the only one of a law of one axis
-            one = row.axis < 0 or flown.shape == (1,)
-            wide = jnp.broadcast_to(flown, (3,))
-            changed = jnp.full_like(flown, changed) if one else wide.at[row.axis].set(changed)
+        if row.axis < 0 or flown.shape == (1,):  # of all axes, or of the only one
+            changed = jnp.full_like(flown, value)
+        else:
+            changed = jnp.broadcast_to(flown, (3,)).at[row.axis].set(value)
         law = _replaced(law, row.field, changed)
     return law
 

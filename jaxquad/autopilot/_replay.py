@@ -158,9 +158,7 @@ class _Grid:
 
 
 def _straight(at: np.ndarray, time: np.ndarray, signal: np.ndarray) -> np.ndarray:
-    if signal.ndim == 1:
-        return np.interp(at, time, signal)
-    return np.stack([np.interp(at, time, column) for column in signal.T], axis=1)
+    return np.apply_along_axis(lambda column: np.interp(at, time, column), 0, signal)
 
 
 @eqx.filter_jit

@@ -5,7 +5,7 @@ import itertools
 import math
 import re
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, ClassVar, Literal, NamedTuple
+from typing import Any, ClassVar, Literal
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -248,15 +248,6 @@ def ardupilot_harmonic_notch(
     )  # fmt: skip
 
 
-class Tracking(NamedTuple):
-    """A notch in the gyro's chain that follows the throttle: INS_HNTCH_FREQ, _REF and _FM_RAT."""
-
-    place: int
-    frequency_hz: float
-    reference: float
-    least: float
-
-
 _FOLLOWED = {
     2: "the RPM sensor", 3: "the motors, by ESC telemetry", 4: "the spectrum of the gyro",
     5: "the second RPM sensor",
@@ -268,10 +259,11 @@ class FlownArduPilot(FlownLoop[ArduPilotRate]):
 
     **Arguments:** (those of `FlownLoop`, and)
 
-    - `tracking`: which of the gyro's filters follow the throttle, and how.
+    - `tracking`: place of each of the gyro's filters that follows the throttle, with its
+        INS_HNTCH_FREQ, _REF and _FM_RAT.
     """
 
-    tracking: tuple[Tracking, ...] = eqx.field(static=True, default=())
+    tracking: tuple[tuple[int, float, float, float], ...] = eqx.field(static=True, default=())
 
     def at(self, throttle: Float[ArrayLike, "..."]) -> ArduPilotRate:
         """The law at a throttle of 0 to 1: where its notches are."""
@@ -320,7 +312,7 @@ def ardupilot_loop(
         for name, what in switched.items() if number(name, 0.0) > 0
     ]  # fmt: skip
     filters: list[HarmonicNotch] = []
-    tracking: list[Tracking] = []
+    tracking: list[tuple[int, float, float, float]] = []
     for name in ("INS_HNTCH", "INS_HNTC2"):
         read = lambda end, default, name=name: number(f"{name}_{end}", default)
         mask = round(read("HMNCS", 3.0))
@@ -335,7 +327,7 @@ def ardupilot_loop(
             notches=2 if options & 1 else 3 if options & 16 else 5 if options & 64 else 1,
         )  # fmt: skip
         if mode == 1:
-            tracking.append(Tracking(len(filters), frequency, reference, read("FM_RAT", 1.0)))
+            tracking.append((len(filters), frequency, reference, read("FM_RAT", 1.0)))
         if mode not in _FOLLOWED:
             filters.append(notch)
         elif sources := (tracked_hz or {}).get(mode):
