@@ -2,13 +2,14 @@
 
 import dataclasses
 import shlex
+from collections import ChainMap
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from jaxquad._core import announce, Message, plain_content, staged_files
+from jaxquad._core import announce, Message, plain_content, staged_files, write_file
 from jaxquad.records import AXES
 from jaxquad.records.firmware import firmware_names
 from jaxquad.report import Provenance, provenance, write_json
@@ -19,7 +20,14 @@ from ._flight_channels import FlownAutopilot, IdentifiedPlant
 from ._identified_log import ThrottleVerdict
 from ._law_check import LoopCheck
 from ._page import limits_text, pilot_page, PilotPage, write_pilot_page
-from ._parameters import change_table, ParameterChange, propose_changes, ProposedParameters
+from ._parameters import (
+    change_table,
+    find_parameter,
+    parameter_file,
+    ParameterChange,
+    propose_changes,
+    write_parameter_files,
+)
 from ._rate_loops import DesignSettings, Kind, Limits, OuterStage, Stage, WAYS
 
 
@@ -81,15 +89,11 @@ class AutopilotProposal:
         return self.flown.old | filters | around
 
     @property
-    def parameters(self) -> ProposedParameters:
-        """Old and new values by the firmware's names."""
-        at_once = () if self.filters is None else self.filters.at_once
+    def at_once(self) -> tuple[str, ...]:
+        """Those of the new parameters that have no third of the way."""
         if self.stages and self.stages[1].stable < 1:
-            at_once = tuple(self.new)
-        return ProposedParameters(
-            self.flown.firmware, self.flown.version, self.old, dict(self.new), self._reasons,
-            at_once,
-        )  # fmt: skip
+            return tuple(self.new)
+        return () if self.filters is None else self.filters.at_once
 
     @property
     def shared_filters(self) -> dict[str, float]:
@@ -102,8 +106,10 @@ class AutopilotProposal:
     @property
     def changes(self) -> tuple[ParameterChange, ...]:
         """From what flew to the proposal."""
-        x = self.parameters
-        return propose_changes(x.firmware, x.old, x.new, reasons=x.reasons, beyond=list(x.new))
+        new, reasons = self.new, self._reasons
+        return propose_changes(
+            self.flown.firmware, self.old, new, reasons=reasons, beyond=list(new)
+        )
 
     @property
     def _reasons(self) -> dict[str, str]:
@@ -183,9 +189,7 @@ class AutopilotProposal:
             "_revert": f"the {curve.name} that flew",
         }
         return [
-            self.parameters.write_one(
-                f"{_CURVE}{end}", [curve.change], title, folder, revert=bool(end)
-            )
+            _write_changes(folder / f"{_CURVE}{end}", self.flown, [curve.change], title, bool(end))
             for end, title in titles.items()
         ]
 
@@ -273,19 +277,16 @@ class AxesProposal:
     @property
     def new(self) -> dict[str, float]:
         """The proposed parameters of all axes by name."""
-        return self.parameters.new
+        new = ChainMap(*(dict(one.new) for one in self.axes.values()))
+        return {name: new[name] for name in self.old if name in new}
 
     @property
     def old(self) -> dict[str, float]:
         """What flew of them; without a proposal what flew of all axes."""
-        return self.parameters.old
-
-    @property
-    def parameters(self) -> ProposedParameters:
-        """Of the axes that have a proposal; without one of all axes."""
-        parts = [one.parameters for one in self.axes.values()]
-        proposed = [part for part in parts if part.new]
-        return ProposedParameters.joined(proposed or parts)
+        axes = self.axes.values()
+        parts = [one.old for one in axes if one.new] or [one.old for one in axes]
+        first = ChainMap(*parts)
+        return {name: first[name] for part in parts for name in part}
 
     def content(self) -> dict[str, object]:
         """All of it, for JSON."""
@@ -314,6 +315,17 @@ class AxesProposal:
         return "\n\n".join(parts)
 
 
+def _write_changes(
+    stem: Path, flown: FlownAutopilot, changes: Sequence[ParameterChange], title: str,
+    revert: bool, raised: Sequence[str] = (),
+) -> Path:  # fmt: skip
+    text = parameter_file(
+        flown.firmware, changes, revert=revert, version=flown.version or (2025, 12),
+        raised=raised, title=title, profile=None,
+    )  # fmt: skip
+    return write_file(stem.with_suffix(f".{firmware_named(flown.firmware).suffix}"), text)
+
+
 def _write_axes(
     folder: Path, result: AutopilotProposal | AxesProposal, axes: Sequence[AutopilotProposal]
 ) -> list[Path]:
@@ -323,7 +335,21 @@ def _write_axes(
 
     def files(folder: Path) -> list[Path]:
         curves = (one.write_curve(folder) for one in axes)
-        return [*next((paths for paths in curves if paths), []), *result.parameters.write(folder)]
+        written, old, new = next((paths for paths in curves if paths), []), result.old, result.new
+        if not new:
+            rows = [(find_parameter(flown.firmware, name), x) for name, x in old.items()]
+            same = [ParameterChange(row, x, x) for row, x in rows]
+            raised = [axis for axis in AXES if f"d_max_{axis}" in old]
+            stem = folder / "proposal_revert"
+            return [*written, _write_changes(stem, flown, same, "what flew", True, raised)]
+        parts = [one for one in axes if one.new]
+        files = write_parameter_files(
+            folder, flown.firmware, old, new, beyond=list(new),
+            reasons={name: x for one in reversed(parts) for name, x in one._reasons.items()},
+            at_once=[name for one in parts for name in one.at_once],
+            version=flown.version or (2025, 12), profile=None,
+        )  # fmt: skip
+        return [*written, *files.stages, files.revert, files.table]
 
     pages = lambda origin: [pilot_page(one, origin, overview) for one in axes]
     log, settings = axes[0].identification.path, result.settings
