@@ -179,20 +179,6 @@ class AutopilotProposal:
         """
         return _write_axes(Path(folder), self, [self])
 
-    def write_curve(self, folder: Path) -> list[Path]:
-        """The thrust curve's parameter and what flew of it, never in a file with gains."""
-        curve = None if self.throttle is None else self.throttle.curve
-        if curve is None or curve.change is None:
-            return []
-        titles = {
-            "": f"{curve.name} alone: all loops and the throttle at hover change with it",
-            "_revert": f"the {curve.name} that flew",
-        }
-        return [
-            _write_changes(folder / f"{_CURVE}{end}", self.flown, [curve.change], title, bool(end))
-            for end, title in titles.items()
-        ]
-
     def __str__(self) -> str:
         flown, lines = self.flown, [self.title]
         lines += [f"  {name} = {value:.6g}" for name, value in self.old.items()]
@@ -315,39 +301,41 @@ class AxesProposal:
         return "\n\n".join(parts)
 
 
-def _write_changes(
-    stem: Path, flown: FlownAutopilot, changes: Sequence[ParameterChange], title: str,
-    revert: bool, raised: Sequence[str] = (),
-) -> Path:  # fmt: skip
-    text = parameter_file(
-        flown.firmware, changes, revert=revert, version=flown.version or (2025, 12),
-        raised=raised, title=title, profile=None,
-    )  # fmt: skip
-    return write_file(stem.with_suffix(f".{firmware_named(flown.firmware).suffix}"), text)
-
-
 def _write_axes(
     folder: Path, result: AutopilotProposal | AxesProposal, axes: Sequence[AutopilotProposal]
 ) -> list[Path]:
     """With the thrust curve, and one parameter file of all axes for each stage."""
-    flown = axes[0].flown
-    overview = f"{flown.firmware} {'.'.join(map(str, flown.version))}, rate loops".strip()
+    flown, old, new = axes[0].flown, result.old, result.new
+    firmware, version = flown.firmware, flown.version or (2025, 12)
+    overview = f"{firmware} {'.'.join(map(str, flown.version))}, rate loops".strip()
+
+    def write(stem: Path, changes: Sequence[ParameterChange], title: str, revert: bool) -> Path:
+        text = parameter_file(
+            firmware, changes, revert=revert, version=version, profile=None, title=title,
+            raised=[axis for axis in AXES if f"d_max_{axis}" in old],
+        )  # fmt: skip
+        return write_file(stem.with_suffix(f".{firmware_named(firmware).suffix}"), text)
 
     def files(folder: Path) -> list[Path]:
-        curves = (one.write_curve(folder) for one in axes)
-        written, old, new = next((paths for paths in curves if paths), []), result.old, result.new
+        curves = (one.throttle.curve for one in axes if one.throttle is not None)
+        written, curve = [], next((x for x in curves if x is not None and x.change), None)
+        if curve is not None and curve.change is not None:  # never in a file with gains
+            title = f"{curve.name} alone: all loops and the throttle at hover change with it"
+            back = f"the {curve.name} that flew"
+            written = [
+                write(folder / _CURVE, [curve.change], title, False),
+                write(folder / f"{_CURVE}_revert", [curve.change], back, True),
+            ]
         if not new:
-            rows = [(find_parameter(flown.firmware, name), x) for name, x in old.items()]
+            rows = [(find_parameter(firmware, name), x) for name, x in old.items()]
             same = [ParameterChange(row, x, x) for row, x in rows]
-            raised = [axis for axis in AXES if f"d_max_{axis}" in old]
-            stem = folder / "proposal_revert"
-            return [*written, _write_changes(stem, flown, same, "what flew", True, raised)]
+            return [*written, write(folder / "proposal_revert", same, "what flew", True)]
         parts = [one for one in axes if one.new]
         files = write_parameter_files(
-            folder, flown.firmware, old, new, beyond=list(new),
+            folder, firmware, old, new, beyond=list(new),
             reasons={name: x for one in reversed(parts) for name, x in one._reasons.items()},
             at_once=[name for one in parts for name in one.at_once],
-            version=flown.version or (2025, 12), profile=None,
+            version=version, profile=None,
         )  # fmt: skip
         return [*written, *files.stages, files.revert, files.table]
 
