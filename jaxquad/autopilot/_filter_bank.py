@@ -12,7 +12,7 @@ from jaxquad.records import Record
 from jaxquad.spectra import find_line, SpectralLine
 
 from ._filters import Filter, FilterChain
-from ._firmware import cutoff_of, FilterChoice, FilterOption, firmware_named
+from ._firmware import cutoff_of, FilterChoice, FilterOption, firmware_named, Stage
 from ._flight_channels import FlightChannels, Samples
 from ._law import RateLoop
 from ._parameters import find_parameter, flown_loop, gains_of, store_parameters
@@ -278,10 +278,10 @@ class FilterBank:
     def filters(self, picks: Picks) -> Filters:
         """The responses of each design's filters over those that flew."""
         ones = np.ones((len(picks), self.measured.size), complex)
-        responses = {"gyro": ones, "derivative": ones}
+        responses: dict[Stage, Paths] = {"gyro": ones, "derivative": ones}
         for k, choice in enumerate(self.choices):
             responses[choice.stage] = responses[choice.stage] * self._ratios[k][picks[:, k]]
-        return Filters(responses["gyro"], responses["derivative"])
+        return responses
 
     def beyond(self, picks: Picks) -> Float[np.ndarray, " designs"]:
         """How far the other axes get, over what is allowed: their delay may not grow."""
@@ -295,10 +295,10 @@ class FilterBank:
     def other_noise(self, filters: Filters) -> Float[np.ndarray, " designs"]:
         """Of the other axes' commands, over what flew: rms, and of each frequency not known."""
         if not all(choice.shared for choice in self.choices):  # those of the tuned axis' D term
-            filters = filters._replace(derivative=np.ones_like(filters.derivative))
-        growth = [np.zeros(len(filters.gyro))]
+            filters = {**filters, "derivative": np.ones_like(filters["derivative"])}
+        growth = [np.zeros(len(filters["gyro"]))]
         for slow, quick, noise in self._others:
-            through = (slow + quick * filters.derivative) * filters.gyro
+            through = (slow + quick * filters["derivative"]) * filters["gyro"]
             growth.append(noise_growth(through, slow + quick, noise, self.measured))
         return np.max(growth, axis=0)
 

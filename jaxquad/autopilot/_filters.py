@@ -24,10 +24,6 @@ class Section(NamedTuple):
     b2: Float[Array, "..."] | None = None
     a2: Float[Array, "..."] | None = None
 
-    @property
-    def order(self) -> int:
-        return 1 if self.b2 is None else 2
-
 
 Frequencies = Float[Array | np.ndarray, " frequencies"] | Sequence[float]  # Hz
 Memory = tuple[tuple[Array, ...], ...]  # of each section, in its transposed form
@@ -290,7 +286,7 @@ class FilterChain(eqx.Module):
 
 def rest_of(sections: Sequence[Section], like: Array) -> Memory:
     """What sections remember that have seen nothing but zeros."""
-    return tuple((jnp.zeros_like(like),) * section.order for section in sections)
+    return tuple((jnp.zeros_like(like),) * (1 if section.b2 is None else 2) for section in sections)
 
 
 def run_sections(

@@ -6,7 +6,7 @@ Source: docs/autopilots.md.
 """
 
 import dataclasses
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Literal, NamedTuple, Protocol, runtime_checkable, TypeVar
 
 import equinox as eqx
@@ -16,7 +16,7 @@ from jaxtyping import Bool, Complex, Float
 
 from jaxquad.identify import draw_models, filter_response, KnownFilter, MeasuredChain
 
-from ._firmware import OuterLoop
+from ._firmware import OuterLoop, Stage as FilterStage
 from ._flight_channels import FlownAutopilot, IdentifiedPlant
 from ._identified_log import ThrottleVerdict
 from ._law import linear_responses, RateLoop
@@ -28,6 +28,7 @@ Response = Complex[np.ndarray, " frequencies"]
 Responses = Complex[np.ndarray, "plants frequencies"]
 Paths = Complex[np.ndarray, "designs frequencies"]
 Parts = Complex[np.ndarray, "gains frequencies"]
+Filters = Mapping[FilterStage, Paths]  # of other filters of each design, over those that flew
 Parted = Float[np.ndarray, "designs plants frequencies"]  # of 1 + L
 Gains = Float[np.ndarray, "designs gains"]
 OneGains = Float[np.ndarray, " gains"]
@@ -44,13 +45,6 @@ class LoopQualities(NamedTuple):
     # Root of the integrated square of the rate after a step of torque, relative.
     rejection: Float[np.ndarray, "designs plants"]
     noise: Float[np.ndarray, "designs plants"]  # rms of the command of the gyro's noise, relative
-
-
-class Filters(NamedTuple):
-    """Responses of other filters of each design over those that flew."""
-
-    gyro: Paths
-    derivative: Paths
 
 
 @dataclasses.dataclass(frozen=True)
@@ -114,9 +108,9 @@ class RateLoops:
         """The law from the logged rate to minus the command, and from the set-point to it."""
         if filters is None:
             return gains @ self.feedback, gains @ self.ahead
-        both, slow, quick = filters.gyro, gains[:, :2], gains[:, 2:]
-        back = slow @ self.feedback[:2] + (quick @ self.feedback[2:]) * filters.derivative
-        return back * both, slow @ self.ahead[:2] + (quick @ self.ahead[2:]) * filters.derivative
+        both, slow, quick = filters["gyro"], gains[:, :2], gains[:, 2:]
+        back = slow @ self.feedback[:2] + (quick @ self.feedback[2:]) * filters["derivative"]
+        return back * both, slow @ self.ahead[:2] + (quick @ self.ahead[2:]) * filters["derivative"]
 
     def _qualities(self, feedback: Paths, ahead: Paths) -> LoopQualities:
         plants, cells, gain = _power(self.plants), cells_of(self.omega), _power(feedback)
