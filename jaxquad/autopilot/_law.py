@@ -230,10 +230,6 @@ class FlownLoop(eqx.Module, Generic[RateLaw]):
 
     # What a replay of a log asks for
 
-    def without_gyro_filters(self) -> "FlownLoop":
-        """The law as it acts on the logged rate."""
-        return dataclasses.replace(self, law=self.law.without_gyro_filters())
-
     def moments(
         self, throttle: Series, before: Series, mixer_range: Series | None
     ) -> tuple[Series, ...]:

@@ -86,7 +86,8 @@ def replay_terms(
     rows = grid.rows(
         setpoint, throttle, late, feed_forward, grid.fine(gyro), mixer_range, integral, restart
     )
-    terms = _replayed(flown.without_gyro_filters(), rows)
+    behind = dataclasses.replace(flown, law=flown.law.without_gyro_filters())
+    terms = _replayed(behind, rows)
     return {name: grid.coarse(np.asarray(term)) for name, term in terms.items()}
 
 

@@ -35,6 +35,7 @@ from ._betaflight_law import (
     I_SCALE,
     ItermRelax,
     P_SCALE,
+    SMOOTH_HZ,
     tpa_factor,
 )
 from ._betaflight_log import BETAFLIGHT as LOG
@@ -311,7 +312,6 @@ _ROWS = [
     Parameter("adrc_hover_throttle", "%", 35, 5, 100, True),
     Parameter("adrc_sigma_decay", "0.1/s", 3, 0, 100, True),
 ]
-_SMOOTH_HZ = 50.0  # of the set-point in ANGLE mode
 _SAME_LOOP = 0.05  # of the interval in the header
 
 
@@ -370,7 +370,7 @@ class Betaflight(Firmware):
         level = values.get("levelPID", "").split(",")[0]
         if axis == 2 or not level:
             return None
-        smooth = FilterChain((PT3(_SMOOTH_HZ),), 1 / dt)
+        smooth = FilterChain((PT3(SMOOTH_HZ),), 1 / dt)
         flown = {"angle_p_gain": level}
         return OuterLoop.of(flown, "angle_p_gain", 0.1, 0.0, closed=levelled, smooth=smooth)
 

@@ -25,6 +25,7 @@ from .._law import (
 )
 
 
+SMOOTH_HZ = 50.0  # of the set-point in ANGLE mode
 _BOOSTED = 50.0  # deg/s of set-point, up to which anti-gravity's boost of P is whole
 P_SCALE, I_SCALE, D_SCALE, F_SCALE = 0.032029, 0.244381, 0.000529, 0.013754e-2  # per unit of CLI
 
@@ -381,7 +382,6 @@ class BetaflightAngle(AngleLoop):
 
     - `rate`: the `BetaflightPID` inside.
     - `level`: angle_p_gain, 50 is 5 1/s.
-    - `smooth`: the filters of the rate's set-point; None is a pt3 at 50 Hz.
 
     **Raises:** `ValueError`: the level is not above 0.
     """
@@ -389,14 +389,13 @@ class BetaflightAngle(AngleLoop):
     outer: ClassVar[tuple[str, ...]] = ("level",)
     rate: BetaflightPID
     level: Float[Array, "..."] = per_member(rank=1, converter=as_float, default=50.0)
-    smooth: tuple[Filter, ...] | None = None
 
     def __check_init__(self):
         require_positive("level", self.level, "give angle_p_gain, 50 by default")
 
     @property
     def _smooth(self) -> FilterChain:
-        return FilterChain((PT3(50.0),) if self.smooth is None else self.smooth, 1 / self.dt)
+        return FilterChain((PT3(SMOOTH_HZ),), 1 / self.dt)
 
     def inner(self) -> BetaflightPID:
         return dataclasses.replace(self.rate.levelled(), f=jnp.zeros_like(self.rate.f))
