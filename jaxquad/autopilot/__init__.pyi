@@ -61,7 +61,6 @@ from ._law import (
     FirmwareLoop as FirmwareLoop,
     FlownLoop as FlownLoop,
     LoopState as LoopState,
-    pick_axis as pick_axis,
     RateLoop as RateLoop,
 )
 from ._law_check import check_law as check_law, check_loop as check_loop

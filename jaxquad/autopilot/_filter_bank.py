@@ -276,7 +276,6 @@ class FilterBank:
             self._delays.append(-np.angle(self._ratios[-1][:, low]) / omega[low])
 
     def filters(self, picks: Picks) -> Filters:
-        """The responses of each design's filters over those that flew."""
         ones = np.ones((len(picks), self.measured.size), complex)
         responses: dict[Stage, Paths] = {"gyro": ones, "derivative": ones}
         for k, choice in enumerate(self.choices):

@@ -292,7 +292,6 @@ def rest_of(sections: Sequence[Section], like: Array) -> Memory:
 def run_sections(
     sections: Sequence[Section], memory: Memory, sample: Array
 ) -> tuple[Memory, Array]:
-    """One sample through all sections."""
     after = []
     for section, state in zip(sections, memory, strict=True):
         b0, b1, a1 = (broadcast_gain(x, sample) for x in section[:3])

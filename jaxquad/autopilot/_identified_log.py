@@ -170,7 +170,6 @@ class StepGrid(NamedTuple):
 
     @classmethod
     def of(cls, dt: float) -> "StepGrid":
-        """For a law of this interval."""
         coarse = max(dt, _FINEST)
         count = 2 * int(_PERIOD / coarse / 2)
         omega = 2 * np.pi * np.arange(1, count // 2) / (count * coarse)

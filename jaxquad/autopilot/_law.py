@@ -351,7 +351,6 @@ def sum_of(terms: Terms) -> Signal:
 
 
 def bounded(value: Signal, limit: Array) -> Signal:
-    """`value` within +-`limit`."""
     most = broadcast_gain(limit, value)
     return jnp.clip(value, -most, most)
 

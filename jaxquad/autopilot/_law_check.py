@@ -87,7 +87,6 @@ class LawCheck:
 
     @property
     def flew(self) -> bool:
-        """Whether these gains and filters make the logged terms."""
         return bool(self.terms) and not self.wrong
 
     @property
@@ -260,7 +259,6 @@ class LoopCheck:
 
     @property
     def kind(self) -> Literal["flown", "not flown", "unknown"]:
-        """What the log says of law and plant together."""
         if not self.law.terms:
             return "unknown"
         if not self.law.flew:

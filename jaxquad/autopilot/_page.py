@@ -166,7 +166,6 @@ def steps_section(page: PilotPage) -> PageSection:
 
 
 def again_section(page: PilotPage) -> PageSection:
-    """A part of the flight as logged and as law and plant make it."""
     flight = page.again
     if flight is None:
         return None
@@ -198,7 +197,6 @@ def b0_section(page: PilotPage) -> PageSection:
 
 
 def balance_section(page: PilotPage) -> PageSection:
-    """How large the terms were, and how often motors were at their limits."""
     if not page.terms and not page.motors:
         return None
     image = None
@@ -396,7 +394,6 @@ def motor_rows(flight: FlightChannels) -> list[tuple[str, float, float]]:
 
 
 def stage_rows(proposal: "AutopilotProposal") -> Table:
-    """What each set of gains gives on fresh plants."""
     stages: dict[str, Stage] = dict(zip(WAYS, proposal.stages, strict=True))
     levels = () if proposal.throttle is None else proposal.throttle.logged
     if proposal.filters is not None and proposal.filters.flown and proposal.filters.gains_alone:
@@ -425,7 +422,6 @@ def stage_rows(proposal: "AutopilotProposal") -> Table:
 
 
 def change_rows(changes: Sequence[ParameterChange], words: Sequence[WordChange] = ()) -> Table:
-    """Old, new, unit, range and reason, for the page."""
     rows: Rows = [
         [Cell(row.name), f"{old:.5g}", f"{new:.5g}", row.unit, row.range_text, reason]
         for row, old, new, reason in changes

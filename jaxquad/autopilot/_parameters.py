@@ -159,7 +159,6 @@ def _value_at(law: FirmwareLoop, field: str) -> object:
 
 
 def _replaced(law: Law, field: str, value: Array) -> Law:
-    """The law with another value at a field."""
     if field.startswith("angle."):
         return dataclasses.replace(law, **{field.removeprefix("angle."): value})
     if isinstance(law, AngleLoop):
@@ -204,7 +203,6 @@ def names_by_field(firmware: str, axis: int) -> dict[str, str]:
 
 
 def gains_of(law: RateLoop, axis: int) -> Gains:
-    """P, I and D of one axis."""
     return np.array([float(np.broadcast_to(vars(law)[name], (3,))[axis]) for name in FIELDS])
 
 

@@ -173,7 +173,6 @@ class _Design:
 
     @ft.cached_property
     def choices(self) -> tuple[FilterChoice, ...]:
-        """The filters that could be others."""
         flown, line = self.flown, None if self.noise is None else self.noise.line
         return filter_choices(
             flown.firmware, flown.values, flown.version, axis=flown.axis, throttle=flown.throttle,
@@ -193,7 +192,6 @@ class _Design:
         return {name: flown[name] for name in names}
 
     def filtered(self, loops: Sequence[RateLoops], filters: Mapping[str, float]) -> list[RateLoops]:
-        """The loops with other filters, at each throttle."""
         laws = [flown.with_filters(filters) for flown in self.flown_there]
         return [x.of_law(law, self.flown.axis) for x, law in zip(loops, laws, strict=True)]
 

@@ -451,7 +451,6 @@ def _steps_and_b0(
 
 
 def stage_table(proposal: ADRCProposal, fresh: int) -> Table:
-    """What parameters give on fresh plants, for the page."""
     rows = [[name, *stage.cells()] for name, stage in proposal.stages.items()]
     heads = (
         "parameters", "wc", "wo", "b0", "stable, %", "worst Ms", "worst peak", "crossover, Hz",
