@@ -404,10 +404,7 @@ def stage_rows(proposal: "AutopilotProposal") -> Table:
     ]
     rows: Rows = [
         [
-            name, f"{100 * x.stable:.1f}", f"{x.peak:.2f}", f"{x.resonance:.2f}",
-            f"{x.crossover / (2 * np.pi):.1f}", x.margin_text,
-            f"{x.rejection:.2f}", f"{x.noise:.2f}", *further(x),
-            *(f"{peak:.2f}" for peak in x.peaks[: len(levels)]),
+            name, *x.cells(), *further(x), *(f"{peak:.2f}" for peak in x.peaks[: len(levels)]),
         ]
         for name, x in stages.items()
     ]  # fmt: skip

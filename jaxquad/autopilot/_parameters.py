@@ -203,7 +203,7 @@ def names_by_field(firmware: str, axis: int) -> dict[str, str]:
 
 
 def gains_of(law: RateLoop, axis: int) -> Gains:
-    return np.array([float(np.broadcast_to(vars(law)[name], (3,))[axis]) for name in FIELDS])
+    return np.array([float(np.broadcast_to(vars(law)[name], (3,))[axis]) for name in law.tuned])
 
 
 def gains_in(law: RateLoop, axis: int, parameters: Mapping[str, Number]) -> Gains:

@@ -196,11 +196,7 @@ class AutopilotProposal:
             heads += "" if angle is None else "   Ms angle"
             lines += ["", f"{'on fresh plants':<20} {heads}"]
             for name, stage in zip(WAYS, self.stages, strict=False):
-                row = (
-                    f"{name:<20} {100 * stage.stable:5.1f} % {stage.peak:9.2f} "
-                    f"{stage.resonance:9.2f}   {stage.crossover / (2 * np.pi):8.1f} Hz "
-                    f"{stage.margin_text:>9} ms {stage.rejection:8.2f} {stage.noise:7.2f}"
-                )
+                row = _STAGE.format(name, *stage.cells())
                 row += "" if stage.relaxed is None else f" {stage.relaxed:9.2f}"
                 lines.append(row + ("" if stage.angle is None else f" {stage.angle.peak:10.2f}"))
             lines += [_OF_STAGES, *([_OF_HELD] if relaxed else [])]
@@ -231,6 +227,7 @@ class AutopilotProposal:
         return "\n".join([*lines, "", Message(self.verdict).in_words(lambda summary: below)])
 
 
+_STAGE = "{:<20} {:>5} % {:>9} {:>9}   {:>8} Hz {:>9} ms {:>8} {:>7}"
 _OF_STAGES = """(fresh plants: drawn from what the log leaves possible, not tuned on; Ms and
 resonance: peaks of |S| and of the response to the set-point; torque: the rate after a step of
 torque, noise: that of the command, both over those of what flew)"""

@@ -360,10 +360,13 @@ class Stage(NamedTuple):
     delay_margin: float = float("inf")  # the least, in s
     angle: OuterStage | None = None  # of the angle loop around it
 
-    @property
-    def margin_text(self) -> str:
-        """The least delay margin in ms; none of a loop that is not stable."""
-        return f"{1e3 * self.delay_margin:.1f}" if self.stable == 1 else "none"
+    def cells(self) -> list[str]:
+        """The numbers as text and page print them, the crossover in Hz, the delay margin in ms."""
+        margin = f"{1e3 * self.delay_margin:.1f}" if self.stable == 1 else "none"
+        peaks, effects = (self.peak, self.resonance), (self.rejection, self.noise)
+        peaks, effects = ([f"{x:.2f}" for x in part] for part in (peaks, effects))
+        hertz = self.crossover / (2 * np.pi)
+        return [f"{100 * self.stable:.1f}", *peaks, f"{hertz:.1f}", margin, *effects]
 
     def content(self) -> dict[str, object]:
         return {**self._asdict(), "angle": None if self.angle is None else self.angle._asdict()}

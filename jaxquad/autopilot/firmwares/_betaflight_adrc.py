@@ -87,10 +87,6 @@ class FlownADRC(FlownLoop[BetaflightADRC]):
         """The values that flew, by the names of `PARAMETERS`."""
         return list_parameters(self.law) | self.frame.parameters()
 
-    def design(self, axis: int) -> Design:
-        """wc, wo and b0 of one axis."""
-        return np.array([float(np.broadcast_to(x, (3,))[axis]) for x in self.law.gains().values()])
-
     def at(self, throttle: float) -> BetaflightADRC:
         """The law at a throttle of 0 to 1: dynamic cutoffs and the scale of b0."""
         scale = float(self.schedule.scale(throttle))

@@ -31,6 +31,7 @@ from .._page import (
 from .._parameters import (
     change_table,
     find_parameter,
+    gains_of,
     parameter_file,
     ParameterChange,
     propose_changes,
@@ -127,7 +128,7 @@ def propose_adrc(
     low, high, usual = (
         np.array([getattr(row, name) for row in rows], float) for name in ("low", "high", "default")
     )
-    before = flown.design(place) if isinstance(flown, FlownADRC) else None
+    before = gains_of(flown.law, place) if isinstance(flown, FlownADRC) else None
     if before is not None:
         ways = before / targets.change, before * targets.change
         low, high = (np.clip(x, low, high) for x in ways)
