@@ -193,7 +193,6 @@ def flown_loop(
     )
 
 
-FIELDS = ("p", "i", "d")
 Gains = Float[np.ndarray, " gains"]
 
 
@@ -209,7 +208,7 @@ def gains_of(law: RateLoop, axis: int) -> Gains:
 def gains_in(law: RateLoop, axis: int, parameters: Mapping[str, Number]) -> Gains:
     """P, I and D of parameters; those that are not named stay."""
     gains, names = gains_of(law, axis), names_by_field(law.firmware, axis)
-    for k, field in enumerate(FIELDS):
+    for k, field in enumerate(law.tuned):
         gains[k] = parameters.get(names.get(field, ""), gains[k])
     return gains
 
@@ -217,7 +216,7 @@ def gains_in(law: RateLoop, axis: int, parameters: Mapping[str, Number]) -> Gain
 def parameters_of(law: RateLoop, axis: int, gains: Gains) -> dict[str, float]:
     """The parameters that stand for these gains; a ceiling of D rises with D."""
     names = names_by_field(law.firmware, axis)
-    flown = zip(FIELDS, gains, gains_of(law, axis), strict=True)
+    flown = zip(law.tuned, gains, gains_of(law, axis), strict=True)
     values = {names[field]: float(gain) for field, gain, old in flown if old > 0}
     if (ceiling := law.d_ceiling(axis)) > 1:
         values[names["d_max.ceiling"]] = ceiling * float(gains[2])

@@ -25,7 +25,6 @@ from ._firmware import FilterChoice, firmware_named, OuterLoop, Parameter
 from ._flight_channels import FlownAutopilot
 from ._parameters import (
     ceiling_in,
-    FIELDS,
     find_parameter,
     gains_in,
     gains_of,
@@ -340,7 +339,7 @@ class _Search:
         self.free = np.flatnonzero(self.flown > 0)
         firmware = design.flown.firmware
         names = names_by_field(firmware, design.flown.axis)
-        self.rows = [find_parameter(firmware, names[FIELDS[k]]) for k in self.free]
+        self.rows = [find_parameter(firmware, names[design.flown.law.tuned[k]]) for k in self.free]
         least = np.array([max(row.low, 1e-9) for row in self.rows])
         most = np.array([row.high for row in self.rows])
         self.low = np.clip(self.flown[self.free] / change, least, most)

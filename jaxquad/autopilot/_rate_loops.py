@@ -20,7 +20,6 @@ from ._firmware import OuterLoop, Stage as FilterStage
 from ._flight_channels import FlownAutopilot, IdentifiedPlant
 from ._identified_log import ThrottleVerdict
 from ._law import linear_responses, RateLoop
-from ._parameters import FIELDS
 
 
 Frequencies = Float[np.ndarray, " frequencies"]
@@ -210,8 +209,8 @@ def delay_margin(loop: Responses, omega: Frequencies) -> Float[np.ndarray, " pla
 def law_paths(law: RateLoop, axis: int, omega: Frequencies) -> tuple[Parts, Parts]:
     """Per unit of P, I and D: from the filtered rate to minus the command, from the set-point."""
     bare = law.without_gyro_filters()  # the logged rate is behind them: they are in the plant
-    fields, responses = (*FIELDS, *law.feed_forward), []
-    for name in FIELDS:  # a gain of 1, none of the other two and no feed-forward
+    fields, responses = (*law.tuned, *law.feed_forward), []
+    for name in law.tuned:  # a gain of 1, none of the other two and no feed-forward
         gains = [jnp.full_like(vars(law)["p"], float(field == name)) for field in fields]
         # What `replace` would check anew is known to be right.
         alone = eqx.tree_at(lambda law: [vars(law)[field] for field in fields], bare, gains)
@@ -229,8 +228,8 @@ def forward_path(law: RateLoop, axis: int, omega: Frequencies) -> Response | Non
     if law.of_sticks or not any(np.any(vars(law)[name]) for name in law.feed_forward):
         return None
     without = eqx.tree_at(
-        lambda x: [vars(x)[name] for name in FIELDS],
-        law.without_gyro_filters(), [jnp.zeros_like(vars(law)["p"])] * len(FIELDS),
+        lambda x: [vars(x)[name] for name in law.tuned],
+        law.without_gyro_filters(), [jnp.zeros_like(vars(law)["p"])] * len(law.tuned),
     )  # fmt: skip
     return linear_responses(without.linear(axis), omega)[0]
 
