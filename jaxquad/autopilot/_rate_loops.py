@@ -25,6 +25,7 @@ from ._law import linear_responses, RateLoop
 Frequencies = Float[np.ndarray, " frequencies"]
 Response = Complex[np.ndarray, " frequencies"]
 Responses = Complex[np.ndarray, "plants frequencies"]
+SomePlants = Complex[np.ndarray, "_ frequencies"]  # of one of several loops
 Paths = Complex[np.ndarray, "designs frequencies"]
 Parts = Complex[np.ndarray, "gains frequencies"]
 Filters = Mapping[FilterStage, Paths]  # of other filters of each design, over those that flew
@@ -142,17 +143,17 @@ class RateLoops:
 Loops = TypeVar("Loops", bound=RateLoops)
 
 
-def with_plants(loops: Iterable[Loops], plants: Iterable[Responses]) -> list[Loops]:
+def with_plants(loops: Iterable[Loops], plants: Iterable[SomePlants]) -> list[Loops]:
     """The loops, each with other plants."""
     return [dataclasses.replace(x, plants=y) for x, y in zip(loops, plants, strict=True)]
 
 
-def with_more_plants(loops: Sequence[Loops], more: Iterable[Responses]) -> list[Loops]:
+def with_more_plants(loops: Sequence[Loops], more: Iterable[SomePlants]) -> list[Loops]:
     pairs = zip(loops, more, strict=True)
     return with_plants(loops, (np.concatenate([loop.plants, x]) for loop, x in pairs))
 
 
-def worst_plants(loops: Sequence[RateLoops], gains: Gains, count: int) -> list[Responses]:
+def worst_plants(loops: Sequence[RateLoops], gains: Gains, count: int) -> list[SomePlants]:
     """Those of all loops that have the greatest peaks under these gains."""
     peaks = []
     for x in (loop.qualities(gains) for loop in loops):
