@@ -14,7 +14,6 @@ from ._analysis import (
 )
 from ._bandwidth import attitude_bandwidth as attitude_bandwidth, Bandwidth as Bandwidth
 from ._loop import (
-    after_drive as after_drive,
     CarriesPayload as CarriesPayload,
     ChecksState as ChecksState,
     Controller as Controller,
@@ -22,10 +21,7 @@ from ._loop import (
     LinearisablePlant as LinearisablePlant,
     Loop as Loop,
     Plant as Plant,
-    prepared as prepared,
-    sample_interval as sample_interval,
     Sensor as Sensor,
-    signals_of as signals_of,
 )
 from ._margins import Margins as Margins, margins as margins
 from ._rejection import (

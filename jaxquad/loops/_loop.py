@@ -96,29 +96,6 @@ class ChecksState(Protocol):
     def is_resolved(self, state: PyTree) -> Bool[Array, "*ensemble"]: ...
 
 
-def sample_interval(controller: object) -> float | None:
-    """The interval in s that a controller was made for; None where it has no `dt`."""
-    return getattr(controller, "dt", None)
-
-
-def prepared(controller: Controller) -> Controller:
-    """The controller to run sample by sample."""
-    prepare = getattr(controller, "prepared", None)
-    return controller if prepare is None else prepare()
-
-
-def after_drive(controller: Controller, state: PyTree, achieved: Vector) -> PyTree:
-    """The controller's state once it knows what the drive really gave."""
-    applied = getattr(controller, "applied", None)
-    return state if applied is None else applied(state, achieved)
-
-
-def signals_of(controller: Controller, state: PyTree) -> dict[str, Array]:
-    """What a controller gives to record."""
-    signals = getattr(controller, "signals", None)
-    return {} if signals is None else signals(state)
-
-
 _DEFAULT_DT = 0.002  # s
 # A scheduled controller is tuned and certified: its members fly it at the inertia they are given.
 AnyController = Controller | LinearisableController | ScheduledController | LinearController
@@ -204,7 +181,7 @@ class Loop(eqx.Module):
         dt: float | None = None, substeps: int = 1, bound: float = 100.0,
         longest_delay: float | None = None,
     ):  # fmt: skip
-        dt = (sample_interval(controller) or _DEFAULT_DT) if dt is None else dt
+        dt = (getattr(controller, "dt", None) or _DEFAULT_DT) if dt is None else dt
         if not (dt > 0 and math.isfinite(dt)):
             raise ValueError(f"dt is {dt} s: give a sample interval above 0")
         self.plant, self.controller, self.drive, self.encoder = plant, controller, drive, encoder
@@ -222,7 +199,7 @@ class Loop(eqx.Module):
                 f"the controller is a {type(self.controller).__name__}, which is a plant: give "
                 "jq.Loop(plant, controller, ...)"
             )
-        made_for = sample_interval(self.controller)
+        made_for = getattr(self.controller, "dt", None)
         if made_for is not None and not math.isclose(made_for, self.dt, rel_tol=1e-6):
             raise ValueError(
                 f"the controller was made for samples of {made_for} s, not {self.dt} s: "

@@ -17,18 +17,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 from jaxquad._compile import KEPT, Queue
 from jaxquad._core import align
 from jaxquad.control import Reference, Setpoint
-from jaxquad.loops import (
-    after_drive,
-    CarriesPayload,
-    ChecksState,
-    Controller,
-    Drive,
-    Loop,
-    Plant,
-    prepared,
-    Sensor,
-    signals_of,
-)
+from jaxquad.loops import CarriesPayload, ChecksState, Controller, Drive, Loop, Plant, Sensor
 
 from ._hardware import delay_line, DelayLine
 from ._scenario import Scenario
@@ -162,12 +151,16 @@ class LoopStep(eqx.Module):
         happens, bound = _wide(happens, angle), self.bound
         fine = carry.running & jnp.all(jnp.abs(angle) <= bound, axis=0)
         angle = within(angle, bound)
-        measurement = self._measured(angle + happens.noise)
+        measurement = angle + happens.noise
+        measurement = measurement if self.encoder is None else self.encoder(measurement)
         memory, requested, inputs, achieved, fine = self._answer(carry, measurement, happens, fine)
-        felt, signals = inputs if oldest is None else oldest, signals_of(self.controller, memory)
+        felt = inputs if oldest is None else oldest
+        record = getattr(self.controller, "signals", None)
+        signals = {} if record is None else record(memory)
         following = self._move(carry, memory, felt, happens, fine)
         if oldest is not None:
             following = following._replace(queue=inputs[None])
+        rounding = 1e3 * float(jnp.finfo(requested.dtype).eps)
         result = SampleResult(
             index=index,
             time=index.astype(angle.dtype) * self.dt,
@@ -176,7 +169,7 @@ class LoopStep(eqx.Module):
             reference=happens.reference,
             requested=requested,
             command=jnp.where(fine, achieved, 0),
-            saturated=_falls_short(requested, achieved),
+            saturated=jnp.abs(requested - achieved) > rounding * (1 + jnp.abs(requested)),
             injection=happens.injection,
             disturbance=happens.disturbance,
             signals={
@@ -202,7 +195,8 @@ class LoopStep(eqx.Module):
         fine = fine & are_tame(command, self.ensemble)
         requested = jnp.where(fine, command, 0) + happens.injection
         inputs, achieved = self._driven(requested)
-        memory = after_drive(self.controller, memory, achieved)
+        if applied := getattr(self.controller, "applied", None):
+            memory = applied(memory, achieved)
         fine = fine & are_numbers(memory, self.ensemble)
         return choose(fine, memory, carry.memory, self.ensemble), requested, inputs, achieved, fine
 
@@ -216,9 +210,6 @@ class LoopStep(eqx.Module):
             runs = runs & self.plant.is_resolved(state)
         state, past = choose(runs, (state, past), (carry.state, carry.past), self.ensemble)
         return Carry(state, memory, past, runs)
-
-    def _measured(self, angle: Float[Array, " axes *ensemble"]) -> Float[Array, " axes *ensemble"]:
-        return angle if self.encoder is None else self.encoder(angle)
 
     def _driven(self, command: Float[Array, " axes *ensemble"]) -> tuple[Array, Array]:
         if self.drive is None:
@@ -264,9 +255,11 @@ def require_runnable(controller: object) -> Controller:
 
 def make_step(loop: Loop, ensemble: tuple[int, ...]) -> LoopStep:
     """What runs `loop`, for members of the shape `ensemble`."""
+    controller = require_runnable(loop.controller)
+    prepare = getattr(controller, "prepared", None)
     return LoopStep(
         plant=loop.plant,
-        controller=prepared(require_runnable(loop.controller)),
+        controller=controller if prepare is None else prepare(),
         drive=loop.drive,
         encoder=loop.encoder,
         line=delay_line(loop),
@@ -294,11 +287,6 @@ def _wide(happens: Scenario, like: Float[Array, " axes *ensemble"]) -> Scenario:
 def widen(x: Float[Array, "axes ..."], like: Float[Array, " axes *ensemble"]) -> Array:
     """`x` for every member of the ensemble of `like`, in its precision."""
     return jnp.broadcast_to(align(x, like), like.shape).astype(like.dtype)
-
-
-def _falls_short(requested: Array, achieved: Array) -> Bool[Array, " axes *ensemble"]:
-    rounding = 1e3 * float(jnp.finfo(requested.dtype).eps)
-    return jnp.abs(requested - achieved) > rounding * (1 + jnp.abs(requested))
 
 
 # In SI units no angle, rate, voltage or squared rotor speed comes near it.
@@ -362,21 +350,16 @@ def guarded(
 def _guarded_jvp(sample, ensemble, primals, tangents):
     rest, carry, *others = primals
     following, result = sample(carry, *others)
-    runs = _keep(following.running)
-    out = following._replace(running=runs), jax.tree.map(_keep, result)
+    keep = lambda x: checkpoint_name(x, KEPT)  # for reverse mode: who runs, and what was measured
+    runs = keep(following.running)
+    out = following._replace(running=runs), jax.tree.map(keep, result)
     carry = choose(runs, carry, rest, ensemble)
     moved = jax.jvp(sample, (carry, *others), tangents[1:])[1]
     still = jax.tree.map(lambda t: t if _is_void(t) else jnp.zeros_like(t), moved)
     return out, choose(runs, moved, still, ensemble)
 
 
-def _keep(x: Array) -> Array:
-    """For reverse mode: who runs, and what was measured."""
-    return checkpoint_name(x, KEPT)
-
-
-def _is_void(tangent: Array) -> bool:
-    """Of an integer, which has no tangent."""
+def _is_void(tangent: Array) -> bool:  # of an integer, which has no tangent
     return tangent.dtype == jax.dtypes.float0
 
 
