@@ -27,6 +27,4 @@ from ._margins import Margins as Margins, margins as margins
 from ._rejection import (
     disturbance_rejection as disturbance_rejection,
     Rejection as Rejection,
-    rms_response as rms_response,
-    RmsResponse as RmsResponse,
 )

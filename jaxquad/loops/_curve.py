@@ -333,12 +333,10 @@ def evaluate_curve(
         values, others, basis, errors = _propagate(search, curve, *args)
     if is_concrete(basis.finite) and not bool(basis.finite):
         bad = np.asarray(curve.omega)[~np.isfinite(np.asarray(curve(curve.omega)))]
-        where = (
-            f"at {bad[0]:.6g} rad/s" if bad.size else "once closed or multiplied with a spectrum"
-        )
+        where = f"at {bad[0]:.6g} rad/s" if bad.size else "once closed"
         raise ValueError(
             f"the response is not finite {where}: choose omega= without the poles on the imaginary "
-            "axis (of 1 / (1 + L) too), and a spectrum of 0 or more"
+            "axis (of 1 / (1 + L) too)"
         )
     values = values | others
     if curve.coherence is not None:  # the lesser of the two points beside each frequency
