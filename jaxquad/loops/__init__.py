@@ -23,8 +23,9 @@ from ._loop import (
     Plant as Plant,
     Sensor as Sensor,
 )
-from ._margins import Margins as Margins, margins as margins
-from ._rejection import (
+from ._margins import (
     disturbance_rejection as disturbance_rejection,
+    Margins as Margins,
+    margins as margins,
     Rejection as Rejection,
 )

@@ -30,8 +30,7 @@ from ._linear_loop import (
     sharpest,
 )
 from ._loop import Loop
-from ._margins import margins
-from ._rejection import disturbance_rejection
+from ._margins import disturbance_rejection, margins
 
 
 _LOWEST, _BEYOND, _POINTS = 1e-5, 1.0005, 500  # of pi / dt; a crossing may lie at pi / dt itself
