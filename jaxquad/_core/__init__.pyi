@@ -12,6 +12,7 @@ from ._arrays import (
     mark_members as mark_members,
     match_reference as match_reference,
     multiply_gains as multiply_gains,
+    of_one_rank as of_one_rank,
     on_host as on_host,
     per_member as per_member,
     pick_gain as pick_gain,

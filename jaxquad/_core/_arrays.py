@@ -290,10 +290,17 @@ def match_reference(
     return jax.tree.map(lambda x: broadcast_gain(x, measurement), reference)
 
 
-def multiply_gains(a: Float[Array, "..."], b: Float[Array, "..."]) -> Float[Array, "..."]:
-    """The product of two gains; the one with fewer trailing axes holds for all members."""
+Numbers = TypeVar("Numbers", jax.Array, np.ndarray)
+
+
+def of_one_rank(a: Numbers, b: Numbers) -> tuple[Numbers, Numbers]:
+    """Both with as many axes; the one with fewer trailing axes holds for all members."""
     rank = max(a.ndim, b.ndim)
-    a, b = (x.reshape(x.shape + (1,) * (rank - x.ndim)) for x in (a, b))
+    return a.reshape(a.shape + (1,) * (rank - a.ndim)), b.reshape(b.shape + (1,) * (rank - b.ndim))
+
+
+def multiply_gains(a: Numbers, b: Numbers) -> Numbers:
+    a, b = of_one_rank(a, b)
     return a * b
 
 

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Key
 
-from jaxquad._core import as_float, require_all_positive
+from jaxquad._core import as_float, multiply_gains, require_all_positive
 from jaxquad.loops import Loop
 from jaxquad.models import DecoupledAxes, Multirotor
 
@@ -26,7 +26,6 @@ from ._members import (
     FACTORS,
     MemberPayload,
     Members,
-    multiply,
     nominal_value,
     Payload,
     plant_inertia,
@@ -339,17 +338,17 @@ class Ensemble(eqx.Module):
             delay, longest = drawn["delay"], latest("delay")
         payload = None
         if "payload added" in distributions:
-            inertia = wide(multiply(plant_inertia(nominal), drawn["payload added"]))
+            inertia = wide(multiply_gains(plant_inertia(nominal), drawn["payload added"]))
             at, until = wide(drawn["payload at"])[0], np.full((n,), np.inf)
             if "payload width" in distributions:
                 until = at + wide(drawn["payload width"])[0]
             parts = map(as_float, (inertia, at, until))
             payload = MemberPayload(*parts, latest=latest("payload at"))
-        believed = multiply(plant_inertia(nominal), drawn["inertia"])
+        believed = multiply_gains(plant_inertia(nominal), drawn["inertia"])
         return Members(
             plant=vary_plant(plant, drawn),
             delay=as_float(wide(delay)[0]),
-            assumed_inertia=as_float(wide(multiply(believed, drawn["assumed_inertia"]))),
+            assumed_inertia=as_float(wide(multiply_gains(believed, drawn["assumed_inertia"]))),
             keys=make_member_keys(key, n),
             noise=as_float(wide(drawn["noise"])) if "noise" in distributions else None,
             gust=as_float(wide(drawn["gust"])) if "gust" in distributions else None,

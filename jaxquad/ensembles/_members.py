@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Int, Key, PyTree
 
 from jaxquad._compile import brief_options, Jit
-from jaxquad._core import as_float, is_concrete, mark_members, per_member
+from jaxquad._core import as_float, is_concrete, mark_members, multiply_gains, per_member
 from jaxquad.control import schedule_for_flight
 from jaxquad.loops import Drive, Loop, Sensor
 from jaxquad.models import Attitude, DecoupledAxes, MotorLag, Multirotor
@@ -43,9 +43,9 @@ def vary_plant(plant: VariablePlant, drawn: Drawn) -> VariablePlant:
     names = ("damping", "stiffness", "coulomb")
     values = {name: drawn.get(name, nominal_value(plant, name)) for name in names}
     changed = {name: value for name, value in values.items() if value is not None}
-    inertia = multiply(plant_inertia(plant), drawn["inertia"])
+    inertia = multiply_gains(plant_inertia(plant), drawn["inertia"])
     if isinstance(plant, DecoupledAxes):
-        gain = multiply(np.asarray(plant.torque_gain), drawn["torque_gain"])
+        gain = multiply_gains(np.asarray(plant.torque_gain), drawn["torque_gain"])
         return DecoupledAxes(gain, inertia, lag=drawn.get("lag", plant.lag), **changed)
     attitude = Attitude(inertia, rotor_inertia=plant.attitude.rotor_inertia, **changed)
     motor = MotorLag(drawn["lag"][0]) if "lag" in drawn else plant.motor
@@ -65,13 +65,6 @@ def plant_inertia(plant: VariablePlant) -> Numbers:
 def count_axes(plant: VariablePlant) -> int:
     """How many angles a plant turns by."""
     return 3 if isinstance(plant, Multirotor) else plant.shape[0]
-
-
-def multiply(a: Numbers, b: Numbers) -> Numbers:
-    """The product; the one with fewer trailing axes holds for all members."""
-    rank = max(a.ndim, b.ndim)
-    a, b = (x.reshape(x.shape + (1,) * (rank - x.ndim)) for x in (a, b))
-    return a * b
 
 
 class Payload(eqx.Module):

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Shaped
 
-from jaxquad._core import align, per_member, whole_samples
+from jaxquad._core import align, of_one_rank, per_member, whole_samples
 
 from ._step import SampleResult
 
@@ -99,11 +99,7 @@ def share_beyond(
     limit: Float[Array, "axes ..."], signal: Float[Array, "samples axes ..."], span: Window
 ) -> Float[Array, "axes ..."]:
     """Share of the window's samples in which a signal exceeds a limit in size."""
-    rows = limit.astype(signal.dtype)[None]
-    rank = max(rows.ndim, signal.ndim)
-    rows, signal = (x.reshape(x.shape + (1,) * (rank - x.ndim)) for x in (rows, signal))
-    shape = jnp.broadcast_shapes(rows.shape, signal.shape)
-    rows, signal = jnp.broadcast_to(rows, shape), jnp.broadcast_to(signal, shape)
+    rows, signal = of_one_rank(limit.astype(signal.dtype)[None], signal)
     within = _inside(span.first, span.last, signal)
     beyond = (jnp.abs(signal) > rows * (1 + _ROUNDING)) & within
     count = jnp.asarray(span.last - span.first + 1).astype(rows.dtype)

@@ -10,7 +10,15 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from jaxquad._compile import Queue
-from jaxquad._core import align, as_float, ensemble_shape, is_concrete, per_member
+from jaxquad._core import (
+    align,
+    as_float,
+    ensemble_shape,
+    is_concrete,
+    multiply_gains,
+    of_one_rank,
+    per_member,
+)
 from jaxquad.loops import Drive, Loop, Plant
 from jaxquad.models import Allocation, QUANSER_HOVER
 
@@ -348,12 +356,11 @@ def find_authority(
             rows.append(jnp.minimum(*(jnp.abs(x) for x in both)))
         most = jnp.stack(rows)
         most = jnp.where(most < 0.99 * _ALL, most, jnp.inf)
-    command = jnp.minimum(*_same(most, limits[0]))
+    command = jnp.minimum(*of_one_rank(most, limits[0]))
     forward = jnp.full_like(gain, jnp.inf)  # the command at which the first motor stops
     if isinstance(drive, HasForwardLimit):
         forward = drive.forward_limit(axes).astype(gain.dtype)
-    limits = (command, forward)
-    return Authority(gain, command, *(jnp.multiply(*_same(gain, x)) for x in limits))
+    return Authority(gain, command, *(multiply_gains(gain, x) for x in (command, forward)))
 
 
 def warn_beyond_authority(drive_authority: Authority | None, scenario: Scenario) -> None:
@@ -390,13 +397,6 @@ def beyond_authority(drive_authority: Authority | None, scenario: Scenario) -> l
                 )
                 break
     return messages
-
-
-def _same(a: Array, b: Array) -> tuple[Array, Array]:
-    members = max(a.ndim, b.ndim)
-    a, b = (x.reshape(x.shape + (1,) * (members - x.ndim)) for x in (a, b))
-    shape = jnp.broadcast_shapes(a.shape, b.shape)
-    return jnp.broadcast_to(a, shape), jnp.broadcast_to(b, shape)
 
 
 def _span(values: ArrayLike) -> str:
