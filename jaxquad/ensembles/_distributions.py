@@ -9,7 +9,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Key
 
-from jaxquad._core import as_array, is_concrete
+from jaxquad._core import as_array, is_concrete, require_finite, require_positive
 
 
 Numbers = Float[np.ndarray, "..."]  # [] or [axes]
@@ -32,20 +32,6 @@ def row(value: Numbers) -> Float[np.ndarray, "axes 1"]:
 def number(value: Numbers) -> str:
     """For a table: one number, or one for each axis."""
     return "/".join(f"{float(x):.4g}" for x in np.atleast_1d(value))
-
-
-def check_finite(**values: Numbers) -> None:
-    """Raise ValueError for the first of the named values that is not finite."""
-    for name, value in values.items():
-        if not np.all(np.isfinite(value)):
-            raise ValueError(f"{name} is {number(value)}: a distribution needs finite numbers")
-
-
-def check_above_zero(remedy: str, **values: Numbers) -> None:
-    """Raise ValueError for the first of the named values that is not above 0 and finite."""
-    for name, value in values.items():
-        if not np.all((value > 0) & np.isfinite(value)):
-            raise ValueError(f"{name} is {number(value)}, but it must be above 0: {remedy}")
 
 
 def check_axes(**values: Numbers) -> None:
@@ -114,7 +100,7 @@ class Fixed(Distribution):
 
     def __check_init__(self):
         check_axes(value=self.value)
-        check_finite(value=self.value)
+        require_finite("value", self.value)
 
     def quantile(self, u: Shares) -> Values:
         return row(self.value) + np.zeros_like(u)
@@ -149,7 +135,7 @@ class Choice(Distribution):
     def __check_init__(self):
         if self.values.ndim != 1 or self.values.size < 2:
             raise ValueError(f"Choice has values {self.values}: give two or more in one row")
-        check_finite(values=self.values)
+        require_finite("values", self.values)
 
     def quantile(self, u: Shares) -> Values:
         count = self.values.size
@@ -197,7 +183,8 @@ class Uniform(Distribution):
 
     def __check_init__(self):
         check_axes(low=self.low, high=self.high)
-        check_finite(low=self.low, high=self.high)
+        require_finite("low", self.low)
+        require_finite("high", self.high)
         if not np.all(self.low < self.high):
             raise ValueError(
                 f"a distribution from {number(self.low)} to {number(self.high)} is empty: give low "
@@ -228,9 +215,8 @@ class LogUniform(Uniform):
 
     def __check_init__(self):
         Uniform.__check_init__(self)  # what it says comes first
-        check_above_zero(
-            "a ratio needs it; use jq.ensembles.Uniform for a range with 0", low=self.low
-        )
+        remedy = "a ratio needs it; use jq.ensembles.Uniform for a range with 0"
+        require_positive("low", self.low, remedy)
 
     def quantile(self, u: Shares) -> Values:
         low, high = row(self.low), row(self.high)
@@ -260,8 +246,8 @@ class Normal(Distribution):
 
     def __check_init__(self):
         check_axes(deviation=self.deviation, mean=self._mean)
-        check_above_zero(_DEVIATION, deviation=self.deviation)
-        check_finite(mean=self._mean)
+        require_positive("deviation", self.deviation, _DEVIATION)
+        require_finite("mean", self._mean)
 
     @property
     def _mean(self) -> Numbers:
@@ -314,8 +300,8 @@ class LogNormal(Distribution):
 
     def __check_init__(self):
         check_axes(deviation=self.deviation, median=self.median)
-        check_above_zero(_DEVIATION, deviation=self.deviation)
-        check_above_zero("logarithms need it", median=self.median)
+        require_positive("deviation", self.deviation, _DEVIATION)
+        require_positive("median", self.median, "logarithms need it")
 
     def quantile(self, u: Shares) -> Values:
         return row(self.median) * np.exp(row(self.deviation) * normal_scores(u))

@@ -14,7 +14,7 @@ from jaxquad._compile import brief_options, Jit
 from jaxquad.control import LinearController
 from jaxquad.records import AXES
 
-from ._curve import decibels, degrees, first, lines, shown
+from ._curve import crossings, decibels, degrees, lines, shown
 from ._linear_loop import (
     abscissa,
     close,
@@ -471,8 +471,8 @@ def _window(parts: LinearParts) -> GainWindow:
     exists, ratio = jnp.any(inside), parts.ratio
 
     crossed = jnp.stack([~inside[:-1] & inside[1:], inside[:-1] & ~inside[1:]])
-    roots = jax.lax.stop_gradient(jax.vmap(lambda where: first(rate, factors, where))(crossed))
-    edges = jax.vmap(newton_step)(roots)
+    roots = jax.vmap(lambda where: crossings(rate, factors, where)[0])(crossed)
+    edges = jax.vmap(newton_step)(jax.lax.stop_gradient(roots))
     is_open = jnp.stack([inside[0], inside[-1]])
     edges = jnp.where(is_open, jnp.array([0.0, jnp.inf], edges.dtype), edges) * ratio
     return GainWindow(*jnp.where(exists, edges, jnp.nan))

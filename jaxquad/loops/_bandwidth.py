@@ -8,13 +8,14 @@ from ._curve import (
     ambiguous,
     Basis,
     crossed,
+    crossings,
     Curve,
     curve_of,
     degrees,
     evaluate_curve,
     Evaluated,
-    first,
     lines,
+    Numbers,
     Response,
     shown,
 )
@@ -91,26 +92,18 @@ def doubtful_bandwidth(result: "Bandwidth") -> list[str]:
 _POINTS = 64  # of a model, even in frequency from w180 to 2 w180
 
 
-def two_point_delay(
+def _phase_delays(
     curve: Curve, phase: Float[Array, " frequencies"], w180: Float[Array, ""], top: Float[Array, ""]
-) -> Float[Array, ""]:
-    """Phase lost from w180 to 2 w180, over 2 w180: in s, `nan` beyond `top`."""
-    exists = 2 * w180 <= top
-    start = jnp.where(exists, w180, curve.omega[0])
-    ends = _phase_at(curve, phase, jnp.stack([start, 2 * start]))
-    return jnp.where(exists, (ends[0] - ends[1]) / (2 * start), jnp.nan)
+) -> Numbers:
+    """Phase delays in s, `nan` past `top`: the phase lost from w180 to 2 w180, over 2 w180; and
+    half the slope of the straight line through the phase between them.
 
-
-def fitted_delay(
-    curve: Curve, phase: Float[Array, " frequencies"], w180: Float[Array, ""], top: Float[Array, ""]
-) -> Float[Array, ""]:
-    """Half the slope of the straight line through the phase from w180 to 2 w180: s, `nan` past top.
-
-    A measured phase counts at its own frequencies with the coherence weight of Tischler & Remple,
-    eq. (11.4); a model's at 64 even ones.
+    There a measured phase counts at its own frequencies with the coherence weight of Tischler &
+    Remple, eq. (11.4); a model's at 64 even ones.
     """
     exists = 2 * w180 <= top
     start = jnp.where(exists, w180, curve.omega[0])
+    ends = _phase_at(curve, phase, jnp.stack([start, 2 * start]))
     if curve.coherence is None:
         points = start * jnp.linspace(1, 2, _POINTS, dtype=start.dtype)
         weights = jnp.ones_like(points)
@@ -123,7 +116,11 @@ def fitted_delay(
     centred = x - jnp.sum(weights * x) / total
     spread = jnp.sum(weights * centred**2)
     slope = jnp.sum(weights * centred * y) / jnp.where(spread > 0, spread, 1.0)
-    return jnp.where(exists & (jnp.sum(weights > 0) >= 3), -slope / (2 * start), jnp.nan)
+    fits = exists & (jnp.sum(weights > 0) >= 3)
+    return {
+        "phase_delay": jnp.where(exists, (ends[0] - ends[1]) / (2 * start), jnp.nan),
+        "phase_delay_fit": jnp.where(fits, -slope / (2 * start), jnp.nan),
+    }
 
 
 def _phase_at(
@@ -242,9 +239,7 @@ def _numbers(curve: Curve, start: Float[Array, ""] | None) -> Evaluated:
         "phase_bandwidth": by_phase,
         "gain_bandwidth": by_gain,
         "omega_180": w180,
-        "phase_delay": two_point_delay(curve, phase, w180, top),
-        "phase_delay_fit": fitted_delay(curve, phase, w180, top),
-    }
+    } | _phase_delays(curve, phase, w180, top)
     counts = {
         "gain_crossings": crossings,
         "phase_crossings": jnp.maximum(*passes).astype(w180.dtype),
@@ -261,7 +256,7 @@ def _falls_through(
     def beyond(omega):
         return jnp.angle(curve(omega) * turn)
 
-    return first(beyond, curve.omega, crossed(phase - target, "falling") & clear)
+    return crossings(beyond, curve.omega, crossed(phase - target, "falling") & clear)[0]
 
 
 def _gain_bandwidth(
@@ -278,4 +273,5 @@ def _gain_bandwidth(
     grid = jnp.log(jnp.abs(values)) - jax.lax.stop_gradient(level)
     where = crossed(grid, "falling") & (curve.omega[:-1] < place) & exists
     nearest = -jnp.arange(where.size, dtype=place.dtype)
-    return first(excess, curve.omega, where, nearest), jnp.sum(where).astype(place.dtype)
+    bandwidth = crossings(excess, curve.omega, where, rank=nearest)[0]
+    return bandwidth, jnp.sum(where).astype(place.dtype)

@@ -239,16 +239,6 @@ def crossings(
     return jnp.where(exists, root, jnp.nan)
 
 
-def first(
-    residual: Residual,
-    omega: Float[Array, " frequencies"],
-    where: Bool[Array, " intervals"],
-    rank: Float[Array, " intervals"] | None = None,
-) -> Float[Array, ""]:
-    """The one root of lowest rank, `nan` if there is none."""
-    return crossings(residual, omega, where, rank=rank)[0]
-
-
 def between(
     residual: Residual, low: Float[Array, " points"], high: Float[Array, " points"]
 ) -> Float[Array, " points"]:
@@ -289,7 +279,6 @@ class Basis(eqx.Module):
 
     @property
     def where(self) -> str:
-        """The band in words."""
         return f"within {float(self.band[0]):.4g}..{float(self.band[1]):.4g} rad/s"
 
     @property
@@ -409,12 +398,10 @@ def shown(
 
 
 def degrees(value: Float[Array, ""] | float, error: Float[Array, ""] | float | None) -> str:
-    """An angle in rad as degrees."""
     return shown(value, error, "deg", float(np.degrees(1.0)))
 
 
 def decibels(value: Float[Array, ""] | float, error: Float[Array, ""] | float | None) -> str:
-    """A ratio in dB."""
     if not np.isfinite(value):
         return "-"
     scale = 20 / np.log(10)

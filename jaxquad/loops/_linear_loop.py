@@ -131,19 +131,6 @@ def noise_gain(
     return jnp.sqrt(power) + moved / (2 * jnp.sqrt(jnp.where(power > 0, power, jnp.inf)))
 
 
-def balance(matrix: Float[Array, "states states"]) -> Float[Array, " states"]:
-    """Scales of the states for which rows and columns are of one size (Osborne)."""
-    size = jax.lax.stop_gradient(jnp.abs(matrix)) * (1 - jnp.eye(len(matrix), dtype=matrix.dtype))
-    scale = jnp.ones(len(matrix), matrix.dtype)
-    for _ in range(_SWEEPS):
-        now = size * scale[None] / scale[:, None]
-        row, column = jnp.sum(now, axis=1), jnp.sum(now, axis=0)
-        usable = (row > 0) & (column > 0)
-        ratio = jnp.where(usable, row, 1.0) / jnp.where(usable, column, 1.0)
-        scale = scale * ratio**0.25  # half of the step: all states move at once
-    return scale
-
-
 def _turned(ladder: Powers) -> Powers:
     return Powers(jnp.swapaxes(ladder.matrices, 1, 2), ladder.logs)
 
@@ -429,7 +416,6 @@ def _ahead(angle: Float[Array, " points"]) -> Complex[Array, " points"]:
 
 
 def join(plant: SampledAxis, controller: LinearController) -> OpenLoop:
-    """Frequency responses of the loop."""
     inputs = jnp.stack([plant.fresh, plant.stale, plant.push], axis=1)
     first = jnp.zeros_like(plant.fresh).at[0].set(1)
     angle = rational(plant.transition, inputs, first, jnp.zeros_like(inputs[0]))
@@ -451,8 +437,16 @@ class ClosedLoopMatrix(eqx.Module):
     through: Float[Array, ""]
 
     def balanced(self) -> "ClosedLoopMatrix":
-        """The same loop in states whose units do not matter."""
-        scale = balance(self.matrix)
+        """The same loop in states for which rows and columns are of one size (Osborne)."""
+        fixed, unit = jax.lax.stop_gradient(self.matrix), jnp.eye(len(self.matrix))
+        size = jnp.abs(fixed) * (1 - unit.astype(fixed.dtype))
+        scale = jnp.ones(len(fixed), fixed.dtype)
+        for _ in range(_SWEEPS):
+            now = size * scale[None] / scale[:, None]
+            row, column = jnp.sum(now, axis=1), jnp.sum(now, axis=0)
+            usable = (row > 0) & (column > 0)
+            ratio = jnp.where(usable, row, 1.0) / jnp.where(usable, column, 1.0)
+            scale = scale * ratio**0.25  # half of the step: all states move at once
         matrix = self.matrix * scale[None] / scale[:, None]
         return ClosedLoopMatrix(matrix, self.noise / scale, self.command * scale, self.through)
 

@@ -8,7 +8,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Bool, Float, PyTree
 
-from jaxquad._core import as_float, per_member
+from jaxquad._core import as_float, per_member, require_sample_interval
 from jaxquad.control import LinearController, LinearisableController, Reference, ScheduledController
 from jaxquad.models import LinearAxis, Multirotor
 
@@ -182,8 +182,7 @@ class Loop(eqx.Module):
         longest_delay: float | None = None,
     ):  # fmt: skip
         dt = (getattr(controller, "dt", None) or _DEFAULT_DT) if dt is None else dt
-        if not (dt > 0 and math.isfinite(dt)):
-            raise ValueError(f"dt is {dt} s: give a sample interval above 0")
+        require_sample_interval(dt)
         self.plant, self.controller, self.drive, self.encoder = plant, controller, drive, encoder
         self.dt, self.substeps, self.bound = float(dt), substeps, float(bound)
         self.queue, self.longest_delay = DelayQueue.of(delay, self.dt, longest_delay), longest_delay

@@ -21,7 +21,6 @@ from ._curve import (
     degrees,
     evaluate_curve,
     Evaluated,
-    first,
     lines,
     Numbers,
     only_finite,
@@ -397,7 +396,8 @@ def _rejection_of(curve: Curve, quantity: str, unstable_poles: Float[Array, ""])
 
     level = jnp.log(jnp.abs(sensitivity(curve.omega)))
     rises = crossed(jax.lax.stop_gradient(level) - _LEVEL, "rising")
-    bandwidth = first(lambda w: jnp.log(jnp.abs(sensitivity(w))) - _LEVEL, curve.omega, rises)
+    deficit = lambda w: jnp.log(jnp.abs(sensitivity(w))) - _LEVEL
+    bandwidth = crossings(deficit, curve.omega, rises)[0]
     (peak, at), (other, there) = (_peak(f, curve) for f in (sensitivity, complement))
     loop = jax.lax.stop_gradient(curve(curve.omega))
     unknown = jnp.asarray(jnp.nan, level.dtype)

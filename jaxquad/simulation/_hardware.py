@@ -18,6 +18,7 @@ from jaxquad._core import (
     multiply_gains,
     of_one_rank,
     per_member,
+    require_limit,
 )
 from jaxquad.loops import Drive, Loop, Plant
 from jaxquad.models import Allocation, QUANSER_HOVER
@@ -139,11 +140,7 @@ class Saturation(eqx.Module):
     limit: Float[Array, "..."] = per_member(rank=1, converter=as_float)  # of |u|; [], [axes, ...]
 
     def __check_init__(self):
-        if is_concrete(self.limit) and not np.all(np.asarray(self.limit) > 0):
-            raise ValueError(
-                f"limit is {self.limit}, but it must be above 0: it bounds the command on both "
-                "sides, in the command's unit"
-            )
+        require_limit(self.limit)
 
     def inputs(self, command: Float[Array, " axes *ensemble"]) -> Float[Array, " axes *ensemble"]:
         """The command within the limit."""

@@ -14,7 +14,14 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Key, PyTree
 
 from jaxquad._compile import brief_options, Jit
-from jaxquad._core import as_float, ensemble_shape, per_member, require_all_positive, whole_samples
+from jaxquad._core import (
+    as_float,
+    ensemble_shape,
+    per_member,
+    require_all_nonnegative,
+    require_all_positive,
+    whole_samples,
+)
 from jaxquad.excitation import Excitation
 from jaxquad.records import AXES
 
@@ -226,15 +233,8 @@ def excite(
             f"a signal of shape {shape} in V: give at least 2 finite samples, for instance the "
             ".signal of jq.sweep(...)"
         )
-    for name, value, least in (
-        ("dt", dt, 0.0),
-        ("torque_corner", torque_corner, 0.0),
-        ("torque_noise", torque_noise, -1e-300),
-        ("sensor_noise", sensor_noise, -1e-300),
-    ):
-        if not least < value < np.inf:
-            bound = "above 0" if least == 0 else "0 or above"
-            raise ValueError(f"{name} is {value}: it is {bound} and finite")
+    require_all_positive(dt=dt, torque_corner=torque_corner)
+    require_all_nonnegative(torque_noise=torque_noise, sensor_noise=sensor_noise)
     levels = as_float([torque_noise, torque_corner, sensor_noise])
     return _excited(as_float(signal), key, levels, float(dt), AXES.index(axis))
 
@@ -270,7 +270,6 @@ def require_memory(what: str, needed: float | int, remedy: str) -> None:
 
 
 def size_of(tree: PyTree) -> int:
-    """The bytes of its arrays."""
     return sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(tree) if isinstance(x, _SIZED))
 
 
