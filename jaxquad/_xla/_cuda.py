@@ -224,7 +224,6 @@ template <typename T> __device__ void fetch(const T *first, int rows, int apart)
 
 
 def type_of(kind: np.dtype) -> str:
-    """The type in C."""
     return TYPES[kind.name]
 
 

@@ -232,8 +232,6 @@ Value = Any  # an array, or the number of a literal
 
 
 def no_fuse(function: Callable[..., PyTree], *args: PyTree) -> PyTree:
-    """`function(*args)` as a call that the CPU's compiler does not fuse with what is around it."""
-
     def run(*args: PyTree) -> PyTree:
         with set_xla_metadata(inlineable="true"):  # `jnp.where` and its like are calls themselves
             return function(*args)
@@ -248,7 +246,6 @@ _LARGE = 1024  # elements, from which on no call costs more than recomputing
 
 
 def evaluate_once(function: Callable[..., PyTree], *, least: int) -> Callable[..., PyTree]:
-    """See the door's, `jaxquad._compile.evaluate_once`."""
     if jax.default_backend() != "cpu":
         return function
 

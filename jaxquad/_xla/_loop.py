@@ -101,7 +101,6 @@ class Loop(NamedTuple):
 
     @property
     def count(self) -> int:
-        """Samples."""
         return self.segments.count
 
     @property

@@ -39,7 +39,6 @@ _said: dict[str, None] = {}
 
 
 def set_kernel(kernel: str) -> None:
-    """Raises ValueError for another word."""
     plain_loops.set_global(_checked(kernel, "kernel") == "off")
 
 
@@ -94,14 +93,12 @@ _BRIEF = {_EMITTERS: False, _LEVEL: 2}
 
 
 def brief_options() -> dict[str, Any]:
-    """`compiler_options()` for programs that take longer to compile than they run."""
     if jax.default_backend() != "cpu":
         return {}
     return compiler_options() | {k: v for k, v in _BRIEF.items() if not _is_chosen(k) and _takes(k)}
 
 
 def hasty_options() -> dict[str, Any]:
-    """For programs without loops over time that run a few times: hardly any optimisation."""
     level = {_LEVEL: 0}
     return level if _is_chosen(_EMITTERS) or not _takes(_EMITTERS) else level | {_EMITTERS: False}
 

@@ -93,8 +93,6 @@ class Payload(eqx.Module):
 
 
 class MemberPayload(eqx.Module):
-    """The payload of each member."""
-
     inertia: Float[Array, "axes members"] = per_member(rank=1)  # kg m^2
     at: Float[Array, " members"] = per_member(rank=0)  # s
     until: Float[Array, " members"] = per_member(rank=0)  # s

@@ -115,8 +115,6 @@ def _inside(
 
 
 class Sample(NamedTuple):
-    """What metrics need of a sample."""
-
     index: Int[Array, ""]
     angle: Float[Array, " axes *ensemble"]
     reference: Float[Array, " axes *ensemble"]
@@ -200,7 +198,6 @@ class _Moment:
 
     @ft.cached_property
     def starts(self) -> Array:
-        """Whether a part of the flight starts here."""
         return ft.reduce(jnp.logical_or, [self.now.index == a for a in self.of.steps.first])
 
     @ft.cached_property

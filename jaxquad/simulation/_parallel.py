@@ -337,8 +337,6 @@ def over_cores(
 
 
 class _Part(NamedTuple):
-    """How an ensemble is parted."""
-
     members: int
     width: int  # members of a part
     varies: list[bool]  # which leaves have the members on the last axis

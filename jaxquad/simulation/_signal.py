@@ -157,14 +157,12 @@ def spread(
 
 
 def fit(signal: Float[Known, "samples ..."], members: tuple[int, ...]) -> Known:
-    """The signal as wide as `members`."""
     missing = len(members) - (signal.ndim - 1)
     aligned = signal.reshape(signal.shape[:1] + (1,) * missing + signal.shape[1:])
     return widened(aligned, signal.shape[:1] + members)
 
 
 def widened(x: Float[Known, "..."], shape: tuple[int, ...]) -> Float[Known, "..."]:
-    """`x` broadcast to a shape."""
     return (jnp if isinstance(x, jax.Array) else np).broadcast_to(x, shape)
 
 

@@ -254,7 +254,6 @@ def require_runnable(controller: object) -> Controller:
 
 
 def make_step(loop: Loop, ensemble: tuple[int, ...]) -> LoopStep:
-    """What runs `loop`, for members of the shape `ensemble`."""
     controller = require_runnable(loop.controller)
     prepare = getattr(controller, "prepared", None)
     return LoopStep(

@@ -43,8 +43,6 @@ if TYPE_CHECKING:
 
 
 class _Idle(eqx.Module):
-    """The controller that does nothing."""
-
     def init(self, like: Float[Array, " axes *ensemble"]) -> None:
         return None
 

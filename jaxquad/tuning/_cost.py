@@ -55,8 +55,6 @@ class Subproblem(NamedTuple):
 
 
 class CostResult(NamedTuple):
-    """One evaluation of the cost of each problem."""
-
     value: Float[Array, " problems"]
     gradient: Float[Array, "problems n"]
     cost: Float[Array, " problems"]  # the objective, without what limits add

@@ -73,8 +73,6 @@ class LBFGS(eqx.Module):
 
 
 class Descent(NamedTuple):
-    """Where each problem ended."""
-
     z: Float[np.ndarray, "problems n"]
     value: Float[np.ndarray, " problems"]
     gradient: Float[np.ndarray, "problems n"]
@@ -268,7 +266,6 @@ class _Squares(eqx.Module):
 
 
 def require_squares(objective: Objective, limits: Sequence[Limit]) -> None:
-    """Raise ValueError for what is no sum of squares."""
     odd = [name for name in objective.terms if name != "itae"]
     odd += [f"limit on {limit.quantity}" for limit in limits]
     if not isinstance(objective.risk, Mean):

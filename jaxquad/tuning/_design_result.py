@@ -358,8 +358,6 @@ _OF_ALL = tuple(
 
 
 class Flown(NamedTuple):
-    """What a flight was, by members."""
-
     numbers: dict[str, Float[np.ndarray, "axes members"]]
     diverged: Bool[np.ndarray, " members"]
     greatest: Float[np.ndarray, " members"]  # rad, the error at any time and of any axis

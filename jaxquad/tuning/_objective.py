@@ -121,7 +121,6 @@ def split_quantities(wanted: Collection[str]) -> tuple[tuple[str, ...], tuple[st
 
 
 def require_quantity(name: str) -> None:
-    """Raise ValueError for a quantity that does not exist."""
     if name not in QUANTITIES:
         raise ValueError(f"there is no quantity {name!r}: choose one of {', '.join(QUANTITIES)}")
 
@@ -139,7 +138,6 @@ class _Titled(Protocol):
 
 
 def risk_text(risk: Risk) -> str:
-    """The `text` of a risk, or the name of its class."""
     return risk.text if isinstance(risk, _Titled) else type(risk).__name__.lower()
 
 
@@ -280,7 +278,6 @@ def is_gated(quantity: str) -> bool:
 
 
 def require_bound(quantity: str, bound: Float[Array, "..."]) -> None:
-    """Raise ValueError for a bound that has no level."""
     require_finite(f"the bound of {quantity}", bound)
     if QUANTITIES[quantity].logarithmic:
         name = f"the bound of {quantity}, which counts by its logarithm,"

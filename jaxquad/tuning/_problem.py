@@ -64,7 +64,6 @@ class Coordinates(eqx.Module):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The name of each tuned number."""
         names = () if self.parameters is None else self.parameters.names
         return names + tuple(place.name for block in self.blocks for place in block.places)
 
@@ -74,7 +73,6 @@ class Coordinates(eqx.Module):
         return frozenset(name.partition("[")[0] for name in self.names)
 
     def controller_at(self, z: Float[Array, " n"]) -> PyTree:
-        """The controller with its tuned numbers set."""
         controller, first = self.controller, 0
         if self.parameters is not None:
             first = self.parameters.count
@@ -87,7 +85,6 @@ class Coordinates(eqx.Module):
         return controller
 
     def values(self, z: Float[np.ndarray, " n"]) -> dict[str, float]:
-        """The tuned numbers by name."""
         tuned = eqx.filter(build_design(self, as_array(z)), eqx.is_inexact_array)
         leaves = [np.asarray(x).reshape(-1) for x in jax.tree.leaves(tuned)]
         places = {place.name: place for place in name_places(self.controller)}
@@ -209,8 +206,6 @@ _FULL_FLIGHT = TimeSpan()
 
 
 class LinearLoops(eqx.Module):
-    """The linear loops of members."""
-
     axes: DecoupledAxes  # the plant near level flight
     delay: Float[Array, " members"]  # s
     assumed_inertia: Float[Array, "axes members"]  # kg m^2
@@ -220,7 +215,6 @@ class LinearLoops(eqx.Module):
 
     @property
     def members(self) -> int:
-        """How many there are."""
         return self.assumed_inertia.shape[-1]
 
     def replaced(self, places: Int[np.ndarray, " some"], others: "LinearLoops") -> "LinearLoops":
@@ -279,7 +273,6 @@ class Problem(eqx.Module):
 
     @property
     def members(self) -> int:
-        """How many are flown."""
         return self.linear.members
 
     def loop_around(self, controller: PyTree) -> Loop:
@@ -357,7 +350,6 @@ def decouple(plant: object) -> DecoupledAxes:
 
 
 def require_ensemble(ensemble: object) -> None:
-    """Raise ValueError for what is neither an ensemble nor members of one."""
     if not isinstance(ensemble, Ensemble | Members):
         raise ValueError(
             f"ensemble is a {type(ensemble).__name__}: give jq.Ensemble(inertia=...), or "
@@ -366,7 +358,6 @@ def require_ensemble(ensemble: object) -> None:
 
 
 def require_same_rate(loop: Loop, members: Members) -> None:
-    """Raise ValueError for members that were drawn around a loop of another sample interval."""
     if not np.isclose(loop.dt, members.dt, rtol=1e-6):
         raise ValueError(
             f"the members were drawn around a loop with dt = {members.dt} s, but this one has "
