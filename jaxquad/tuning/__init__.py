@@ -15,7 +15,6 @@ from ._design_result import (
     DesignResult as DesignResult,
     DesignSummary as DesignSummary,
     LinearMembers as LinearMembers,
-    share_interval as share_interval,
     upper_bound as upper_bound,
 )
 from ._objective import (

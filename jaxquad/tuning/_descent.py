@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
+from jaxquad._core import require_all_positive
 from jaxquad.simulation import SampleResult, scan_loop
 
 from ._cost import SMOOTHING
@@ -65,11 +66,7 @@ class LBFGS(eqx.Module):
             raise ValueError(
                 f"evaluations is {self.evaluations} and memory {self.memory}: give 1 or more"
             )
-        if not (self.longest_step > 0 and self.first_step > 0):
-            raise ValueError(
-                f"longest_step is {self.longest_step} and first_step {self.first_step}: give "
-                "nepers above 0"
-            )
+        require_all_positive(longest_step=self.longest_step, first_step=self.first_step)
 
 
 class Descent(NamedTuple):

@@ -134,35 +134,22 @@ def with_further(design: DesignResult, further: LinearMembers | None) -> DesignR
     )
 
 
-def upper_bound(count: int, draws: int, *, level: float = 0.95) -> float:
-    """The share that the true one exceeds with a probability of at most 1 - `level`, where `count`
-    of `draws` independent members showed the event: the exact one-sided bound.
+def upper_bound(count: int, draws: int) -> float:
+    """The share that the true one exceeds with a probability of at most 5 %, where `count` of
+    `draws` independent members showed the event: the exact one-sided bound.
 
     None of 256 bounds the share by 1.2 %, none of 2304 by 0.13 %.
     Source: Clopper and Pearson, Biometrika 26 (1934).
 
-    **Raises:** ValueError for fewer draws than counted, or a level that is not between 0 and 1.
+    **Raises:** ValueError for fewer draws than counted.
     """
     if not (0 <= count <= draws and draws >= 1):
         raise ValueError(f"{count} of {draws} members: give 1 draw or more, and a count among them")
-    if not 0 < level < 1:
-        raise ValueError(f"level is {level}: give a confidence between 0 and 1, such as 0.95")
     if count == draws:
         return 1.0
     from scipy.special import betaincinv
 
-    return float(betaincinv(count + 1, draws - count, level))
-
-
-def share_interval(count: int, draws: int, *, level: float = 0.95) -> tuple[float, float]:
-    """The lower and the upper end of a share; the true one lies beyond each with (1 - `level`) / 2.
-
-    Arguments, source and errors are those of `jq.tuning.upper_bound`.
-    171 of 256 bound the share by 60.7 and 72.5 %, 1408 of 2000 by 68.3 and 72.4 %.
-    """
-    one_sided = 0.5 * (1 + level)
-    low = 1 - upper_bound(draws - count, draws, level=one_sided)
-    return low, upper_bound(count, draws, level=one_sided)
+    return float(betaincinv(count + 1, draws - count, 0.95))
 
 
 class Statistics(NamedTuple):

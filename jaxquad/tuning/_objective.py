@@ -132,13 +132,8 @@ class Risk(Protocol):
     def __call__(self, values: Float[Array, " members"], /) -> Float[Array, ""]: ...
 
 
-@runtime_checkable
-class _Titled(Protocol):
-    text: str
-
-
 def risk_text(risk: Risk) -> str:
-    return risk.text if isinstance(risk, _Titled) else type(risk).__name__.lower()
+    return getattr(risk, "text", type(risk).__name__.lower())
 
 
 class Mean(eqx.Module):

@@ -65,7 +65,10 @@ class Distance(NamedTuple):
         demand = f"{shown.title}, {self.over}, {self.sense} {shown.text(self.bound)}"
         if np.isnan(self.reached):
             return f"{demand}: not known, because the scenario or the controller does not have it"
-        beyond = self._beyond
+        beyond = f", {self.beyond} of {self.members} members beyond" if covers(self) else ""
+        if beyond and self.beyond_at_most is not None:
+            most = 100 * self.beyond_at_most
+            beyond += f" (proven: at most {most:.2g} % of all, 95 % confidence)"
         if self.without:
             finite = np.isfinite(self.of_others)
             others = f"; of the others {shown.text(self.of_others)}" if finite else ""
@@ -79,27 +82,10 @@ class Distance(NamedTuple):
         share = f" ({abs(self.percent):.2g} %)" if np.isfinite(self.percent) else ""
         return f"{demand}: {shown.text(self.reached)}, {by}{share}{beyond}"
 
-    @property
-    def _beyond(self) -> str:
-        """How many members are beyond the limit, and what that proves of all."""
-        if not covers(self):
-            return ""
-        count = f", {self.beyond} of {self.members} members beyond"
-        if self.beyond_at_most is None:
-            return count
-        most = 100 * self.beyond_at_most
-        return f"{count} (proven: at most {most:.2g} % of all, 95 % confidence)"
-
 
 def covers(distance: Distance) -> bool:
     """Whether every single member has to keep the limit, and not a mean or a quantile."""
     return distance.over == "worst"
-
-
-def beyond_limit(design: DesignResult, distance: Distance) -> Bool[np.ndarray, " members"]:
-    """Which members are beyond the bound themselves; a number that is not known counts as so."""
-    sign = 1.0 if distance.sense == "at most" else -1.0
-    return ~(sign * _with_unstable(design, distance.quantity) <= sign * distance.bound)
 
 
 def measure_distances(
@@ -304,12 +290,13 @@ def judge_stability(
     missed.sort(key=lambda d: -np.inf if np.isnan(d.percent) else d.percent)
     failures += [f"{d}{'' if d.member is None else f' ({place(d.member)})'}" for d in missed]
     proven = independent and not failures
-    kept, others = _split(distances, covers)
+    kept, others = [x for x in distances if covers(x)], [x for x in distances if not covers(x)]
     unstable = np.zeros(every.members, bool) if every.unstable is None else every.unstable
     if further is None:
         text = _within(design, unstable | design.diverged, kept, "members are stable", proven)
     else:
-        linear, flown = _split(kept, lambda x: QUANTITIES[x.quantity].linear)
+        linear = [x for x in kept if QUANTITIES[x.quantity].linear]
+        flown = [x for x in kept if x not in linear]
         text = _within(every, unstable, linear, "members are stable", proven)
         text += f"; {_within(design, design.diverged, flown, 'flights are bounded', proven)}"
     if failures:
@@ -319,19 +306,14 @@ def judge_stability(
     return Verdict("STABILITY", True, f"{text}{met}")
 
 
-def _split(
-    distances: Sequence[Distance], chosen: Callable[[Distance], bool]
-) -> tuple[list[Distance], list[Distance]]:
-    return [x for x in distances if chosen(x)], [x for x in distances if not chosen(x)]
-
-
 def _within(
     design: DesignResult, lost: Bool[np.ndarray, " members"], kept: Sequence[Distance], what: str,
     proven: bool,
 ) -> str:  # fmt: skip
     """How many members are neither lost nor beyond a limit that each has to keep, as a sentence."""
-    for distance in kept:
-        lost = lost | beyond_limit(design, distance)
+    for distance in kept:  # beyond it is a number that is not known, too
+        sign = 1.0 if distance.sense == "at most" else -1.0
+        lost = lost | ~(sign * _with_unstable(design, distance.quantity) <= sign * distance.bound)
     titles = _titles(kept)
     within = f" and within the limit{'s' * (len(titles) > 1)} on {joined(titles)}" if titles else ""
     return f"{_count(~lost)} {what}{within}{_share(lost, 'are not', proven)}"
