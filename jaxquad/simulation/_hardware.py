@@ -1,7 +1,6 @@
 """Actuators within their limits and the torque they have, a sensor that counts, and delays."""
 
 import warnings
-from typing import Protocol, runtime_checkable
 
 import equinox as eqx
 import jax
@@ -9,7 +8,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from jaxquad._compile import Queue
 from jaxquad._core import (
     align,
     as_float,
@@ -191,14 +189,6 @@ class DelayLine(eqx.Module):
     further: int = eqx.field(static=True)  # how many inputs are kept beyond the queue
     splits: bool = eqx.field(static=True)  # whether there are early inputs at all
 
-    def queue(self, inputs: Float[Array, " inputs *ensemble"]) -> Queue | None:
-        """Before the first sample the plant feels `inputs`."""
-        return _repeated(inputs, self.fewest)
-
-    def init(self, inputs: Float[Array, " inputs *ensemble"]) -> Float[Array, "past ..."] | None:
-        """The inputs that have left the queue."""
-        return _repeated(inputs, self.further)
-
     def share(self, like: Array) -> Float[Array, "*members"]:
         """Of a sample interval that belongs to the early inputs."""
         samples = self.samples.astype(like.dtype)
@@ -219,10 +209,6 @@ class DelayLine(eqx.Module):
         samples = jnp.floor(self.samples).astype(int) - self.fewest
         late = _of_age(waiting, samples)
         return waiting[:-1], _of_age(waiting, samples + 1) if self.splits else late, late
-
-
-def _repeated(inputs: Float[Array, " inputs *ensemble"], count: int) -> Array | None:
-    return jnp.broadcast_to(inputs, (count, *inputs.shape)) if count else None
 
 
 def _of_age(queue: Float[Array, "ages ..."], age: Array) -> Array:
@@ -285,29 +271,6 @@ class Authority(eqx.Module):
         return "\n".join(["torque authority", *rows])
 
 
-@runtime_checkable
-class HasTorqueGain(Protocol):
-    """A plant that knows its torque in N m per unit of command, [axes, *ensemble]."""
-
-    @property
-    def torque_gain(self) -> Float[Array, " axes *ensemble"]: ...
-
-
-@runtime_checkable
-class HasLimit(Protocol):
-    """A drive or controller that bounds the command, [axes, *ensemble]."""
-
-    @property
-    def limit(self) -> Float[ArrayLike, "..."]: ...
-
-
-@runtime_checkable
-class HasForwardLimit(Protocol):
-    """A drive whose motors have a direction."""
-
-    def forward_limit(self, axes: int) -> Float[Array, " axes *ensemble"]: ...
-
-
 def authority(
     plant: Plant, drive: Drive | None = None, controller: object | None = None
 ) -> Authority:
@@ -335,12 +298,17 @@ def authority(
 def find_authority(
     plant: Plant, drive: Drive | None, controller: object | None
 ) -> Authority | None:
-    """`authority`, or None for a plant whose torque per unit of command is not known."""
-    if not isinstance(plant, HasTorqueGain):
+    """`authority`, or None for a plant whose torque per unit of command is not known.
+
+    What a drive has is asked for by name: a `limit` [axes, *ensemble], as controllers have, and
+    `forward_limit(axes)` where its motors have a direction.
+    """
+    torque_gain = getattr(plant, "torque_gain", None)
+    if torque_gain is None:
         return None
-    gain = jnp.atleast_1d(as_float(plant.torque_gain))
-    limit_of = lambda part: part.limit if isinstance(part, HasLimit) else jnp.inf
-    limits = [jnp.atleast_1d(as_float(limit_of(part))) for part in (controller, drive)]
+    gain = jnp.atleast_1d(as_float(torque_gain))
+    limits = [getattr(part, "limit", jnp.inf) for part in (controller, drive)]
+    limits = [jnp.atleast_1d(as_float(x)) for x in limits]
     axes = max(len(x) for x in (gain, *limits))
     gain = jnp.broadcast_to(gain, (axes, *gain.shape[1:]))
     most = jnp.full_like(gain, jnp.inf)
@@ -355,8 +323,8 @@ def find_authority(
         most = jnp.where(most < 0.99 * _ALL, most, jnp.inf)
     command = jnp.minimum(*of_one_rank(most, limits[0]))
     forward = jnp.full_like(gain, jnp.inf)  # the command at which the first motor stops
-    if isinstance(drive, HasForwardLimit):
-        forward = drive.forward_limit(axes).astype(gain.dtype)
+    if (forward_limit := getattr(drive, "forward_limit", None)) is not None:
+        forward = forward_limit(axes).astype(gain.dtype)
     return Authority(gain, command, *(multiply_gains(gain, x) for x in (command, forward)))
 
 

@@ -119,7 +119,9 @@ def placed(loop: Loop, scenario: Scenario, devices: DeviceChoice) -> tuple[Run, 
         return run, chosen
     chosen = where_put(run) if chosen is None else chosen
     require_same({name: vars(loop)[name] for name in _PARTS} | {"scenario": scenario}, chosen)
-    return movable(run, chosen), chosen
+    # What is bound to other devices than these is bound to none.
+    bound = lambda x: is_concrete_array(x) and x.committed and x.devices() != set(chosen or ())
+    return jax.tree.map(lambda x: _unbound(x) if bound(x) else x, run), chosen
 
 
 def loop_over_devices(
@@ -231,13 +233,6 @@ def where_put(tree: PyTree) -> Devices | None:
     default = getattr(jax.config, "jax_default_device", None)
     wishes = wishes or ([{default}] if isinstance(default, jax.Device) else [])
     return tuple(sorted(max(wishes, key=len), key=lambda x: x.id)) if wishes else None
-
-
-def movable(tree: PyTree, places: Devices | None) -> PyTree:
-    """The same, with arrays that are bound to other devices than these bound to none."""
-    kept = set(places or ())
-    bound = lambda x: is_concrete_array(x) and x.committed and x.devices() != kept
-    return jax.tree.map(lambda x: _unbound(x) if bound(x) else x, tree)
 
 
 def gathered(tree: PyTree) -> PyTree:

@@ -18,7 +18,7 @@ from jaxquad.records import AXES, Record
 from ._hardware import Authority, find_authority, warn_beyond_authority
 from ._parallel import DeviceChoice, Devices, loop_over_devices, over_cores, placed
 from ._scenario import require_memory, Scenario, size_of
-from ._step import are_sound, Carry, guarded, LoopStep, make_step, require_runnable, SampleResult
+from ._step import Carry, guarded, LoopStep, make_step, require_runnable, SampleResult
 
 
 @pytree_node
@@ -131,21 +131,9 @@ def simulate(loop: Loop, scenario: Scenario, *, devices: DeviceChoice = None) ->
     run, places = placed(loop, scenario, devices)
     flown = over_cores(_run, run, (), places, check=_require_room)
     (stored, diverged), authority = flown
-    angle, measurement, command, saturated, signals = stored
     warn_beyond_authority(authority, scenario)
-    time = _times(loop.dt, angle.shape[0], angle.dtype)
-    return Simulation(
-        time,
-        angle,
-        measurement,
-        command,
-        saturated,
-        signals,
-        diverged,
-        scenario,
-        loop.dt,
-        authority,
-    )
+    time = _times(loop.dt, stored[0].shape[0], stored[0].dtype)
+    return Simulation(time, *stored, diverged, scenario, loop.dt, authority)
 
 
 @ft.lru_cache(maxsize=8)
@@ -244,8 +232,11 @@ def scan_loop(
     To be jitted by the caller, after `check_run`.
     """
     job, ensemble = (loop, scenario, accumulator), ensemble_shape(loop, scenario)
-    most = _most_at_once(job, ensemble)
-    if len(ensemble) != 1 or ensemble[0] <= most:
+    if len(ensemble) != 1 or ensemble[0] <= _FEW:
+        return _run_members(job, ensemble)
+    carry, total = jax.eval_shape(lambda: _begin(job, ensemble)[1])
+    most = most_at_once((carry._replace(queue=None), total), ensemble[0])
+    if ensemble[0] <= most:
         return _run_members(job, ensemble)
     arrays, rest = eqx.partition(job, eqx.is_array)
 
@@ -258,13 +249,6 @@ def scan_loop(
 
 _Job = tuple[Loop, Scenario, Accumulator]
 _FEW = 16  # members that are one chunk
-
-
-def _most_at_once(job: _Job, ensemble: tuple[int, ...]) -> int:
-    if math.prod(ensemble) <= _FEW:
-        return _FEW
-    carry, total = jax.eval_shape(lambda: _begin(job, ensemble)[1])
-    return most_at_once((carry._replace(queue=None), total), ensemble[-1])
 
 
 def _begin(job: _Job, ensemble: tuple[int, ...]) -> tuple[LoopStep, tuple[Carry, PyTree]]:
@@ -280,7 +264,10 @@ def _run_members(
 ) -> tuple[PyTree, PyTree, Bool[Array, "*ensemble"]]:
     step, (start, total) = _begin(job, ensemble)
     _, scenario, accumulator = job
-    sound = are_sound(eqx.filter((step, start, total, scenario, accumulator), eqx.is_array))
+    # A member runs where the first number of every array is one.
+    numbers = eqx.filter((step, start, total, scenario, accumulator), eqx.is_array)
+    firsts = [jnp.ravel(x)[:1] for x in jax.tree.leaves(numbers)]
+    sound = ft.reduce(jnp.logical_and, [jnp.all(x == x) for x in firsts], jnp.ones((), bool))
     queue, start = start.queue, start._replace(running=start.running & sound, queue=None)
     arrays, static = eqx.partition((step, accumulator), eqx.is_array)
 

@@ -16,7 +16,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
 from jaxquad._compile import KEPT, Queue
 from jaxquad._core import align
-from jaxquad.control import Reference, Setpoint
+from jaxquad.control import Setpoint
 from jaxquad.loops import CarriesPayload, ChecksState, Controller, Drive, Loop, Plant, Sensor
 
 from ._hardware import delay_line, DelayLine
@@ -135,8 +135,9 @@ class LoopStep(eqx.Module):
     def begin(self, state: PyTree, like: Float[Array, " axes *ensemble"]) -> Carry:
         """At rest: before the first command arrives, the inputs are those of none."""
         line, inputs = self.line, self._driven(like)[0]
-        past = None if line is None else line.init(inputs)
-        queue = None if line is None else line.queue(inputs)
+        waiting = lambda count: jnp.broadcast_to(inputs, (count, *inputs.shape)) if count else None
+        further, fewest = (0, 0) if line is None else (line.further, line.fewest)
+        past, queue = waiting(further), waiting(fewest)
         return Carry(state, self.controller.init(like), past, jnp.ones(self.ensemble, bool), queue)
 
     def sample(
@@ -148,9 +149,12 @@ class LoopStep(eqx.Module):
         `oldest` are the inputs that leave the queue; the next carry's queue has the newest alone.
         """
         angle = self.plant.measure(carry.state)
-        happens, bound = _wide(happens, angle), self.bound
+        bound, parts = self.bound, happens.parts  # one scenario for all members of an ensemble
+        widen = lambda x: jnp.broadcast_to(align(x, angle), angle.shape).astype(angle.dtype)
+        where = lambda h: [vars(h)[name] for name in parts]
+        happens = eqx.tree_at(where, happens, [widen(x) for x in parts.values()])
         fine = carry.running & jnp.all(jnp.abs(angle) <= bound, axis=0)
-        angle = within(angle, bound)
+        angle = jnp.clip(jnp.where(jnp.isnan(angle), bound, angle), -bound, bound)
         measurement = angle + happens.noise
         measurement = measurement if self.encoder is None else self.encoder(measurement)
         memory, requested, inputs, achieved, fine = self._answer(carry, measurement, happens, fine)
@@ -186,7 +190,11 @@ class LoopStep(eqx.Module):
         fine: Bool[Array, "*ensemble"],
     ) -> tuple[PyTree, Array, Array, Array, Array]:  # fmt: skip
         """The controller's memory, what it asked for, what the drive makes of it, who is fine."""
-        memory, command = self.controller.step(carry.memory, _setpoint(happens), measurement)
+        reference, slopes = happens.reference, (happens.rate, happens.acceleration)
+        if any(x is not None for x in slopes):
+            still = jnp.zeros_like(reference)
+            reference = Setpoint(reference, *(still if x is None else x for x in slopes))
+        memory, command = self.controller.step(carry.memory, reference, measurement)
         if command.shape != measurement.shape:
             raise ValueError(
                 f"the controller's command has the shape {command.shape}, but {measurement.shape} "
@@ -197,7 +205,8 @@ class LoopStep(eqx.Module):
         inputs, achieved = self._driven(requested)
         if applied := getattr(self.controller, "applied", None):
             memory = applied(memory, achieved)
-        fine = fine & are_numbers(memory, self.ensemble)
+        # No float is nan; inf may be a bound or a spread that is not known.
+        fine = fine & _members(memory, self.ensemble, lambda x: ~jnp.isnan(x))
         return choose(fine, memory, carry.memory, self.ensemble), requested, inputs, achieved, fine
 
     def _move(
@@ -269,49 +278,13 @@ def make_step(loop: Loop, ensemble: tuple[int, ...]) -> LoopStep:
     )
 
 
-def _setpoint(happens: Scenario) -> Reference:
-    if happens.rate is None and happens.acceleration is None:
-        return happens.reference
-    still = jnp.zeros_like(happens.reference)
-    rate, acceleration = (still if x is None else x for x in (happens.rate, happens.acceleration))
-    return Setpoint(happens.reference, rate, acceleration)
-
-
-def _wide(happens: Scenario, like: Float[Array, " axes *ensemble"]) -> Scenario:
-    """One scenario for all members of an ensemble."""
-    wide = {name: widen(x, like) for name, x in happens.parts.items()}
-    return eqx.tree_at(lambda h: [vars(h)[name] for name in wide], happens, list(wide.values()))
-
-
-def widen(x: Float[Array, "axes ..."], like: Float[Array, " axes *ensemble"]) -> Array:
-    """`x` for every member of the ensemble of `like`, in its precision."""
-    return jnp.broadcast_to(align(x, like), like.shape).astype(like.dtype)
-
-
 # In SI units no angle, rate, voltage or squared rotor speed comes near it.
 VAST = 1e9
-
-
-def within(x: Float[Array, " axes *ensemble"], bound: float) -> Float[Array, " axes *ensemble"]:
-    """`x` kept within +-`bound`, and without a nan."""
-    return jnp.clip(jnp.where(jnp.isnan(x), bound, x), -bound, bound)
 
 
 def are_tame(tree: PyTree, ensemble: tuple[int, ...]) -> Bool[Array, "*ensemble"]:
     """Whether every float of a member is finite and not vast."""
     return _members(tree, ensemble, lambda x: jnp.abs(x) <= VAST)
-
-
-def are_numbers(tree: PyTree, ensemble: tuple[int, ...]) -> Bool[Array, "*ensemble"]:
-    """Whether no float of a member is nan (inf may be a bound or a spread that is not known)."""
-    return _members(tree, ensemble, lambda x: ~jnp.isnan(x))
-
-
-def are_sound(tree: PyTree) -> Bool[Array, ""]:
-    """Whether the first number of every array is one."""
-    firsts = [jnp.ravel(x)[:1] for x in jax.tree.leaves(tree)]
-    checks = [jnp.all(x == x) for x in firsts]
-    return ft.reduce(jnp.logical_and, checks, jnp.ones((), bool))
 
 
 def choose(
