@@ -44,7 +44,6 @@ from ._signal import (
     Motion as Motion,
     Pulse as Pulse,
     Ramp as Ramp,
-    ReferenceModel as ReferenceModel,
     Signal as Signal,
     Sine as Sine,
     SmoothStep as SmoothStep,

@@ -114,8 +114,8 @@ def scenario(
     - `reference` (rad), `noise` (rad), `disturbance` (N m), `injection` (units of the command) and
         `payload` (kg m^2, added to the plant's inertia): a map from an axis, by name or number, to
         a signal, or one signal for every axis. A signal is a `jq.Step`, `jq.Pulse`,
-        `jq.simulation.Ramp`, `.SmoothStep`, `.Sine`, `.ReferenceModel`, `.Gust`, `.WhiteNoise`, a
-        sum of them, a `jq.excitation.Excitation`, or an array [samples, *ensemble].
+        `jq.simulation.Ramp`, `.SmoothStep`, `.Sine`, `.Gust`, `.WhiteNoise`, a sum of them, a
+        `jq.excitation.Excitation`, or an array [samples, *ensemble].
     - `feed_forward`: the controller also gets the reference's rate and acceleration, which are zero
         for signals that jump.
     - `ensemble`: the number of members, each of which draws its own noise from `key`.

@@ -8,7 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float, Int, Key, PyTree
+from jaxtyping import Array, ArrayLike, Float, Int, Key
 
 from jaxquad._core import (
     as_float,
@@ -278,55 +278,6 @@ class Sine(Signal):
         angle = omega * clock.dt * count + self.phase
         waves = (np.sin(angle), omega * np.cos(angle), -(omega**2) * np.sin(angle))
         return Motion(*(spread(wave * (count >= 0), self.amplitude) for wave in waves))
-
-
-class ReferenceModel(Signal):
-    """A signal seen through wn^2 / (s^2 + 2 zeta wn s + wn^2), from rest at zero.
-
-    What a pilot's command model does: the set-point becomes one that the vehicle can follow, with
-    the rate and acceleration for feed-forward. Exact for a signal held between samples.
-
-    **Arguments:**
-
-    - `signal`: the set-point as it is asked for, a `Signal` or a number.
-    - `natural_frequency`: wn in rad/s.
-    - `damping`: zeta, without unit; 1 does not overshoot.
-
-    **Raises:**
-
-    - `ValueError`: wn or zeta is not above 0.
-    """
-
-    signal: Signal = eqx.field(converter=as_signal)
-    natural_frequency: float = eqx.field(static=True, kw_only=True)  # rad/s
-    damping: float = eqx.field(static=True, default=1.0, kw_only=True)
-
-    def __check_init__(self):
-        require_all_positive(natural_frequency=self.natural_frequency, damping=self.damping)
-
-    @property
-    def random(self) -> bool:
-        return self.signal.random
-
-    def sample(self, clock: Clock, key: Key[Array, ""] | None) -> Motion:
-        from scipy.linalg import expm
-
-        command = self.signal.sample(clock, key).value
-        stiffness, friction = self.natural_frequency**2, 2 * self.damping * self.natural_frequency
-        model = [[0.0, 1.0, 0.0], [-stiffness, -friction, stiffness], [0.0, 0.0, 0.0]]
-        advance = np.asarray(expm(clock.dt * np.array(model))[:2], command.dtype)
-        angle, rate = _follow(advance, command)
-        return Motion(angle, rate, stiffness * (command - angle) - friction * rate)
-
-
-@jax.jit
-def _follow(advance: Float[Array, "2 3"], command: Float[Array, " samples *ensemble"]) -> PyTree:
-    def sample(state, now):
-        joined = jnp.concatenate([state, now[None]])
-        return jnp.tensordot(advance, joined, 1, precision="highest"), (state[0], state[1])
-
-    start = jnp.zeros((2, *command.shape[1:]), command.dtype)
-    return jax.lax.scan(sample, start, command)[1]
 
 
 def _between(

@@ -1,12 +1,10 @@
-"""What happens to a loop: signals against closed forms, scipy and python-control."""
+"""What happens to a loop: signals against closed forms."""
 
-import control
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import scipy.integrate
 
 from jaxquad.excitation import sweep
 from jaxquad.simulation import (
@@ -15,7 +13,6 @@ from jaxquad.simulation import (
     Motion,
     Pulse,
     Ramp,
-    ReferenceModel,
     Scenario,
     scenario,
     Signal,
@@ -107,18 +104,6 @@ def test_a_smooth_step_has_the_rate_of_the_least_jerk_and_comes_to_rest():
     assert made.rate is not None and made.acceleration is not None
     assert np.max(made.rate) == pytest.approx(15 / 8 * 0.3 / 2.0, rel=1e-12)
     assert made.reference[-1, 0] == 0.3 and made.rate[-1, 0] == made.acceleration[-1, 0] == 0
-
-
-def test_a_reference_model_answers_a_step_as_its_transfer_function_does():
-    model = ReferenceModel(Step(0.2, at=1.0), natural_frequency=4.0, damping=0.7)
-    made = scenario(duration=DURATION, axes=1, reference={0: model}, feed_forward=True)
-    assert made.rate is not None and made.acceleration is not None
-    time = TIME[: 5000 - 500]
-    response = control.step_response(control.tf([16.0], [1.0, 5.6, 16.0]), time).outputs
-    np.testing.assert_allclose(made.reference[500:, 0], 0.2 * np.asarray(response), atol=1e-9)
-    # Angle and rate are integrals of what is fed forward.
-    rate = scipy.integrate.cumulative_trapezoid(np.asarray(made.acceleration)[500:, 0], dx=DT)
-    np.testing.assert_allclose(rate, np.asarray(made.rate)[501:, 0], atol=1e-5)
 
 
 def test_signals_add():
