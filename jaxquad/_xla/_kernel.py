@@ -323,8 +323,7 @@ def _key_of(arg: Value) -> Value:
 
 
 def _bind(equation: JaxprEqn, args: Sequence[Value]) -> list[Value]:
-    bound = equation.primitive.get_bind_params(equation.params)
-    functions, params = bound if isinstance(bound, tuple) else ((), bound)  # before jax 0.10, both
+    params = equation.primitive.get_bind_params(equation.params)
     with equation.ctx.manager:  # without it `no_fuse` would be lost
-        results = equation.primitive.bind(*functions, *args, **params)
+        results = equation.primitive.bind(*args, **params)
     return list(results) if equation.primitive.multiple_results else [results]

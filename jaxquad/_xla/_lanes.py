@@ -17,7 +17,7 @@ from typing import Any
 import jax
 import numpy as np
 from jax.core import Tracer
-from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal, Primitive
+from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal
 
 from ._cuda import EXPRESSIONS, FUNCTIONS, TYPES
 from ._switch import MOST_CELLS
@@ -84,7 +84,10 @@ class Lanes:
             if first is not None and first.primitive.name == "name":
                 # What a kernel computes in place of a function, which tells its name first.
                 if in_its_place := FUNCTIONS.get(first.params["name"], ()):
-                    return [self._of_lanes(operation, *args) for operation in in_its_place]
+                    [x] = args
+                    self.count += x.size * len(in_its_place)
+                    pairs = ([f.bind(lane) for lane in x.reshape(-1)] for f in in_its_place)
+                    return [cells_of(lanes, x.shape) for lanes in pairs]
             return self.call(called, args)
         if name in _KEPT:
             return args
@@ -94,7 +97,8 @@ class Lanes:
                 raise NotInLanes(f"{name} of {v.aval}")
         if name in EXPRESSIONS:
             shape = self.small(equation.outvars[0].aval.shape)  # pyright: ignore
-            return [self._arithmetic(equation, args, shape)]
+            rows = zip(*(np.broadcast_to(x, shape).reshape(-1) for x in args), strict=True)
+            return [cells_of([self._operation(equation, row) for row in rows], shape)]
         if name not in RULES:
             raise NotInLanes(f"{name} of {', '.join(str(v.aval) for v in equation.invars)}")
         results = RULES[name](self, equation, *args)
@@ -104,23 +108,17 @@ class Lanes:
         closed = isinstance(jaxpr, ClosedJaxpr)
         return self.evaluate(*((jaxpr.jaxpr, jaxpr.consts) if closed else (jaxpr, ())), args)
 
-    def _arithmetic(self, equation: JaxprEqn, args: Sequence[Cells], shape: Shape) -> Cells:
-        columns = [np.broadcast_to(x, shape).reshape(-1) for x in args]
-        rows = zip(*columns, strict=True)
-        return cells_of([self._operation(equation, row) for row in rows], shape)
-
     def _operation(self, equation: JaxprEqn, row: Sequence[Lane]) -> Lane:
-        constant = folded(equation, row)
-        if constant is not None:
-            return constant
+        """Done at once where all numbers are known while tracing, as indices and masks are."""
+        name = equation.primitive.name
+        if name in _KNOWN and all(isinstance(x, np.generic) for x in row):
+            kind = equation.outvars[0].aval.dtype  # pyright: ignore[reportAttributeAccessIssue]
+            with np.errstate(all="ignore"):
+                return np.dtype(kind).type(_KNOWN[name](*row))
         self.count += 1
         if self.count > _MOST_OPERATIONS:
             raise NotInLanes(f"more than {_MOST_OPERATIONS} operations in a sample")
         return equation.primitive.bind(*row, **equation.params)
-
-    def _of_lanes(self, operation: Primitive, x: Cells) -> Cells:
-        self.count += x.size
-        return cells_of([operation.bind(lane) for lane in x.reshape(-1)], x.shape)
 
     def fold(self, name: str, lanes: Sequence[Lane]) -> Lane:
         """The sum, the product, ... of some lanes, by halves."""
@@ -131,8 +129,10 @@ class Lanes:
         return lanes[0]
 
     def pair(self, name: str, a: Lane, b: Lane) -> Lane:
+        """What a reduction does with two numbers."""
         self.count += 1
-        return pair(name, a, b)
+        are_constants = isinstance(a, np.generic) and isinstance(b, np.generic)
+        return _PAIRS[name][0 if are_constants else 1](a, b)
 
     def is_members(self, shape: Shape, axis: int | np.integer) -> bool:
         return shape[axis] == self.members
@@ -173,12 +173,6 @@ _PAIRS: dict[str, tuple[Callable, Callable]] = {
 }
 
 
-def pair(name: str, a: Lane, b: Lane) -> Lane:
-    """What a reduction does with two numbers."""
-    are_constants = isinstance(a, np.generic) and isinstance(b, np.generic)
-    return _PAIRS[name][0 if are_constants else 1](a, b)
-
-
 _KNOWN: dict[str, Callable[..., Any]] = {
     "add": np.add, "sub": np.subtract, "mul": np.multiply, "lt": np.less, "le": np.less_equal,
     "gt": np.greater, "ge": np.greater_equal, "eq": np.equal, "ne": np.not_equal,
@@ -187,16 +181,6 @@ _KNOWN: dict[str, Callable[..., Any]] = {
     "select_n": lambda which, *cases: cases[int(which)],
     "clamp": lambda low, x, high: np.minimum(np.maximum(low, x), high),
 }  # fmt: skip
-
-
-def folded(equation: JaxprEqn, row: Sequence[Lane]) -> np.generic | None:
-    """The result where all numbers are known while tracing, as indices and masks are."""
-    name = equation.primitive.name
-    if name not in _KNOWN or not all(isinstance(x, np.generic) for x in row):
-        return None
-    kind = equation.outvars[0].aval.dtype  # pyright: ignore[reportAttributeAccessIssue]
-    with np.errstate(all="ignore"):
-        return np.dtype(kind).type(_KNOWN[name](*row))
 
 
 # What moves numbers or adds them up, done on cells while tracing.

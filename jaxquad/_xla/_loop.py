@@ -181,7 +181,10 @@ def reverse_in_lanes(loop: Loop, which: tuple[bool, ...]) -> ClosedJaxpr:
     """From (consts, carry, now, cotangents) to the cotangents of those in `which` and the carry."""
     step = jaxpr_as_fun(loop.step)
     out = [x for x in loop.out if is_float(x.dtype)]
-    wanted = reverse_wanted(loop, which)
+    # The carry too, whose first is one of many.
+    first, last = loop.consts, loop.consts + loop.carry
+    pairs = enumerate(loop.inputs)
+    wanted = [is_float(x.dtype) if first <= k < last else which[k] for k, x in pairs]
 
     def back(*args: Array) -> list[Array]:
         inputs, cotangents = split(args, len(loop.inputs))
@@ -196,13 +199,6 @@ def reverse_in_lanes(loop: Loop, which: tuple[bool, ...]) -> ClosedJaxpr:
 
     jaxpr = jax.make_jaxpr(back)(*loop.inputs, *out)
     return in_lanes(loop, jaxpr, leave_sums=True)
-
-
-def reverse_wanted(loop: Loop, which: tuple[bool, ...]) -> tuple[bool, ...]:
-    """What one sample is differentiated by: the carry too, whose first is one of many."""
-    first, last = loop.consts, loop.consts + loop.carry
-    avals = loop.inputs
-    return tuple(is_float(x.dtype) if first <= k < last else which[k] for k, x in enumerate(avals))
 
 
 def bounds(loop: Loop) -> list[str]:

@@ -262,7 +262,7 @@ def _largest_difference(mode: str) -> float:
     args = x, gain, push.astype(jnp.float32)[:, None]
     with device_kernels(mode):  # the value, what was stored, three gradients
         pairs = zip(
-            *(jax.tree.leaves(_measure(f)(*args)) for f in (_by_kernel, _plain_scan)), strict=True
+            *(jax.tree.leaves(_measure(f)(*args)) for f in (_by_kernel, jax.lax.scan)), strict=True
         )
     differ = 0.0
     for one, other in pairs:
@@ -273,14 +273,10 @@ def _largest_difference(mode: str) -> float:
     return differ
 
 
-def _plain_scan(step: Step, carry: PyTree, signals: PyTree) -> tuple[PyTree, PyTree]:
-    return jax.lax.scan(step, carry, signals)
-
-
 def _by_kernel(step: Step, carry: PyTree, signals: PyTree) -> tuple[PyTree, PyTree]:
     from ._device_loop import scan_in_kernel
 
-    result = scan_in_kernel(step, carry, signals, _MEMBERS, _plain_scan)
+    result = scan_in_kernel(step, carry, signals, _MEMBERS, jax.lax.scan)
     if result is None:
         raise ValueError("the step of the trial does not fit a kernel")
     return result
