@@ -20,10 +20,6 @@ def as_numbers(value: ArrayLike | Sequence[float]) -> Numbers:
     return np.asarray(value, dtype=float)
 
 
-def as_numbers_or_none(value: ArrayLike | Sequence[float] | None) -> Numbers | None:
-    return None if value is None else as_numbers(value)
-
-
 def row(value: Numbers) -> Float[np.ndarray, "axes 1"]:
     """`value` as a column that broadcasts over members."""
     return np.atleast_1d(value)[:, None]
@@ -242,7 +238,9 @@ class Normal(Distribution):
     """
 
     deviation: Numbers = eqx.field(converter=as_numbers)
-    mean: Numbers | None = eqx.field(converter=as_numbers_or_none, default=None)
+    mean: Numbers | None = eqx.field(
+        converter=lambda x: None if x is None else as_numbers(x), default=None
+    )
 
     def __check_init__(self):
         check_axes(deviation=self.deviation, mean=self._mean)

@@ -4,7 +4,7 @@ import math
 import re
 import threading
 import zlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple, TypeGuard
 
 import equinox as eqx
@@ -324,7 +324,8 @@ def over_cores(
     def compute(first: int) -> None:
         joined.put(first, program(*part.cut(run, first), *further, devices))
 
-    firsts = part.firsts()
+    last = part.members - part.width  # the last part overlaps the one before
+    firsts = (min(first, last) for first in range(0, part.members, part.width))
     if program.is_new(*part.cut(run, 0), *further, devices):
         compute(next(firsts))  # compiled here, once for all threads
     map_in_threads(compute, firsts)
@@ -335,11 +336,6 @@ class _Part(NamedTuple):
     members: int
     width: int  # members of a part
     varies: list[bool]  # which leaves have the members on the last axis
-
-    def firsts(self) -> Iterator[int]:
-        """The first member of each part; the last part overlaps the one before."""
-        for first in range(0, self.members, self.width):
-            yield min(first, self.members - self.width)
 
     def cut(self, run: Run, first: int) -> Run:
         """The same for the members of a part."""

@@ -196,30 +196,22 @@ class Step(Signal):
         return Motion(_between(reached, self.before, self.after))
 
 
-class Ramp(Signal):
+class Ramp(Step):
     """From `before` to `after` at a constant rate.
 
-    **Arguments:**
+    **Arguments:** those of `jq.Step`, and
 
-    - `after`, `before`: in the unit of what it is given for (a reference: rad); one value, or one
-        per member.
     - `within`: s that the change lasts.
-    - `at`: s from the start.
 
     **Raises:**
 
     - `ValueError`: a value is not finite, or `within` is not above 0.
     """
 
-    after: Float[Array, "..."] = eqx.field(converter=as_float)
     within: float = eqx.field(static=True, kw_only=True)  # s
-    before: Float[Array, "..."] = eqx.field(converter=as_float, default=0.0, kw_only=True)
-    at: float = eqx.field(static=True, default=0.0, kw_only=True)  # s
 
     def __check_init__(self):
         require_all_positive(within=self.within)
-        require_finite("after", self.after)
-        require_finite("before", self.before)
 
     def sample(self, clock: Clock, key: Key[Array, ""] | None) -> Motion:
         share = self._progress(clock)

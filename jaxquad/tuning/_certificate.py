@@ -138,15 +138,10 @@ def lag_remark(
     text = f"lag x wc is up to {1e3 * longest:.3g} ms x {wc:.3g} rad/s = {longest * wc:.2g}"
     if late:
         text += f", {(longest + late) * wc:.2g} with the delay of {1e3 * late:.3g} ms"
+    most = f"no b0 stabilises a LADRC beyond about {end:.2g} at wo/wc = {wo / wc:.3g}"
     if longest * wc >= end:
-        return (
-            f"{text}: too large, no b0 stabilises a LADRC beyond about {end:.2g} at wo/wc = "
-            f"{wo / wc:.3g}. Reduce wc below {end / longest:.3g} rad/s"
-        )
-    return (
-        f"{text}; no b0 stabilises a LADRC beyond about {end:.2g} at wo/wc = {wo / wc:.3g}, and "
-        "margins end long before that. Reduce wc to recover margin"
-    )
+        return f"{text}: too large, {most}. Reduce wc below {end / longest:.3g} rad/s"
+    return f"{text}; {most}, and margins end long before that. Reduce wc to recover margin"
 
 
 def find_ladrc(controller: PyTree) -> LADRC | None:

@@ -196,10 +196,9 @@ def _statistics(design: DesignResult, name: str) -> Statistics:
     if not numbers.size or partial:
         return Statistics(np.nan, np.nan, np.nan, numbers.size, member)
     ordered = np.sort(sign * numbers)
-    if np.isfinite(ordered).all():
-        p95 = float(np.quantile(ordered, 0.95))
-    else:  # infinite as soon as it rests on an infinite value
-        p95 = float(ordered[int(np.ceil(0.95 * (ordered.size - 1)))])
+    # Infinite as soon as it rests on an infinite value.
+    method = "linear" if np.isfinite(ordered).all() else "higher"
+    p95 = float(np.quantile(ordered, 0.95, method=method))
     worst = float(sign * ordered[-1])
     return Statistics(float(np.mean(numbers)), sign * p95, worst, numbers.size, member)
 

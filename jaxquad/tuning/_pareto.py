@@ -24,11 +24,6 @@ from ._problem import build_design, DeviceChoice
 from ._tuner import Tuner
 
 
-_NAMES = {
-    "activity": "activity_rate",
-    "activity_rate": "activity_rate",
-    "sensitivity_peak": "sensitivity_peak",
-}
 _REACH = {"activity_rate": (0.1, 10.0), "sensitivity_peak": (0.65, 1.75)}  # times the knee
 _WEIGHT = 4.0  # of the penalty that holds a point at its level
 
@@ -149,9 +144,9 @@ def pareto(
 
     - `ValueError`: `over` is unknown, the levels do not rise, or as `jq.tune` does.
     """
-    if over not in _NAMES:
-        raise ValueError(f"no front over {over!r}: choose one of {', '.join(_NAMES)}")
-    over = _NAMES[over]
+    if over not in ("activity", *_REACH):
+        raise ValueError(f"no front over {over!r}: choose one of activity, {', '.join(_REACH)}")
+    over = "activity_rate" if over == "activity" else over
     tuner = Tuner(
         loop, ensemble, scenario, objective, limits, reserve=reserve, free=free, members=members,
         method=method, key=key, progress=progress, listener=None, devices=devices,

@@ -342,20 +342,11 @@ def _share(bad: Bool[np.ndarray, " members"], what: str, independent: bool) -> s
 def judge_performance(certificate: "Certificate") -> Verdict:
     """Whether a design is of use, and whether its flights are what its linear loops say.
 
-    Every member has to make at most half the error of doing nothing (the command 0), from event to
-    event, since beside a plant that was carried off once any error is small. In all, and in each
-    step, it makes at most twice that of its linear loop, or of the fastest step that the drive
-    allows: margins are those of the linear loop, and say little of a flight whose error comes for
-    the greater part from the limit, friction or resolution. Errors within the band in which a step
-    counts as settled are none. Full torque holds the disturbance within half of the linear loop's
-    peak, the command is at its limit for at most a quarter of the time, and no member is lost.
-
-    Half a step of the encoder beyond the settling band cannot tell whether a step has settled. A
-    motor's losses grow with the square of the command's changes, so ten times the start's activity
-    is another load than the start was taken to bear, if it is more than a reversal from limit to
-    limit every 20 s (0.2 limit^2 per second). Beyond the identified band no data say what the plant
-    does. Fewer than 64 members, or one plant, do not speak of an ensemble: of 59, none
-    that fails shows that at most 5 % of all do (95 % confidence).
+    The rules are those of docs/tuning.md. Errors count from event to event, since beside a plant
+    that was carried off once any error is small; within the band in which a step counts as settled
+    they are none. A motor's losses grow with the square of the command's changes: ten times the
+    start's activity is another load, if it is more than a reversal from limit to limit every 20 s.
+    Of 59 members, none that fails shows that at most 5 % of all do (95 % confidence).
     """
     design, idle, error = certificate.design, certificate.idle, certificate.error
     limits, start, independent = certificate.attainable, certificate.start, certificate.independent
