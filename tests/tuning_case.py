@@ -140,7 +140,7 @@ def controller_at(z, controller):
 def peaks_at(z, controller, members):
     """Abscissa and Ms of every linear loop, [axes, members], with derivatives in unstable ones."""
     run = members.loop(controller_at(z, controller))
-    return linear_numbers(run, [0], ["sensitivity_peak"], smoothing=1e-6, smooth=True)
+    return linear_numbers(run, [0], ["sensitivity_peak"], smoothing=1e-6)
 
 
 def cost_at(z, controller, members, happens):

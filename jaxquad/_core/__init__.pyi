@@ -56,7 +56,6 @@ from ._levenberg_marquardt import (
     advance as advance,
     begin as begin,
     CONVERGED as CONVERGED,
-    DAMPING as DAMPING,
     decrement as decrement,
     Descent as Descent,
     minimise as minimise,

@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 
 TOLERANCE = 1e-8  # of a step, relative to 1 + |z|, and of the root of the cost it would save
 RUNNING, CONVERGED, STALLED = 0, 1, 2
-DAMPING = 3e-2  # of the first step, in units of the largest diagonal element of the Hessian
+_DAMPING = 3e-2  # of the first step, in units of the largest diagonal element of the Hessian
 _SHRINKING = 0.1  # the least factor from one step to the next that is believed
 
 
@@ -69,7 +69,7 @@ def begin(z0: Float[Array, " parameters *batch"]) -> Descent:
     zero, none = jnp.zeros(z0.shape[1:], z0.dtype), jnp.zeros_like(z0)
     hessian = jnp.zeros((len(z0), *z0.shape), z0.dtype)
     normal, counter = Normal(zero + jnp.inf, none, hessian), jnp.zeros(zero.shape, int)
-    levels = zero + DAMPING, zero + 2.0
+    levels = zero + _DAMPING, zero + 2.0
     return Descent(z0, normal, *levels, none, zero, zero + jnp.inf, counter, counter + RUNNING)
 
 
@@ -121,7 +121,7 @@ def advance(
     shrinks = jnp.isfinite(state.size) & (size < state.size)
     enough = ((left <= tolerance) & shrinks) | (predicted <= tolerance**2 * state.normal.cost)
     # A step that damping has shortened says nothing about the distance to the minimum.
-    last = (state.status == RUNNING) & definite & (state.damping <= DAMPING) & enough
+    last = (state.status == RUNNING) & definite & (state.damping <= _DAMPING) & enough
     return state._replace(
         z=_select(last, state.z + change, state.z), change=change, predicted=predicted,
         status=jnp.where(last, CONVERGED, state.status),

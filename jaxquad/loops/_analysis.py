@@ -44,20 +44,19 @@ NUMBERS = ("abscissa", "noise_gain", *MARGINS, *REJECTION)
 
 
 def linear_numbers(
-    loop: Loop, axes: Sequence[int], wanted: Collection[str], *, smoothing: float = 1e-5,
-    smooth: bool = False,
+    loop: Loop, axes: Sequence[int], wanted: Collection[str], *, smoothing: float = 1e-5
 ) -> dict[str, Float[Array, " axes *ensemble"]]:  # fmt: skip
     """The `wanted` numbers of a `LoopAnalysis`, and the abscissa, of some axes of all members.
 
-    With `smooth`, noise gain and sensitivity peak stay finite and differentiable in an unstable
-    loop; the peak is then where a parabola through three neighbouring values of |1 + L|^2 is least.
+    Noise gain and sensitivity peak stay finite and differentiable in an unstable loop; the peak is
+    where a parabola through three neighbouring values of |1 + L|^2 is least.
     """
     parts, ensemble = linear_parts(loop, axes)
 
     def of_one(one: LinearParts) -> dict[str, Float[Array, ""]]:
         plant, controller = one.sampled()
         closed = close(plant, controller, one.memory).balanced()
-        return numbers_of(join(plant, controller), closed, wanted, smoothing, smooth=smooth)
+        return numbers_of(join(plant, controller), closed, wanted, smoothing, smooth=True)
 
     numbers = jax.vmap(of_one)(parts)
     return {name: x.reshape(len(axes), *ensemble) for name, x in numbers.items()}

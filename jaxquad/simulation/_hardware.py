@@ -189,11 +189,6 @@ class DelayLine(eqx.Module):
     further: int = eqx.field(static=True)  # how many inputs are kept beyond the queue
     splits: bool = eqx.field(static=True)  # whether there are early inputs at all
 
-    def share(self, like: Array) -> Float[Array, "*members"]:
-        """Of a sample interval that belongs to the early inputs."""
-        samples = self.samples.astype(like.dtype)
-        return samples - jnp.floor(samples)
-
     def step(
         self, past: Float[Array, "past ..."] | None, inputs: Float[Array, " inputs *ensemble"]
     ) -> tuple[Array | None, Array, Array]:

@@ -253,7 +253,6 @@ def _excited(signal, key, levels, dt, axis) -> Scenario:
 # What an ensemble needs, held against what there is, before an allocation fails.
 
 _GB = 1e9
-_SIZED = (jax.Array, np.ndarray, jax.ShapeDtypeStruct)
 
 
 def require_memory(what: str, needed: float | int, remedy: str) -> None:
@@ -267,10 +266,6 @@ def require_memory(what: str, needed: float | int, remedy: str) -> None:
         raise ValueError(
             f"{what} needs about {needed / _GB:.3g} GB, but {free / _GB:.3g} GB are free: {remedy}"
         )
-
-
-def size_of(tree: PyTree) -> int:
-    return sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(tree) if isinstance(x, _SIZED))
 
 
 def free_memory(device: Any) -> float | None:

@@ -15,10 +15,10 @@ from jaxquad._core import align, ensemble_shape, is_concrete, mark_members, pytr
 from jaxquad.loops import CarriesPayload, Loop, Plant
 from jaxquad.records import AXES, Record
 
-from ._hardware import Authority, find_authority, warn_beyond_authority
+from ._hardware import Authority, delay_line, find_authority, warn_beyond_authority
 from ._parallel import DeviceChoice, Devices, loop_over_devices, over_cores, placed
-from ._scenario import require_memory, Scenario, size_of
-from ._step import Carry, guarded, LoopStep, make_step, require_runnable, SampleResult
+from ._scenario import require_memory, Scenario
+from ._step import Carry, guarded, LoopStep, require_runnable, SampleResult
 
 
 @pytree_node
@@ -159,9 +159,8 @@ def _require_room(result: PyTree) -> None:
     (stored, _), _ = result
     samples, axes, *members = stored[0].shape
     what = f"a record of {samples} samples of {axes} axes of {math.prod(members)} members"
-    require_memory(
-        what, size_of(stored), "take jq.evaluate, which stores none, or jq.simulation.in_slices"
-    )
+    size = sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(stored))
+    require_memory(what, size, "take jq.evaluate, which stores none, or jq.simulation.in_slices")
 
 
 class _Store(eqx.Module):
@@ -254,7 +253,13 @@ _FEW = 16  # members that are one chunk
 def _begin(job: _Job, ensemble: tuple[int, ...]) -> tuple[LoopStep, tuple[Carry, PyTree]]:
     """What runs the loop, and its carry before the first sample."""
     loop, scenario, accumulator = job
-    step = make_step(loop, ensemble)
+    controller = require_runnable(loop.controller)
+    prepare = getattr(controller, "prepared", None)
+    step = LoopStep(
+        plant=loop.plant, controller=controller if prepare is None else prepare(),
+        drive=loop.drive, encoder=loop.encoder, line=delay_line(loop), dt=loop.dt,
+        substeps=loop.substeps, bound=loop.bound, ensemble=ensemble,
+    )  # fmt: skip
     state, like = _at_rest(loop.plant, scenario, ensemble)
     return step, (step.begin(state, like), accumulator.begin(like))
 

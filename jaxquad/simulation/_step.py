@@ -17,9 +17,9 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 from jaxquad._compile import KEPT, Queue
 from jaxquad._core import align
 from jaxquad.control import Setpoint
-from jaxquad.loops import CarriesPayload, ChecksState, Controller, Drive, Loop, Plant, Sensor
+from jaxquad.loops import CarriesPayload, ChecksState, Controller, Drive, Plant, Sensor
 
-from ._hardware import delay_line, DelayLine
+from ._hardware import DelayLine
 from ._scenario import Scenario
 
 
@@ -245,7 +245,8 @@ class LoopStep(eqx.Module):
         past, early, late = line.step(carry.past, inputs)
         if not line.splits:
             return past, hold(carry.state, (late, dt))[0]
-        share = line.share(inputs)
+        samples = line.samples.astype(inputs.dtype)
+        share = samples - jnp.floor(samples)  # of the interval, with the early inputs
         both = jnp.stack([early, late]), jnp.stack([share, 1 - share]) * dt
         return past, jax.lax.scan(hold, carry.state, both)[0]  # the plant is compiled once
 
@@ -259,22 +260,6 @@ def require_runnable(controller: object) -> Controller:
     raise ValueError(
         f"a {type(controller).__name__} cannot be run: a controller needs init(like) and "
         "step(state, reference, measurement)"
-    )
-
-
-def make_step(loop: Loop, ensemble: tuple[int, ...]) -> LoopStep:
-    controller = require_runnable(loop.controller)
-    prepare = getattr(controller, "prepared", None)
-    return LoopStep(
-        plant=loop.plant,
-        controller=controller if prepare is None else prepare(),
-        drive=loop.drive,
-        encoder=loop.encoder,
-        line=delay_line(loop),
-        dt=loop.dt,
-        substeps=loop.substeps,
-        bound=loop.bound,
-        ensemble=ensemble,
     )
 
 

@@ -25,7 +25,6 @@ from ._verdict import (
     joined,
     judge_performance,
     judge_stability,
-    NOT_TUNED,
     Verdict,
 )
 
@@ -187,7 +186,7 @@ class Certificate(eqx.Module):
     idle: DesignResult  # the same flights with the command 0
     start: DesignResult | None = None  # with the gains that the tuning started from
     error: str = eqx.field(static=True, default="itae")  # by which performance is measured
-    convergence: Verdict = NOT_TUNED
+    convergence: Verdict = Verdict("CONVERGENCE", None, "the gains were given, not tuned here")
     further: LinearMembers | None = None  # of whom the linear loop alone was analysed
     attainable: Attainable | None = None  # what the same plants allow
     unsupported: tuple[tuple[str, str], ...] = ()  # bandwidths beyond the band; what to do

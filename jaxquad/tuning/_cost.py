@@ -25,7 +25,6 @@ from ._verdict import Distance
 
 
 _BARRIER = 0.01  # weight of the barrier before observers that are slower than the feedback
-SMOOTHING = 1e-6  # 1/s, of the abscissa: its derivative is off by as much, relative to 1 1/s
 
 Tree = TypeVar("Tree")
 
@@ -110,7 +109,7 @@ def _cost(
     objective, limits = subproblem.objective, subproblem.limits
     wanted = objective.quantities | {limit.quantity for limit in limits}
     in_flight, linear = split_quantities(wanted)
-    numbers = problem.linear.numbers(controller, linear, SMOOTHING)
+    numbers = problem.linear.numbers(controller, linear)
     slowest = jnp.max(numbers["abscissa"], axis=0)
     unknown = {name: jnp.ones_like(numbers["abscissa"]) for name in in_flight}
     if in_flight:
@@ -121,7 +120,7 @@ def _cost(
     # Limits of the linear loop, which is cheap, are kept on many more members.
     bounded, names = dict(worst), {x.quantity for x in limits if QUANTITIES[x.quantity].linear}
     if problem.limited is not None and names:
-        wide = problem.limited.numbers(controller, names, SMOOTHING)
+        wide = problem.limited.numbers(controller, names)
         bounded |= {n: QUANTITIES[n].combine_axes(wide[n], worst=True) for n in names}
     limited = tuple(bounded[x.quantity][: count_members(problem, x)] for x in limits)
     beyond = tuple(limit.beyond(x) for limit, x in zip(limits, limited, strict=True))
@@ -213,11 +212,6 @@ def describe_evaluation(count: int, now: Evaluation) -> str:
     return "  ".join([*parts, f"{now.seconds:.1f} s"])
 
 
-SEARCHES = 5  # at most, until one finds none
-SLICE = 2048  # linear loops that are evaluated at once
-GUARDS = 16  # members that fly for limits alone
-LOOPS, FLIGHTS = 8192, 2048  # of a search, unless it has enough members to go on with before
-ADDED = 64  # linear loops at most, after a search
 _ENOUGH = 16  # members beyond a limit
 _NEAR = 0.1  # nepers within a limit: so near, they are tuned on with those beyond it
 _LOST = 5.0  # nepers beyond a limit: the peak of a loop that is unstable, or as good as that
@@ -284,7 +278,7 @@ def loop_levels(
     """
     kept = [limit for limit in limits if is_kept_by(limit, flights=False)]
     names = {limit.quantity for limit in kept}
-    numbers = loops.numbers(coordinates.controller_at(z), names, SMOOTHING)
+    numbers = loops.numbers(coordinates.controller_at(z), names)
     values = {name: QUANTITIES[name].combine_axes(numbers[name], worst=True) for name in names}
     level = jnp.max(jnp.stack([limit.beyond(values[limit.quantity]) for limit in kept]), axis=0)
     return jnp.where(level < _LOST, level, -jnp.inf)

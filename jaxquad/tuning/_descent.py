@@ -13,7 +13,6 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 from jaxquad._core import require_all_positive
 from jaxquad.simulation import SampleResult, scan_loop
 
-from ._cost import SMOOTHING
 from ._objective import (
     is_gated,
     Limit,
@@ -304,7 +303,7 @@ def _residuals(z: Float[Array, " n"], squares: _Squares) -> tuple[Array, Array]:
     tracking = _errors(z, squares) / jnp.sqrt(squares.scale + _LEAST)[None]
     controller = squares.coordinates.controller_at(z)
     flights, linear = split_quantities({p.quantity for p in squares.penalties} | {"abscissa"})
-    numbers = squares.problem.linear.numbers(controller, linear, SMOOTHING)
+    numbers = squares.problem.linear.numbers(controller, linear)
     if flights:
         numbers |= squares.problem.in_time(controller, flights)
     gate = stability_gate(numbers["abscissa"])

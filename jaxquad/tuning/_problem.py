@@ -203,6 +203,7 @@ class TimeSpan(NamedTuple):
 
 
 _FULL_FLIGHT = TimeSpan()
+_SMOOTHING = 1e-6  # 1/s, of the abscissa: its derivative is off by as much, relative to 1 1/s
 
 
 class LinearLoops(eqx.Module):
@@ -237,7 +238,7 @@ class LinearLoops(eqx.Module):
         )
 
     def numbers(
-        self, controller: PyTree, wanted: Collection[str], smoothing: float
+        self, controller: PyTree, wanted: Collection[str]
     ) -> dict[str, Float[Array, "axes members"]]:
         """The wanted quantities of the linear loop of each member, the abscissa with them."""
 
@@ -247,7 +248,7 @@ class LinearLoops(eqx.Module):
             controller = schedule_for_analysis(controller, inertia)
             loop = Loop(axes, controller, delay=delays[0], longest_delay=delays[1], dt=self.dt)
             places = range(len(inertia))
-            numbers = linear_numbers(loop, places, wanted, smoothing=smoothing, smooth=True)
+            numbers = linear_numbers(loop, places, wanted, smoothing=_SMOOTHING)
             wide = lambda x: jnp.broadcast_to(x.reshape(len(x), -1), inertia.shape)
             return {name: wide(x) for name, x in numbers.items()}
 

@@ -18,10 +18,8 @@ from jaxquad.simulation import Scenario
 from ._certificate import Certificate, lag_remark
 from ._certify import certify
 from ._cost import (
-    ADDED,
     Beyond,
     Evaluation,
-    GUARDS,
     Listener,
     rank_beyond,
     stack_copies,
@@ -31,7 +29,7 @@ from ._cost import (
 from ._design_result import certified_members
 from ._objective import Limit, Objective, QUANTITIES
 from ._problem import Bound, build_design, DeviceChoice
-from ._tuner import Method, Tuner
+from ._tuner import ADDED, GUARDS, Method, Tuner
 from ._verdict import covers, Verdict, with_further
 
 

@@ -14,23 +14,17 @@ from jaxquad.loops import Loop
 from jaxquad.simulation import find_steps, Scenario
 
 from ._cost import (
-    ADDED,
     Beyond,
     CostResult,
     count_members,
     evaluate_cost,
     flight_levels,
-    FLIGHTS,
-    GUARDS,
     is_kept_by,
     Listener,
     loop_levels,
-    LOOPS,
     Progress,
     rank_places,
     search,
-    SEARCHES,
-    SLICE,
     stack_copies,
     Subproblem,
     Tail,
@@ -77,6 +71,11 @@ _ROUNDS = 8  # of multipliers
 _TIMES = 3  # evaluations of all rounds together, in those of one descent
 _BEYOND_KNEE = 0.25  # 1/s, below the abscissa that is enough: where the first phase aims
 _WIDE = 256  # members more, whose linear loops have to keep limits
+GUARDS = 16  # members that fly for limits alone
+ADDED = 64  # linear loops at most, after a search
+_SEARCHES = 5  # at most, until one finds none
+_SLICE = 2048  # linear loops that are evaluated at once
+_LOOPS, _FLIGHTS = 8192, 2048  # of a search, unless it has enough members to go on with before
 _FIRST = 2  # folded into the key of the first slice of loops that is searched
 _FLOWN = 0xF17E  # and of the first slice of flights
 _GUARDING = 0x6A2D  # of those that fly for limits alone
@@ -371,7 +370,7 @@ class Tuner:
         """
         if not any(self.searches):
             return
-        for _ in range(SEARCHES):
+        for _ in range(_SEARCHES):
             on = chosen & np.all(self.beyond <= np.maximum(self._half_of_reserve(), MET), axis=1)
             if not on.any():
                 break
@@ -394,8 +393,8 @@ class Tuner:
                 loops = linear_loops(drawn, self.devices)
                 return [loop_levels(z, self.coordinates, loops, self.limits) for z in points]
 
-            draw = lambda k: self._fresh(_FIRST + k, SLICE)
-            loops, count, searched = search(draw, number, LOOPS // SLICE, levels, ADDED)
+            draw = lambda k: self._fresh(_FIRST + k, _SLICE)
+            loops, count, searched = search(draw, number, _LOOPS // _SLICE, levels, ADDED)
             beyond = Beyond(loops, None, count, searched)
         if self.searches[1]:
             designs = [build_design(self.coordinates, z) for z in points]
@@ -405,7 +404,8 @@ class Tuner:
                 run = lambda x: fly_members(x, drawn, flight, self.span, self.devices)
                 return [flight_levels(run(x).numbers, self.limits) for x in designs]
 
-            draw, most = lambda k: self._fresh(_FLOWN + k, self.size), max(1, FLIGHTS // self.size)
+            draw = lambda k: self._fresh(_FLOWN + k, self.size)
+            most = max(1, _FLIGHTS // self.size)
             flown, count, flights = search(draw, number, most, levels_of_flights, GUARDS)
             beyond = beyond._replace(flown=flown, count=beyond.count + count, flights=flights)
         return beyond

@@ -73,12 +73,11 @@ class Distance(NamedTuple):
             finite = np.isfinite(self.of_others)
             others = f"; of the others {shown.text(self.of_others)}" if finite else ""
             return f"{demand}: missed, {self.without} members are unstable{others}{beyond}"
+        met = "met" if self.met else "missed"
         if not np.isfinite(self.reached):
-            return (
-                f"{demand}: {shown.text(self.reached)}, {'met' if self.met else 'missed'}{beyond}"
-            )
+            return f"{demand}: {shown.text(self.reached)}, {met}{beyond}"
         difference = abs(shown.number(self.reached) - shown.number(self.bound))
-        by = f"{'met' if self.met else 'missed'} by {difference:.3g} {shown.unit}".rstrip()
+        by = f"{met} by {difference:.3g} {shown.unit}".rstrip()
         share = f" ({abs(self.percent):.2g} %)" if np.isfinite(self.percent) else ""
         return f"{demand}: {shown.text(self.reached)}, {by}{share}{beyond}"
 
@@ -263,9 +262,6 @@ class Verdict(NamedTuple):
         return f"{sign} {self.name}: {self.text}{'. ' * bool(self.remedy)}{self.remedy}"
 
 
-NOT_TUNED = Verdict("CONVERGENCE", None, "the gains were given, not tuned here")
-
-
 def judge_stability(
     design: DesignResult, distances: Sequence[Distance], further: LinearMembers | None,
     independent: bool, place: Callable[[int], str],
@@ -424,8 +420,7 @@ def judge_performance(certificate: "Certificate") -> Verdict:
 
 def _mean(design: DesignResult, error: str) -> str:
     text = QUANTITIES[error].text(float(np.mean(design.of(error))))
-    unstable = design.unstable_count
-    lost = int(design.lost.sum())
+    unstable, lost = design.unstable_count, int(design.lost.sum())
     if unstable:
         return f"{text} with {unstable} members unstable"
     return f"{text} with {lost} members lost" if lost else text
