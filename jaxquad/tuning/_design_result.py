@@ -135,10 +135,10 @@ def with_further(design: DesignResult, further: LinearMembers | None) -> DesignR
 
 
 def upper_bound(count: int, draws: int) -> float:
-    """The share that the true one exceeds with a probability of at most 5 %, where `count` of
-    `draws` independent members showed the event: the exact one-sided bound.
+    """The exact one-sided bound of a share: the true one exceeds it in at most 5 % of cases.
 
-    None of 256 bounds the share by 1.2 %, none of 2304 by 0.13 %.
+    `count` of `draws` independent members showed the event. None of 256 bounds the share by 1.2 %,
+    none of 2304 by 0.13 %.
     Source: Clopper and Pearson, Biometrika 26 (1934).
 
     **Raises:** ValueError for fewer draws than counted.
