@@ -89,12 +89,6 @@ class Jit:
                 raise
             return self._plain(*args)  # raises it with its own words, as equinox does
 
-    def lower(self, *args: PyTree) -> jax.stages.Lowered:
-        """What a call with such arguments, outside of other programs, compiles."""
-        leaves, structure = jax.tree.flatten(args)
-        arrays, others = _arrays_and_others(leaves)
-        return self._programs.of(structure, others).plain.lower(arrays)
-
     def is_outermost(self, *args: PyTree) -> bool:
         """Whether a call with such arguments is no part of another program."""
         return _is_outermost(jax.tree.leaves(args))
