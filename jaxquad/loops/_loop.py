@@ -181,7 +181,8 @@ class Loop(eqx.Module):
         dt: float | None = None, substeps: int = 1, bound: float = 100.0,
         longest_delay: float | None = None,
     ):  # fmt: skip
-        dt = (getattr(controller, "dt", None) or _DEFAULT_DT) if dt is None else dt
+        made_for: float | None = getattr(controller, "dt", None)
+        dt = (made_for or _DEFAULT_DT) if dt is None else dt
         require_sample_interval(dt)
         self.plant, self.controller, self.drive, self.encoder = plant, controller, drive, encoder
         self.dt, self.substeps, self.bound = float(dt), substeps, float(bound)

@@ -132,8 +132,12 @@ def simulate(loop: Loop, scenario: Scenario, *, devices: DeviceChoice = None) ->
     flown = over_cores(_run, run, (), places, check=_require_room)
     (stored, diverged), authority = flown
     warn_beyond_authority(authority, scenario)
-    time = _times(loop.dt, stored[0].shape[0], stored[0].dtype)
-    return Simulation(time, *stored, diverged, scenario, loop.dt, authority)
+    angle, measurement, command, saturated, signals = stored
+    time = _times(loop.dt, angle.shape[0], angle.dtype)
+    return Simulation(
+        time, angle, measurement, command, saturated, signals, diverged, scenario, loop.dt,
+        authority,
+    )  # fmt: skip
 
 
 @ft.lru_cache(maxsize=8)
