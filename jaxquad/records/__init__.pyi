@@ -1,6 +1,5 @@
 from ._channel import Channel as Channel, clock_start as clock_start, show_times as show_times
 from ._edit import (
-    detrend as detrend,
     mix as mix,
     resample as resample,
     select as select,

@@ -232,35 +232,6 @@ def trim(record: Record, start: Number | None = None, stop: Number | None = None
     )  # fmt: skip
 
 
-def detrend(record: Record, *, order: Literal[0, 1] = 0) -> Record:
-    """Subtract the mean or the least-squares line from every channel.
-
-    **Arguments:**
-
-    - `record`: a `Record`.
-    - `order`: 0 for the mean, 1 for the line.
-
-    **Returns:** a `Record` with the same channels.
-
-    **Raises:**
-
-    - `RecordError`: for another `order`.
-    """
-    if order not in (0, 1):
-        raise RecordError(f"order is {order}: use 0 to remove the mean, 1 to remove a line.")
-    centred = np.linspace(-1.0, 1.0, record.samples)[:, None]
-
-    def flatten(channels: Channels) -> Channels:
-        level = channels - channels.mean(axis=0)
-        slope = (centred * level).sum(axis=0) / (centred**2).sum()
-        return level - order * slope * centred
-
-    return dataclasses.replace(
-        record, inputs=flatten(record.inputs), outputs=flatten(record.outputs),
-        references=flatten(record.references), time_unit="s",
-    )  # fmt: skip
-
-
 def select(
     record: Record, *, inputs: str | Sequence[str], outputs: str | Sequence[str],
     references: str | Sequence[str] = (),

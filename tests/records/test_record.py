@@ -3,7 +3,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from jaxquad.records import detrend, mix, Record, RecordError, RecordWarning, select, trim
+from jaxquad.records import mix, Record, RecordError, RecordWarning, select, trim
 
 
 TIME = np.arange(101) / 50.0
@@ -145,16 +145,6 @@ def test_trim_keeps_samples_and_their_time():
 def test_trim_refuses(start, stop, said):
     with pytest.raises(RecordError, match=said):
         trim(record(), start, stop)
-
-
-def test_detrend_takes_away_the_mean_or_the_line_and_nothing_else():
-    wave = np.sin(np.pi * TIME)  # one whole period
-    drift = record(inputs=wave + 3 + 0.5 * TIME)
-    assert abs(detrend(drift).inputs.mean()) < 1e-15
-    flat = detrend(drift, order=1)
-    expected = detrend(record(inputs=wave), order=1)
-    np.testing.assert_allclose(flat.inputs, expected.inputs, atol=1e-14)
-    np.testing.assert_allclose(detrend(flat, order=1).inputs, flat.inputs, atol=1e-14)
 
 
 def test_select_gives_channels_new_roles_and_keeps_their_units():
