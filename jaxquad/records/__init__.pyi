@@ -1,10 +1,5 @@
 from ._channel import Channel as Channel, clock_start as clock_start, show_times as show_times
-from ._edit import (
-    mix as mix,
-    resample as resample,
-    select as select,
-    trim as trim,
-)
+from ._edit import resample as resample, select as select, trim as trim
 from ._log import (
     ReadError as ReadError,
     RecordError as RecordError,

@@ -3,7 +3,6 @@
 import dataclasses
 import functools as ft
 from collections.abc import Callable, Mapping, Sequence
-from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -27,7 +26,6 @@ from ._record import as_tuple, assemble, Record
 
 
 Channels = Float[np.ndarray, "samples channels"]
-_ROLES = ("input", "output", "reference")
 
 
 # Kaiser's formulas for 72 dB over a transition from 0.3 to 0.5 of the sample rate.
@@ -255,48 +253,6 @@ def select(
     return assemble(
         record.time, roles, record.channel, record.unit, source=record.source, hold=hold,
         repaired=record.repaired,
-    )  # fmt: skip
-
-
-def mix(
-    record: Record, name: str, weights: Mapping[str, Number], *,
-    role: Literal["input", "output", "reference"] = "input",
-) -> Record:  # fmt: skip
-    """Add a channel that is a weighted sum of others, such as a roll command of four motors.
-
-    **Arguments:**
-
-    - `record`: a `Record`.
-    - `name`: of the new channel.
-    - `weights`: channel name -> weight.
-    - `role`: what the new channel is.
-
-    **Returns:** the `Record` with one channel more. Its unit is that of the summed channels where
-    they agree, else unknown.
-
-    **Raises:**
-
-    - `RecordError`: for no weight, a weight that is not finite, a channel that the record lacks, or
-        a `name` that it has.
-
-    !!! Example
-
-        ```python
-        record = jq.records.mix(record, "roll", {"m1": -1, "m2": -1, "m3": 1, "m4": 1})
-        ```
-    """
-    if role not in _ROLES:
-        raise RecordError(f"role is {role!r}: use one of {', '.join(_ROLES)}.")
-    column = combine(name, weights, record.channel)
-    shared = {record.unit(source) for source in weights}
-    unit = shared.pop() if len(shared) == 1 else ""
-    roles = [record.input_names, record.output_names, record.reference_names]
-    roles[_ROLES.index(role)] += (name,)
-    unknown_hold = role == "input" and not set(weights) <= set(record.input_names)
-    return assemble(
-        record.time, roles, lambda channel: column if channel == name else record.channel(channel),
-        lambda channel: unit if channel == name else record.unit(channel), source=record.source,
-        hold=None if unknown_hold else record.hold, repaired=record.repaired,
     )  # fmt: skip
 
 

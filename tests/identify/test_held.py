@@ -101,7 +101,6 @@ def test_a_simulation_runs_its_inputs_as_the_record_says(said):
 def test_a_hold_stays_with_the_inputs_that_it_is_of(said):
     assert jq.records.trim(said, 5.0).hold == said.hold == pytest.approx(DT)
     assert jq.records.select(said, inputs="y", outputs="u").hold is None
-    assert jq.records.mix(said, "v", {"u": 2.0}).hold == said.hold
     with pytest.raises(jq.records.RecordError, match="hold is -1"):
         jq.Record(TIME, SWEEP, SWEEP, hold=-1)
 

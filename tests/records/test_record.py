@@ -3,7 +3,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from jaxquad.records import mix, Record, RecordError, RecordWarning, select, trim
+from jaxquad.records import Record, RecordError, RecordWarning, select, trim
 
 
 TIME = np.arange(101) / 50.0
@@ -158,29 +158,6 @@ def test_select_gives_channels_new_roles_and_keeps_their_units():
 def test_select_refuses_one_channel_in_two_roles():
     with pytest.raises(RecordError, match="'u' occurs 2 times"):
         select(record(), inputs="u", outputs="u")
-
-
-@pytest.mark.parametrize("role", ["input", "output", "reference"])
-def test_mix_adds_a_weighted_sum_in_the_asked_role(role):
-    before = record(output_units=["rad/s", "rad/s"])
-    after = mix(before, "sum", {"y1": -1, "y2": 1.5}, role=role)
-    np.testing.assert_array_equal(after.channel("sum"), 1.5 * (2 * Y) - Y)
-    assert getattr(after, f"{role}_names")[-1] == "sum" and after.unit("sum") == "rad/s"
-    assert set(after.names) == {*before.names, "sum"}
-
-
-@pytest.mark.parametrize(
-    ("name", "weights", "said"),
-    [
-        ("roll", {"m1": 1.0}, "no channel 'm1'"),
-        ("roll", {}, "the sum 'roll' is empty"),
-        ("roll", {"u": np.nan}, "weight of 'u' in the sum 'roll' is nan"),
-        ("u", {"y1": 1.0}, "'u' occurs 2 times"),
-    ],
-)
-def test_mix_refuses(name, weights, said):
-    with pytest.raises(RecordError, match=said):
-        mix(record(), name, weights)
 
 
 @pytest.mark.parametrize("size", [1e160, 1e-200])

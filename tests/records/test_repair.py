@@ -8,7 +8,6 @@ import pytest
 
 from jaxquad.records import (
     Channel,
-    mix,
     read,
     read_segments,
     Record,
@@ -90,7 +89,6 @@ def test_parts_of_a_record_know_their_own_repairs():
     whole = record(outputs=spoilt(SPIKE, 200), max_gap=0.1)
     np.testing.assert_array_equal(trim(whole, 1.0, 3.0).repaired["y"], [2.0])
     assert trim(whole, 2.5, 4.0).repaired == {}
-    assert mix(whole, "twice", {"y": 2.0}).repaired["y"].size == 2
     assert select(whole, inputs="u", outputs="y").repaired["y"].size == 2
 
 
