@@ -1,8 +1,7 @@
 """Other records from what there is: channels on one grid, parts, sums and other roles."""
 
 import dataclasses
-import functools as ft
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Float
@@ -254,15 +253,3 @@ def select(
         record.time, roles, record.channel, record.unit, source=record.source, hold=hold,
         repaired=record.repaired,
     )  # fmt: skip
-
-
-def combine(name: str, weights: Mapping[str, Number], values: Callable[[str], Times]) -> Times:
-    """The weighted sum that makes the channel `name`; a single weight of 1 changes no bit."""
-    if not weights:
-        raise RecordError(f"the sum {name!r} is empty: give it channels and their weights.")
-    for source, weight in weights.items():
-        if not np.isfinite(weight):
-            raise RecordError(
-                f"the weight of {source!r} in the sum {name!r} is {weight}: use a finite number."
-            )
-    return ft.reduce(np.add, (weight * values(source) for source, weight in weights.items()))

@@ -1,10 +1,11 @@
 """Records of the channels of a file, and of its segments."""
 
 import dataclasses
+import functools as ft
 import itertools
 import re
 import warnings
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -25,7 +26,7 @@ from ._channel import (
     within,
     without_turns,
 )
-from ._edit import combine, resample
+from ._edit import resample
 from ._log import GapError, known_unit, located, ReadError, RecordError, unknown_name, warn
 from ._record import as_tuple, assemble, check_distinct, Hold, Record
 from ._timebase import Timebases
@@ -52,9 +53,9 @@ def read(
     **Arguments:**
 
     - `path`: the file; for a ROS 2 bag also its folder.
-    - `inputs`, `outputs`, `references`: channel names, or new names with weighted sums of channels,
-        as `{"roll": {"motor[0]": -1, "motor[1]": 1}}`. The columns of a 2-D array `x` are `x[0]`,
-        `x[1]`, ...
+    - `inputs`, `outputs`, `references`: channel names, or new names with weighted sums of channels
+        and of their powers, as `{"roll": {"motor[0]": -1, "motor[1]^2": 1}}`. The columns of a 2-D
+        array `x` are `x[0]`, `x[1]`, ...
     - `sample_rate`: of the record, in Hz. By default channels that share one uniform time base
         are kept bit by bit; others are resampled (see `resample`) to the lowest of their own rates,
         rounded to three digits.
@@ -115,10 +116,11 @@ def _mixes(selection: Selection) -> Mixes:
 
 @dataclasses.dataclass(frozen=True)
 class _Logged:
-    """Channels of a file, repaired, each on its own clock."""
+    """Channels of a file, repaired, each on its own clock; what sums are of, as `m1` or `m1^2`."""
 
     path: str | Path
     channels: Sequence[Channel]
+    powers: Mapping[str, tuple[str, int]]  # term of a sum -> channel and its power
     repaired: Mapping[str, Times]
     max_gap: Number | None
     hold: Hold
@@ -127,7 +129,7 @@ class _Logged:
         self, roles: Sequence[Mixes], units: Mapping[str, str], sample_rate: Number | None,
         segment: "Segment",
     ) -> Record:  # fmt: skip
-        """Weighted sums of the channels in one segment, at one rate."""
+        """Weighted sums of the terms in one segment, at one rate."""
         channels, hold = self.channels, self.hold
         stamps, span = channels[0].time, None
         if sample_rate is None and all(np.array_equal(stamps, c.time) for c in channels):
@@ -143,8 +145,13 @@ class _Logged:
             # Input and output pass through one filter: a hold within a sample stays what it is.
             longest = 1.01 * (stamps[1] - stamps[0])
             hold = None if isinstance(hold, int | float) and hold > longest else hold
-        logged = {channel.name: channel.unit for channel in channels}
-        columns = dict(zip(logged, table.T, strict=True))
+        names = [channel.name for channel in channels]
+        columns, logged = {}, {}
+        for term, (name, power) in self.powers.items():
+            k = names.index(name)
+            columns[term], logged[term] = table[:, k], channels[k].unit
+            if power > 1:
+                columns[term], logged[term] = table[:, k] ** power, ""
         mixes = {name: mix for role in roles for name, mix in role.items()}
         for name, unit in units.items():
             if name not in mixes:
@@ -164,10 +171,29 @@ class _Logged:
             shared = {"" if converted else logged[source] for source in mix}
             agreed[name] = shared.pop() if len(shared) == 1 else ""
         return assemble(
-            stamps, roles, lambda name: combine(name, mixes[name], columns.__getitem__),
+            stamps, roles, lambda name: _combine(name, mixes[name], columns),
             (agreed | dict(units)).__getitem__, source=str(self.path), hold=hold,
             repaired=within(self.repaired, stamps[0], stamps[-1]),
         )  # fmt: skip
+
+
+def _combine(name: str, weights: Mapping[str, Number], columns: Mapping[str, Times]) -> Times:
+    """The weighted sum that makes the channel `name`; a single weight of 1 changes no bit."""
+    if not weights:
+        raise RecordError(f"the sum {name!r} is empty: give it channels and their weights.")
+    for source, weight in weights.items():
+        if not np.isfinite(weight):
+            raise RecordError(
+                f"the weight of {source!r} in the sum {name!r} is {weight}: use a finite number."
+            )
+    return ft.reduce(np.add, (weight * columns[source] for source, weight in weights.items()))
+
+
+def _power(term: str, channels: Collection[str]) -> tuple[str, int]:
+    """The channel and the power in a term of a sum: `m1^2` is `m1` and 2, if it is no channel."""
+    channel, sign, power = term.rpartition("^")
+    is_power = term not in channels and sign and channel and power in set("23456789")
+    return (channel, int(power)) if is_power else (term, 1)
 
 
 def _read_channels(
@@ -175,12 +201,14 @@ def _read_channels(
     dt: Number | None, time_factor: Number | None, *, max_gap: Number | None, hold: Hold,
     valid: Valid,
 ) -> _Logged:  # fmt: skip
-    names = list(dict.fromkeys(name for role in roles for mix in role.values() for name in mix))
+    terms = dict.fromkeys(term for role in roles for mix in role.values() for term in mix)
     signals = load_signals(path)
-    if not names:
+    if not terms:
         raise ReadError(f"{path}: no channels are named. Name them («inputs=», «outputs=»).")
     try:
         timebases = Timebases(signals, time, time_unit, dt, time_factor)
+        powers = {term: _power(term, {*timebases.names, *signals.titles}) for term in terms}
+        names = list(dict.fromkeys(name for name, _ in powers.values()))
         logged = [timebases.channel(name) for name in names]
     except ReadError as error:
         raise located(error, path) from error
@@ -200,7 +228,7 @@ def _read_channels(
             )
         channels.append(Channel(name, channel.time, values, channel.unit))
         repaired[name] = times
-    return _Logged(path, channels, repaired, max_gap, hold)
+    return _Logged(path, channels, powers, repaired, max_gap, hold)
 
 
 Mix = dict[str, dict[str, float]]  # name -> channel, or its power `m1^2`, -> weight
@@ -297,67 +325,31 @@ def read_segments(
                     f"overlap, so samples would count twice. Choose segments that do not overlap."
                 )
     roles, units = (inputs, outputs, references or {}), units or {}
-    # A single channel may have any name, even one that looks like a power.
-    terms = {
-        name: [(name, 1, 1.0)] if mix == {name: 1.0} else [(*_power(x), w) for x, w in mix.items()]
-        for role in roles
-        for name, mix in role.items()
-    }
-    every = [term for mix in terms.values() for term in mix]
-    plain = all(power == 1 for _, power, _ in every)
-    names = {channel: {channel: 1.0} for channel, _, _ in every}
-
-    def mixed(segment: Segment, rate: Number | None) -> Record:
-        """One segment. Powers are taken of the channels as they are read, after resampling."""
-        if plain:
-            return logged.record(roles, units, rate, segment)
-        any_output = {"any output": dict.fromkeys(list(names)[:1], 1.0)}  # A record needs one.
-        raw = logged.record((names, any_output, {}), {}, rate, segment)
-        if unknown := set(units) - set(terms):
-            raise RecordError(
-                f"a unit is given for {unknown.pop()!r}, but the channels are {', '.join(terms)}."
-            )
-        agreed = {}
-        for name, mix in terms.items():
-            shared = {raw.unit(channel) if power == 1 else "" for channel, power, _ in mix}
-            agreed[name] = shared.pop() if len(shared) == 1 else ""
-        powers = lambda name: (weight * raw.channel(c) ** p for c, p, weight in terms[name])
-        return assemble(
-            raw.time, roles, lambda name: sum(powers(name), np.zeros(raw.samples)),
-            (agreed | dict(units)).__getitem__, source=raw.source, hold=raw.hold,
-            repaired=raw.repaired,
-        )  # fmt: skip
-
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         logged = _read_channels(
-            path, roles if plain else (names,), time, time_unit, dt, time_factor,
-            max_gap=max_gap, hold=hold, valid=valid or {},
+            path, roles, time, time_unit, dt, time_factor, max_gap=max_gap, hold=hold,
+            valid=valid or {},
         )  # fmt: skip
-        cut = [_without_gaps(lambda span: mixed(span, sample_rate), x) for x in segments]
+        recorded = lambda segment, rate: logged.record(roles, units, rate, segment)
+        cut = [_without_gaps(lambda span: recorded(span, sample_rate), x) for x in segments]
         parts = [part for several in cut for part in several]
         records = [record for _, record in parts]
         slowest = min(record.sample_rate for record in records)
         if max(record.sample_rate for record in records) > (1 + 1e-6) * slowest:
             rate = float(f"{slowest:.3g}")
-            records = [mixed(segment, rate) for segment, _ in parts]
+            records = [recorded(segment, rate) for segment, _ in parts]
     for warning in {str(warning.message): warning for warning in caught}.values():
         warnings.warn(str(warning.message), warning.category, stacklevel=2)
     return records
 
 
-def _power(term: str) -> tuple[str, int]:
-    """The channel and the power in a term of a sum: `m1^2` is `m1` and 2."""
-    channel, sign, power = term.rpartition("^")
-    return (channel, int(power)) if sign and channel and power in set("23456789") else (term, 1)
-
-
 def _without_gaps(
-    mixed: Callable[[Segment], Record], segment: Segment
+    recorded: Callable[[Segment], Record], segment: Segment
 ) -> list[tuple[Segment, Record]]:
     """The parts of a segment between gaps that are too long to be interpolated."""
     try:
-        return [(segment, mixed(segment))]
+        return [(segment, recorded(segment))]
     except GapError as error:
         gaps = error.gaps
         begins, ends = (segment[0], *(b for _, b in gaps)), (*(a for a, _ in gaps), segment[1])
@@ -371,7 +363,7 @@ def _without_gaps(
         parts: list[tuple[Segment, Record]] = []
         for span in spans:
             try:
-                several = _without_gaps(mixed, span)
+                several = _without_gaps(recorded, span)
             except RecordError:  # too few samples between two gaps
                 continue
             parts += [part for part in several if part[1].duration >= _SHORTEST]

@@ -293,6 +293,19 @@ def test_units_are_given_by_name_and_refused_for_channels_that_are_not_read(tmp_
         read(path, inputs="M", outputs="q", units={"p": "rad/s"})
 
 
+@pytest.mark.parametrize(
+    ("weights", "said"),
+    [
+        ({"m1": 1.0}, "no channel 'm1'"),
+        ({}, "the sum 'roll' is empty"),
+        ({"u": np.nan, "u^2": 1.0}, "weight of 'u' in the sum 'roll' is nan"),
+    ],
+)
+def test_a_sum_is_refused_that_says_nothing(weights, said, tmp_path):
+    with pytest.raises(RecordError, match=said):
+        read(npz(tmp_path, t=TIME, u=U, y=Y), inputs={"roll": weights}, outputs="y[0]")
+
+
 def test_a_hold_is_kept_as_long_as_a_sample_is_no_shorter(tmp_path):
     time = np.arange(400) * 0.01
     path = tmp_path / "log.npz"
