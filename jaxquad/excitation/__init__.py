@@ -26,7 +26,6 @@ __all__ = [
     "harmonics",
     "multisine",
     "sweep",
-    "sweep_frequency",
     "three_two_one_one",
 ]
 Kind = Literal["sweep", "multisine", "doublet", "3-2-1-1"]
@@ -142,31 +141,6 @@ def sweep(
     signal = amplitude * envelope * np.sin(phase)
     numbers = (omega_min, omega_max, amplitude, sample_rate, duration, lead_in, trim, trim)
     return Excitation(time, signal, np.empty(0), "sweep", *map(float, numbers))
-
-
-def sweep_frequency(excitation: Excitation) -> Samples:
-    """Instantaneous frequency of a sweep.
-
-    **Arguments:**
-
-    - `excitation`: made by `sweep`.
-
-    **Returns:** frequency in rad/s for each sample; NaN in the zeros before and after the sweep.
-
-    **Raises:**
-
-    - `ValueError`: for another kind of excitation.
-    """
-    if excitation.kind != "sweep":
-        raise ValueError(
-            f"a {excitation.kind} has no instantaneous frequency: use a sweep (jq.sweep)."
-        )
-    clock = excitation.time - excitation.lead
-    span = excitation.duration - excitation.lead_in
-    sweeping = np.clip(clock - excitation.lead_in, 0, span)
-    band = excitation.omega_max - excitation.omega_min
-    omega = excitation.omega_min + _C2 * np.expm1(_C1 * sweeping / span) * band
-    return np.where((clock >= 0) & (clock <= excitation.duration), omega, np.nan)
 
 
 def _ramp(clock: Samples, width: Number) -> Samples:
