@@ -237,10 +237,6 @@ class Flight(NamedTuple):
             return "sticks not logged"
         return "sticks " + ", ".join(f"{a} {100 * x:.0f} %" for a, x in self.sticks.items())
 
-    def is_excited(self, axis: str | None = None) -> bool:
-        """Whether a chirp or the sticks excite the `axis`, by default any axis."""
-        return self.rank(axis) > 0
-
     def rank(self, axis: str | None) -> int:
         """2 with a chirp, 1 with sticks that move, else 0."""
         if axis in self.chirps or (axis is None and self.chirps):

@@ -51,7 +51,7 @@ def test_the_flights_of_a_file_are_listed_with_throttle_and_excitation(joined):
     assert chirp.chirps == {"roll": pytest.approx(20, abs=0.01)} and not levels.chirps
     assert levels.throttle == (0.0, pytest.approx(0.64, abs=0.01))
     assert levels.sticks["roll"] > 0.2 and levels.sticks["pitch"] < 0.01
-    assert [each.is_excited("roll") for each in (hover, chirp, levels)] == [False, True, True]
+    assert [each.rank("roll") for each in (hover, chirp, levels)] == [0, 2, 1]
     assert str(chirp) == "flight 2: 24.3 s, throttle 0.00 .. 0.41, chirp on roll 20 s"
 
 
