@@ -278,7 +278,7 @@ def uniform_stamps(time: ArrayLike, unit: TimeUnit | None) -> Times:
         if stamps is None or unit is not None:
             raise RecordError(
                 f"time has the type {dates.dtype}: give «time_unit=» to plain numbers only, and "
-                f"dates or durations in a unit between weeks and attoseconds."
+                f"dates or durations in a unit between weeks and femtoseconds."
             )
     else:
         stamps = as_float64("time", time) / PER_SECOND[unit or "s"]
