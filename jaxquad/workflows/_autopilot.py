@@ -5,7 +5,6 @@ import re
 import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
@@ -23,7 +22,6 @@ from jaxquad.autopilot import (
     firmware_named,
     Flown,
     FlownADRC,
-    FlownAutopilot,
     HOVER,
     propose_adrc,
     read_channels_if_any,
@@ -94,7 +92,7 @@ def autopilot(
             )
         return _tune_adrc(path, record, proposal, settings, adrc)
     if settings.axis != "all":
-        return _tune_axis(_read_axis(path, settings), {})
+        return _tune_axis(path, settings, {})
     number = re.match(r"log(\d+)\.", proposal.setup.rate)
     if (
         number is not None and settings.flight is None
@@ -108,19 +106,13 @@ def _tune_axes(path: Path, settings: AutopilotSettings) -> AxesProposal:
 
     Raises the error of the first axis where none can be used.
     """
-    read: dict[str, _ReadAxis] = {}
-    errors: dict[str, ValueError] = {}
-    for axis in AXES:
-        try:
-            read[axis] = _read_axis(path, dataclasses.replace(settings, axis=axis))
-        except ValueError as error:  # the log lacks what this axis needs
-            errors[axis] = error
     axes: dict[str, AutopilotProposal] = {}
+    errors: dict[str, ValueError] = {}
     filters: Mapping[str, float] = {}
-    for axis, axis_read in read.items():
+    for axis in AXES:
         announce(f"{axis}:")
         try:
-            axes[axis] = _tune_axis(axis_read, filters)
+            axes[axis] = _tune_axis(path, dataclasses.replace(settings, axis=axis), filters)
         except ValueError as error:  # it costs no other axis
             errors[axis] = error
             continue
@@ -130,26 +122,13 @@ def _tune_axes(path: Path, settings: AutopilotSettings) -> AxesProposal:
     return AxesProposal(settings, axes, {axis: in_options(error) for axis, error in errors.items()})
 
 
-class _ReadAxis(NamedTuple):
-    """What a log holds of one axis."""
-
-    path: Path
-    settings: AutopilotSettings
-    record: IdentifySettings
-    proposal: Proposal
-    flown: FlownAutopilot
-
-
-def _read_axis(path: Path, settings: AutopilotSettings) -> _ReadAxis:
+def _tune_axis(
+    path: Path, settings: AutopilotSettings, filters: Mapping[str, float]
+) -> AutopilotProposal:
+    """The gains of one axis, with `filters` that are changed already."""
     announce("gains and filters that flew")
     record, proposal = _channels_of(path, settings)
     flown = read_flown(path, proposal, record, settings.throttle)
-    return _ReadAxis(path, settings, record, proposal, flown)
-
-
-def _tune_axis(axis: _ReadAxis, filters: Mapping[str, float]) -> AutopilotProposal:
-    """The gains of one axis, with `filters` that are changed already."""
-    path, settings, record, proposal, flown = axis
     plant = identify_plant(path, record, proposal, flown.filters)
     unsure = lambda why, again: AutopilotProposal("cannot tell", why, settings, plant, flown, again)
     recipe = firmware_named(flown.firmware).what_to_fly(AXES[flown.axis])
