@@ -22,7 +22,7 @@ from jaxquad.identify import (
     UndeterminedError,
     Verification,
 )
-from jaxquad.models import LaggedIntegrator, TransferFunction
+from jaxquad.models import LaggedIntegrator
 from jaxquad.records import (
     clock_start,
     Proposal,
@@ -45,7 +45,6 @@ if TYPE_CHECKING:
     from jaxquad.plot import Panels
 
 
-Model = LaggedIntegrator | TransferFunction
 _FIGURES = ("record.png", "bode.png", "verification.png")
 HALVES, EXPLAINED = "Lower and upper half of the band", "What explains the misfit"
 
@@ -157,11 +156,11 @@ class Identification:
         return f"{output} / {source} = {above}{ratio}"
 
     @property
-    def sums(self) -> Mapping[str, Callable[[Model], Float[Array, ""]]]:
-        """The quantities that are shown beside the parameters, all in s."""
+    def sums(self) -> Mapping[str, Callable[[LaggedIntegrator], Float[Array, ""]]]:
+        """What is shown beside the parameters, in s: a sum is better determined than its terms."""
         settings = self.settings
         both = settings.poles is None and settings.lag and settings.delay
-        return {"lag + delay": total_delay} if both else {}
+        return {"lag + delay": _total_delay} if both else {}
 
     @ft.cached_property
     def combinations(self) -> tuple[Combination, ...]:
@@ -371,9 +370,8 @@ class Identification:
             return None
 
 
-def total_delay(model: Model) -> Float[Array, ""]:
-    """The sum of lag and delay, which a record determines better than either of them."""
-    return model.delay if isinstance(model, TransferFunction) else model.lag + model.delay
+def _total_delay(model: LaggedIntegrator) -> Float[Array, ""]:
+    return model.lag + model.delay
 
 
 def _on_negative_gain(fit: Fit, frf: FrequencyResponse) -> list[str]:

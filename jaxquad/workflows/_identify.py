@@ -41,9 +41,8 @@ _EXCITE = "excite the axis more, over a wider band (jaxquad design sweep), or re
 
 
 def identify(
-    path: str | Path | Sequence[str | Path], settings: IdentifySettings | None = None, *,
-    proposal: Proposal | None = None,
-) -> Identification:  # fmt: skip
+    path: str | Path | Sequence[str | Path], settings: IdentifySettings | None = None
+) -> Identification:
     """Identify one log, or several together, as `jaxquad identify` does.
 
     The frequency response is estimated with the delay taken out that a fit to a quick one has
@@ -57,7 +56,6 @@ def identify(
         same channels and units; their sample rates become the lowest of them.
     - `settings`: what to read from it and what to fit. By default the log proposes its input and
       output, and K e^(-delay s) / (s (lag s + 1)) is fitted.
-    - `proposal`: what `propose_settings` returned beside these settings, if they are its.
 
     **Returns:** an `Identification`. Parameters that the record does not determine are marked by
     `.fit.verdict`; nothing is written before its `.write(folder)`.
@@ -74,7 +72,7 @@ def identify(
         result.write("results/flight")
         ```
     """
-    return identify_opened(open_logs(path, settings, proposal))
+    return identify_opened(open_logs(path, settings))
 
 
 def identify_again(

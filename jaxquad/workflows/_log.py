@@ -111,7 +111,7 @@ def open_logs(
     path: str | Path | Sequence[str | Path], settings: IdentifySettings | None = None,
     proposal: Proposal | None = None,
 ) -> OpenedLogs:  # fmt: skip
-    """Read what `identify` takes, with the same arguments; it needs no JAX.
+    """Read what `identify` takes, without JAX; `proposal` is what the settings were proposed by.
 
     **Raises:** `RecordError` or `ReadError` (both ValueErrors) for a log that cannot be used, and
     ValueError for settings that do not go with it.
@@ -121,36 +121,30 @@ def open_logs(
     with keep_logs():
         if proposal is None:
             settings, proposal = propose_settings(paths[0], settings, several=len(paths) > 1)
-        return _open_logs(paths, settings, proposal)
-
-
-def _open_logs(
-    paths: tuple[Path, ...], settings: IdentifySettings, proposal: Proposal | None
-) -> OpenedLogs:
-    logs = {path: read_records(path, settings) for path in paths}
-    rates = [records[0].sample_rate for records in logs.values()]
-    if max(rates) > (1 + 1e-6) * min(rates):
-        common = dataclasses.replace(settings, rate=float(f"{min(rates):.3g}"))
-        logs = {path: read_records(path, common) for path in paths}
-    (first, [reference, *_]), *others = logs.items()
-    for path, [record, *_] in others:
-        for name in (*reference.input_names, *reference.output_names):
-            if record.unit(name) != reference.unit(name):
-                raise RecordError(
-                    f"the unit of {name} is {reference.unit(name) or 'not known'} in {first}, but "
-                    f"{record.unit(name) or 'not known'} in {path}: logs that are identified "
-                    f"together need one unit. Leave one of them out."
+        logs = {path: read_records(path, settings) for path in paths}
+        rates = [records[0].sample_rate for records in logs.values()]
+        if max(rates) > (1 + 1e-6) * min(rates):
+            common = dataclasses.replace(settings, rate=float(f"{min(rates):.3g}"))
+            logs = {path: read_records(path, common) for path in paths}
+        (first, [reference, *_]), *others = logs.items()
+        for path, [record, *_] in others:
+            for name in (*reference.input_names, *reference.output_names):
+                if record.unit(name) != reference.unit(name):
+                    raise RecordError(
+                        f"the unit of {name} is {reference.unit(name) or 'not known'} in {first}, "
+                        f"but {record.unit(name) or 'not known'} in {path}: logs that are "
+                        f"identified together need one unit. Leave one of them out."
+                    )
+        records = tuple(record for of_one in logs.values() for record in of_one)
+        if proposal is not None and settings.reference == proposal.options["references"]:
+            names = records[0].reference_names
+            if names and not any(np.ptp(x.channel(name)) > 0 for x in records for name in names):
+                # It rests in the analysed part, and excites nothing there.
+                settings = dataclasses.replace(settings, reference=None)
+                records = tuple(
+                    select(x, inputs=x.input_names, outputs=x.output_names) for x in records
                 )
-    records = tuple(record for of_one in logs.values() for record in of_one)
-    if proposal is not None and settings.reference == proposal.options["references"]:
-        names = records[0].reference_names
-        if names and not any(np.ptp(record.channel(x)) > 0 for record in records for x in names):
-            # It rests in the analysed part, and excites nothing there.
-            settings = dataclasses.replace(settings, reference=None)
-            records = tuple(
-                select(x, inputs=x.input_names, outputs=x.output_names) for x in records
-            )
-    return OpenedLogs(paths, settings, proposal, records, _other_commands(logs, settings))
+        return OpenedLogs(paths, settings, proposal, records, _other_commands(logs, settings))
 
 
 def open_again(result: str | Path | StoredResult, *, log: str | Path | None = None) -> OpenedLogs:
