@@ -1,7 +1,7 @@
 """What a figure shows: models, fits, loops, measured responses and records, by name."""
 
 from collections.abc import Iterable, Mapping
-from typing import NamedTuple, Protocol, runtime_checkable
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import ArrayLike, Bool, Float, PyTree
@@ -133,13 +133,6 @@ class Channels(NamedTuple):
         return f"{output} per {source}" if output and source else ""
 
 
-@runtime_checkable
-class _IsSampled(Protocol):
-    """A response that ends at pi / dt."""
-
-    dt: float
-
-
 _DECADES = (-1.0, 2.0)  # of rad/s, for models that do not say where they change
 _POINTS = 300
 
@@ -188,9 +181,8 @@ class Shown(NamedTuple):
             return np.atleast_1d(np.asarray(omega, float))
         spans = [np.asarray(response.frf.omega)[[0, -1]] for response in self.measured]
         for model in () if spans else (entry.model for entry in self.modelled):
-            if isinstance(model, _IsSampled):
-                end = np.pi / model.dt
-                spans.append(np.array([1e-3 * end, 0.999 * end]))
+            if (dt := getattr(model, "dt", None)) is not None:  # it ends at pi / dt
+                spans.append(np.array([1e-3, 0.999]) * (np.pi / dt))
                 continue
             try:
                 plant = linear_model(model)
