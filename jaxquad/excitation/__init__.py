@@ -150,18 +150,16 @@ def _ramp(clock: Samples, width: Number) -> Samples:
 
 
 def harmonics(
-    omega_min: Number, omega_max: Number, *, period: Number, lines: int | None = None,
-    spacing: Literal["log", "linear"] = "log",
-) -> Lines:  # fmt: skip
+    omega_min: Number, omega_max: Number, *, period: Number, lines: int | None = None
+) -> Lines:
     """Choose harmonics of a period for a multisine.
 
     **Arguments:**
 
     - `omega_min`, `omega_max`: ends of the band in rad/s.
     - `period`: in s.
-    - `lines`: about how many; by default all harmonics in the band. Log spacing gives fewer where
-        the lines would be closer than the harmonics.
-    - `spacing`: of the lines, `"log"` or `"linear"`.
+    - `lines`: about how many, log-spaced; by default all harmonics in the band. It gives fewer
+        where the lines would be closer than the harmonics.
 
     **Returns:** frequencies in rad/s, increasing. `omega[0::2]` and `omega[1::2]` excite two axes
     at once without influencing each other's lines.
@@ -186,10 +184,7 @@ def harmonics(
             f"lines is {lines}: the band holds {last - first + 1} harmonics; use 2 to "
             f"{last - first + 1}."
         )
-    space = {"log": np.geomspace, "linear": np.linspace}
-    if spacing not in space:
-        raise ValueError(f"spacing is {spacing!r}: use 'log' or 'linear'.")
-    return base * np.unique(np.round(space[spacing](first, last, lines)))
+    return base * np.unique(np.round(np.geomspace(first, last, lines)))
 
 
 def multisine(
