@@ -3,6 +3,7 @@
 import argparse
 import atexit
 import contextlib
+import fcntl
 import gc
 import json
 import logging
@@ -139,19 +140,15 @@ def folder_to_write(
 @contextlib.contextmanager
 def _locked(folder: Path) -> Iterator[None]:
     """One process at a time is within it; the death of one opens it. Without locks, all are."""
-    try:
-        import fcntl
-
+    place = None
+    with contextlib.suppress(OSError):  # a folder that may not be read, a disk without locks
         place = os.open(folder, os.O_RDONLY)
-    except (ImportError, OSError):  # Windows, or a folder that may not be read
-        yield
-        return
+        fcntl.flock(place, fcntl.LOCK_EX)
     try:
-        with contextlib.suppress(OSError):  # a network's disk without locks
-            fcntl.flock(place, fcntl.LOCK_EX)
         yield
     finally:
-        os.close(place)
+        if place is not None:
+            os.close(place)
 
 
 class _NamedOnce(argparse.Action):

@@ -5,6 +5,7 @@ A result is on the disk whole or not there.
 
 import atexit
 import contextlib
+import fcntl
 import gc
 import json
 import math
@@ -141,11 +142,7 @@ def locked(out: Path) -> Iterator[None]:
     out.mkdir(parents=True, exist_ok=True)
     with (out / ".lock").open("w") as file:
         try:
-            import fcntl
-
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except ImportError:  # Windows: two batches in one folder do the same work twice, no harm.
-            pass
         except OSError as error:
             raise ValueError(
                 f"{out}: another batch is running in this folder: wait for it, or choose another "
@@ -169,9 +166,6 @@ _NARROW = {  # Each process has one core: more threads would only wait for each 
 @contextlib.contextmanager
 def _without_interrupts() -> Iterator[None]:
     """A process that starts within it never gets the interrupt that ends this one."""
-    if not hasattr(signal, "pthread_sigmask"):  # Windows
-        yield
-        return
     resource_tracker.ensure_running()  # which would let interrupts in
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
@@ -212,9 +206,6 @@ class _Worker:
                 f"its process was {how} (too little memory?); the next run tries the log again"
             )
 
-    def overdue(self) -> bool:
-        return time.monotonic() >= self.due and not self.connection.poll()
-
     def give_up(self) -> Content:
         """Stop a job that takes too long; its failure is kept, or it would take as long again."""
         self.stop()
@@ -254,7 +245,8 @@ def perform_locally(
             due = min(worker.due for worker in busy.values())
             left = None if due == math.inf else max(0.0, due - time.monotonic())
             ready = wait(list(busy), left)
-            late = [connection for connection, worker in busy.items() if worker.overdue()]
+            now = time.monotonic()
+            late = [x for x, worker in busy.items() if now >= worker.due and not x.poll()]
             for connection in [*ready, *late]:
                 worker = busy.pop(connection)  # pyright: ignore[reportArgumentType]
                 done = worker.job
@@ -271,8 +263,7 @@ def perform_locally(
 
 
 def _serve(work: Work, connection: Connection) -> None:
-    if hasattr(os, "setpgid"):
-        os.setpgid(0, 0)  # What it starts ends with it, see _kill.
+    os.setpgid(0, 0)  # What it starts ends with it, see _kill.
 
     def end_with_the_parent() -> None:
         """At once: a batch that is started again must not find the job under way."""
@@ -293,9 +284,8 @@ def _serve(work: Work, connection: Connection) -> None:
 
 def _kill(process: BaseProcess | None) -> None:
     """A process (None: this one) with the readers that it has started."""
-    if hasattr(os, "killpg"):
-        with contextlib.suppress(OSError):  # It has no group of its own yet.
-            os.killpg((process and process.pid) or os.getpid(), signal.SIGKILL)
+    with contextlib.suppress(OSError):  # It has no group of its own yet.
+        os.killpg((process and process.pid) or os.getpid(), signal.SIGKILL)
     if process is None:
         os._exit(1)
     process.kill()
