@@ -10,7 +10,7 @@ from jaxquad.identify import GainBand
 from jaxquad.records import clock_start, Record
 
 from . import _panels as lay
-from ._panels import AxesLike, LINES, look_of, Panels, Style
+from ._panels import AxesLike, look_of, Panels, Style
 
 
 Places = Int[np.ndarray, " kept"]
@@ -104,14 +104,9 @@ def histories(
 
     **Raises:** ValueError for more curves than there are lines, and for limits of an unknown panel.
     """
-    names = list(dict.fromkeys(name for curves in panels.values() for name in curves))
-    others = [name for name in names if name != target]
-    if len(others) > len(LINES):
-        raise ValueError(
-            f"{len(others)} curves are too many to be distinguished, {len(LINES)} is the most: "
-            f"split {others} over several figures"
-        )
-    style = dict(zip(others, LINES, strict=False)) | ({target: _TARGET} if target else {})
+    names = dict.fromkeys(name for curves in panels.values() for name in curves if name != target)
+    style = {name: look_of(k, name) for k, name in enumerate(names)}
+    style |= {target: _TARGET | {"label": target}} if target else {}
     unknown = [text for text in limits or {} if text not in panels]
     if unknown:
         raise ValueError(f"limits for {unknown}, but the panels are {list(panels)}")
@@ -119,7 +114,7 @@ def histories(
     for axis, (text, curves) in zip(axes, panels.items(), strict=True):
         for name, values in curves.items():
             shown = np.asarray(values, float)
-            axis.plot(time, np.where(np.isfinite(shown), shown, np.nan), label=name, **style[name])
+            axis.plot(time, np.where(np.isfinite(shown), shown, np.nan), **style[name])
         axis.set_ylabel(text)
         axis.grid(True, color="0.92", lw=0.5)
         axis.margins(x=0)

@@ -88,10 +88,9 @@ def stacked(count: int, ax: AxesLike = None, *, columns: int = 1, shared: bool =
         import matplotlib.pyplot as plt  # here: it is slow to import, and no report needs it
 
         figure = plt.figure()
-    first = figure.add_axes((0, 0, 1, 1), label="0")
-    panels = [first]
-    for k in range(1, count):
-        other = first if shared else None
+    panels: list[Axes] = []
+    for k in range(count):
+        other = panels[0] if shared and panels else None
         panels.append(figure.add_axes((0, 0, 1, 1), sharex=other, label=f"{k}"))
     for panel in panels[:-columns] if shared else ():
         panel.tick_params(labelbottom=False)
@@ -120,22 +119,19 @@ def arrange(
         return panels
     left += _LINE * max(panel.get_ylabel().count("\n") for panel in panels)
     gaps = list(gap) if isinstance(gap, Sequence) else [gap] * (len(heights) - 1)
-    lines = len(title.splitlines())
-    top = _TOP + _LINE * lines + above
+    top = _TOP + _LINE * len(title.splitlines()) + above
     longest = max(map(len, legend), default=0)
     across_legend = max(1, min(len(legend), 3, int(width / (_HANDLE + _LETTER * longest))))
     rows = ceil(len(legend) / across_legend)
     bottom = _BOTTOM + (_LINE * rows + 0.15 if rows else 0.0)
     total = top + sum(heights) + sum(gaps) + bottom
     panels.figure.set_size_inches(width, total)
-    column = width / columns
+    column, edge = width / columns, total - top
     across = column - left - right
-    edge = total - top
     for row, (height, space) in enumerate(zip(heights, [*gaps, 0.0], strict=True)):
         for k, panel in enumerate(panels[row * columns : (row + 1) * columns]):
-            x = k * column + left
-            place = (x / width, (edge - height) / total, across / width, height / total)
-            panel.set_position(place)
+            x, y = (k * column + left) / width, (edge - height) / total
+            panel.set_position((x, y, across / width, height / total))
             # Else every tick is measured in order to stand beside it.
             panel.yaxis.set_label_coords(-_LABEL / across, 0.5)
             panel.xaxis.set_label_coords(0.5, -0.35 / height)

@@ -44,9 +44,7 @@ def test_what_is_not_finite_is_left_out_and_limits_hold():
 
 
 def test_too_many_curves_and_unknown_panels_are_refused():
-    with pytest.raises(
-        ValueError, match="6 curves are too many to be distinguished, 5 is the most"
-    ):
+    with pytest.raises(ValueError, match="is curve 6, too many to be distinguished, 5 is the most"):
         histories(TIME, {"roll": {str(k): TIME for k in range(6)}})
     with pytest.raises(ValueError, match=r"limits for \['pitch'\].*\['roll'\]"):
         histories(TIME, {"roll": {"x": TIME}}, limits={"pitch": (0.0, 1.0)})
