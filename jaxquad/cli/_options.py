@@ -16,21 +16,11 @@ from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
 from jaxquad._core import readable, STAGES
-from jaxquad.workflows import (
-    AutopilotSettings,
-    BatchSettings,
-    free_folder,
-    GROUPS,
-    IdentifySettings,
-    TuneSettings,
-)
+from jaxquad.workflows import free_folder, GROUPS, Settings
 
 
 Run = Callable[[argparse.Namespace], int]
-Settings = (
-    type[AutopilotSettings] | type[IdentifySettings] | type[TuneSettings] | type[BatchSettings]
-)
-S = TypeVar("S", AutopilotSettings, IdentifySettings, TuneSettings, BatchSettings)
+S = TypeVar("S", bound=Settings)
 Declare = Callable[[argparse.ArgumentParser], Run]  # declares options; what it returns runs
 
 
@@ -161,8 +151,9 @@ class _NamedOnce(argparse.Action):
 
 
 def add_settings(
-    declared: argparse.ArgumentParser, settings: Settings, *, only: Mapping[str, str] | None = None
-) -> None:
+    declared: argparse.ArgumentParser, settings: type[Settings], *,
+    only: Mapping[str, str] | None = None,
+) -> None:  # fmt: skip
     """Declare an option for each setting, or for those in `only`, each with its own help or ""."""
     chosen = {k: o for k, o in settings.options().items() if only is None or k in only}
     used = list(dict.fromkeys(option.group for option in chosen.values()))
@@ -186,7 +177,7 @@ def add_settings(
         group.add_argument(option.flag, **how)
 
 
-def typed_settings(options: argparse.Namespace, settings: Settings) -> dict[str, object]:
+def typed_settings(options: argparse.Namespace, settings: type[Settings]) -> dict[str, object]:
     """Those that were typed on the command line."""
     return {key: value for key, value in vars(options).items() if key in settings.options()}
 

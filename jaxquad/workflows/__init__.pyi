@@ -17,7 +17,7 @@ from ._log import (
     propose_settings as propose_settings,
     write_demo_log as write_demo_log,
 )
-from ._options import SettingsError as SettingsError
+from ._options import Settings as Settings, SettingsError as SettingsError
 from ._result_file import (
     default_folder as default_folder,
     free_folder as free_folder,
