@@ -94,7 +94,6 @@ def verification_content(check: "Verification") -> dict[str, object]:
 
 
 _PACKAGES = ("jaxquad", "jax", "jaxlib", "numpy", "scipy", "equinox", "optimistix")
-_BLOCK = 1 << 20  # bytes
 
 
 class Source(NamedTuple):
@@ -166,8 +165,7 @@ def sha256_of(path: str | Path) -> str:
     digest = hashlib.sha256()
     for part in _files(Path(path)):
         with part.open("rb") as file:
-            while block := file.read(_BLOCK):
-                digest.update(block)
+            hashlib.file_digest(file, lambda: digest)
     return digest.hexdigest()
 
 
