@@ -263,26 +263,23 @@ def _run(words: Sequence[str]) -> int:
         print(_WAY, end="")
         return 0
     options, unknown = make_parser().parse_known_args(words)
-    if unknown:
-        return _fail(_describe_unknown(options, unknown), _UNUSABLE)
+    if unknown:  # words that no command declares: what is wrong, and the option that was meant
+        command = f"jaxquad {options.command}"
+        first = next((word for word in unknown if word.startswith("-")), unknown[0])
+        text = f"{command} takes no further argument {first!r}."
+        if first.startswith("-"):
+            name = first.partition("=")[0]
+            flags = re.findall(r"--[a-z][a-z0-9-]*", options.usage)
+            near = difflib.get_close_matches(name, flags, n=1)
+            text = f"{command} has no option {name}."
+            text += f" Did you mean {near[0]}?" if near else ""
+        return _fail(f"{text} See {command} --help.", _UNUSABLE)
     with warnings.catch_warnings(), shell.shown_stages(options):
         for kind in (RecordWarning, PageWarning):
             warnings.simplefilter("always", kind)
         warnings.showwarning = printer_of_warnings()
         shell.check_out(options)
         return options.run(options)
-
-
-def _describe_unknown(options: argparse.Namespace, words: Sequence[str]) -> str:
-    """What is wrong with words that no command declares, and the option that was meant."""
-    command = f"jaxquad {options.command}"
-    first = next((word for word in words if word.startswith("-")), words[0])
-    if not first.startswith("-"):
-        return f"{command} takes no further argument {first!r}. See {command} --help."
-    name = first.partition("=")[0]
-    near = difflib.get_close_matches(name, re.findall(r"--[a-z][a-z0-9-]*", options.usage), n=1)
-    guess = f" Did you mean {near[0]}?" if near else ""
-    return f"{command} has no option {name}.{guess} See {command} --help."
 
 
 def _fail(message: str, code: int) -> int:

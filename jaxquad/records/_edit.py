@@ -190,8 +190,7 @@ def _warn_of_clocks(pieces: Sequence[Channel], begin: float, end: float) -> None
             longest = f"longest {1e3 * step.max():.4g} ms at t = {place}"
             gaps.append(f"{piece.name!r} {holes.size}, {longest}")
     if gaps:
-        remark = f"gaps filled by interpolation: {'; '.join(gaps)}."
-        warn(remark)
+        warn(f"gaps filled by interpolation: {'; '.join(gaps)}.")
     scattered = [piece for piece in pieces if scatters(piece.time)]
     if scattered:
         off = max(nonuniformity(piece.time) for piece in scattered)

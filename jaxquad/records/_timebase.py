@@ -321,8 +321,7 @@ class Timebases:
                 "sampling interval («dt=»)."
             )
         if doubt:
-            said = f"the time stamps are taken from {base!r}{doubt}"
-            warn(said)
+            warn(f"the time stamps are taken from {base!r}{doubt}")
         return base
 
     def _count(self, base: str) -> tuple[np.ndarray, int]:

@@ -347,10 +347,8 @@ def spectrum_section(frf: FrequencyResponse, record: Record) -> Section | None:
     elif line.follows > _FOLLOWS:
         text += f" It rises with {throttle} {ranked}: motors."
     elif abs(line.follows) < _STAYS:
-        text += (
-            f" It does not follow {throttle} {ranked}: a resonance of the frame or of the loop, "
-        )
-        text += "or an electrical line."
+        text += f" It does not follow {throttle} {ranked}: a resonance of the frame or of the "
+        text += "loop, or an electrical line."
     else:
         text += f" Its rank correlation with {throttle} is {line.follows:.2f}."
     return {"images": images, "text": text}

@@ -153,10 +153,8 @@ def _key_of(log: Path, settings: IdentifySettings) -> str:
 
 
 _FIRST = ("log", "status")
-_LAST = ("remarks", "seconds", "error", "report", "key")
-
-
 _TEXTS = ("error", "report", "key")
+_LAST = ("remarks", "seconds", *_TEXTS)
 
 
 def _write_tables(out: Path, rows: Sequence[Row]) -> None:
