@@ -286,7 +286,7 @@ class FlownAutopilot:
 def settings_of(path: Path, proposal: Proposal) -> LogSettings:
     """The log's own parameters, of the part that is proposed."""
     prefix = _channel_prefix(proposal).rstrip(".")
-    return read_settings(path, log=prefix, at=proposal.setup.start)
+    return read_settings(path, log=prefix, at=proposal.setup.longest[0])
 
 
 def read_flown(

@@ -48,14 +48,14 @@ class Proposal(NamedTuple):
     @property
     def options(self) -> dict[str, Any]:
         """The keyword arguments of `read`."""
-        setup = self.setup
+        setup, (start, stop) = self.setup, self.setup.longest
         return {
             "inputs": {self._command_name: dict(setup.command)},
             "outputs": setup.rate,
             "references": setup.reference or None,
             "sample_rate": self.sample_rate,
-            "start": setup.start,
-            "stop": setup.stop,
+            "start": start,
+            "stop": stop,
             "hold": setup.hold,
         }
 
@@ -79,25 +79,22 @@ class Proposal(NamedTuple):
 
         Empty where neither was found.
         """
-        setup = self.setup
-        if setup.segments or setup.start is None or setup.stop is None:
-            return setup.segments
-        return ((setup.start, setup.stop),)
+        return tuple((a, b) for a, b in self.setup.spans if a is not None and b is not None)
 
     @property
     def command_line(self) -> str:
         """`jaxquad identify ...`, quoted for a shell."""
-        setup = self.setup
+        setup, (start, stop) = self.setup, self.setup.longest
         words = ["jaxquad", "identify", self.path, "--input", self._mix, "--output", setup.rate]
         words += ["--reference", setup.reference] if setup.reference else []
         words += ["--rate", f"{self.sample_rate:.6g}"]
         words += ["--hold", f"{setup.hold:.6g}"] if setup.hold else []
         if len(self.segments) > 1:
-            spans = [f"{start:.12g}:{stop:.12g}" for start, stop in self.segments]
+            spans = [f"{a:.12g}:{b:.12g}" for a, b in self.segments]
             words += [word for span in spans for word in ("--segment", span)]
         else:
-            words += ["--start", f"{setup.start:.12g}"] if setup.start is not None else []
-            words += ["--stop", f"{setup.stop:.12g}"] if setup.stop is not None else []
+            words += ["--start", f"{start:.12g}"] if start is not None else []
+            words += ["--stop", f"{stop:.12g}"] if stop is not None else []
         words += ["--band", *(f"{f:.3g}" for f in setup.band)] if setup.band else []
         return shlex.join(words)
 
@@ -239,7 +236,7 @@ def propose(
         setup = _split(setup, changes, signals)
         used = [
             (-np.inf if start is None else start, np.inf if stop is None else stop)
-            for start, stop in setup.segments or ((setup.start, setup.stop),)
+            for start, stop in setup.spans
         ]
         setup = setup._replace(remarks=(*setup.remarks, *firmware.remarks_on(log, setup, used)))
         units = {name: signal_of(signals, name).unit for name in names}
@@ -296,7 +293,7 @@ def _split(setup: Setup, changes: Sequence[SettingChange], signals: Signals) -> 
     begin, end = float(np.min(clock)), float(np.max(clock))
     spans = [
         (begin if start is None else start, end if stop is None else stop)
-        for start, stop in setup.segments or ((setup.start, setup.stop),)
+        for start, stop in setup.spans
     ]
     first, last = min(start for start, _ in spans), max(stop for _, stop in spans)
     inside = [change for change in changes if first < change.time < last]
@@ -322,14 +319,8 @@ def _split(setup: Setup, changes: Sequence[SettingChange], signals: Signals) -> 
     others = ", ".join(f"{a:.6g} .. {b:.6g} s" for number, (a, b) in parts if number != regime)
     rest = f" (others: {others})" if others else ""
     remark = f"{said}; split there, what lasted longest with the same ones is taken{rest}"
-    alike = [span for number, span in parts if number == regime]
-    return _within_spans(setup._replace(remarks=(*setup.remarks, remark)), alike)
-
-
-def _within_spans(setup: Setup, spans: Sequence[tuple[float, float]]) -> Setup:
-    """The set-up of these spans; its start and stop are those of the longest."""
-    start, stop = max(spans, key=lambda span: span[1] - span[0])
-    return setup._replace(start=start, stop=stop, segments=tuple(spans) if len(spans) > 1 else ())
+    alike = tuple(span for number, span in parts if number == regime)
+    return setup._replace(spans=alike, remarks=(*setup.remarks, remark))
 
 
 _WINDOW = 0.25  # s
@@ -340,15 +331,13 @@ _LOST = 300.0  # deg/s RMS between set-point and rate: more than any manoeuvre t
 
 def _in_flight(log: Log, setup: Setup, start: float | None, stop: float | None) -> Setup:
     """From take-off to landing or crash, or `start` to `stop` (s), which cut what was injected."""
-    spans = setup.segments or ((setup.start, setup.stop),)
-    if setup.start is not None and setup.stop is not None:
+    ends = setup._replace(spans=((start, stop),))
+    injected = [(a, b) for a, b in setup.spans if a is not None and b is not None]
+    if injected:
         low, high = (-np.inf if start is None else start), (np.inf if stop is None else stop)
-        cut = [(max(a, low), min(b, high)) for a, b in spans if a is not None and b is not None]
-        inside = [(a, b) for a, b in cut if a < b]
-        if not inside:
-            return setup._replace(start=start, stop=stop, segments=())
-        return _within_spans(setup, inside)
-    ends = setup._replace(start=start, stop=stop)
+        cut = ((max(a, low), min(b, high)) for a, b in injected)
+        inside = tuple((a, b) for a, b in cut if a < b)
+        return setup._replace(spans=inside) if inside else ends
     if start is not None and stop is not None:
         return ends
     (begin, end), (before, after), remarks = _flown_span(log)
@@ -360,8 +349,7 @@ def _in_flight(log: Log, setup: Setup, start: float | None, stop: float | None) 
     left_out = " and ".join(filter(None, cut))
     said = f"left out, as no flight: {left_out}; --start and --stop take others"
     return setup._replace(
-        start=begin if start is None else start,
-        stop=end if stop is None else stop,
+        spans=((begin if start is None else start, end if stop is None else stop),),
         remarks=(*setup.remarks, *remarks, *((said,) if left_out else ())),
     )
 

@@ -81,24 +81,22 @@ class Injection(NamedTuple):
 class Setup(NamedTuple):
     """The channels and excitation of one axis in a vehicle's log.
 
-    `start` and `stop` are those of the longest injection, `segments` those of all injections of the
-    same kind, in the order of time. Without an injection `start` and `stop` are take-off and
-    landing, None where the log begins or ends in flight. `injected_at` says where the reference
-    enters the loop: at the set-point of the rate or of the angle, or at the mixer, behind the
-    controller, whose logged output, the `command`, contains it all the same. `late_s` are channels
-    whose value acts that long after its stamp, and is computed from measurements of that stamp.
+    `spans` are start and stop of all injections of the same kind, in the order of time; without an
+    injection take-off and landing, None where the log begins or ends in flight. `injected_at` says
+    where the reference enters the loop: at the set-point of the rate or of the angle, or at the
+    mixer, behind the controller, whose logged output, the `command`, contains it all the same.
+    `late_s` are channels whose value acts that long after its stamp, and is computed from
+    measurements of that stamp.
     """
 
     axis: str
     command: Mix  # a weighted sum of channels
     rate: str
     reference: str = ""  # external signal; empty if there is none
-    start: float | None = None  # s
-    stop: float | None = None
+    spans: tuple[tuple[float | None, float | None], ...] = ((None, None),)  # s
     band: tuple[float, float] | None = None  # Hz
     excitation: str = "no injected excitation found"
     remarks: tuple[str, ...] = ()
-    segments: tuple[tuple[float, float], ...] = ()  # s
     hold: float | None = None  # s; of the command, where the log says it
     throttle: Mix = {}  # the collective, 0 to 1 but for PX4's sign; empty if it is not logged
     injected_at: Point = ""  # empty: nothing was injected, or it is not known
@@ -106,10 +104,14 @@ class Setup(NamedTuple):
     chirps: tuple[NumberedChirp, ...] = ()  # all of the log, of any axis
     levelled: bool = False  # whether an angle loop of Betaflight is known to have been closed
 
+    @property
+    def longest(self) -> tuple[float | None, float | None]:
+        """Start and stop of the longest of the spans, in s."""
+        return max(self.spans, key=lambda span: (span[1] or 0.0) - (span[0] or 0.0))
+
 
 def with_injections(setup: Setup, runs: Sequence[Injection], what: str) -> Setup:
     """The `setup` with what was injected and when: all `runs` of one kind."""
-    best = max(runs, key=lambda run: run.stop - run.start)
     swept = [run for run in runs if 0 < run.low < run.high]
     band = (min(r.low for r in swept), max(r.high for r in swept)) if swept else None
     lasted = " + ".join(f"{run.stop - run.start:.4g}" for run in runs)
@@ -119,11 +121,9 @@ def with_injections(setup: Setup, runs: Sequence[Injection], what: str) -> Setup
         low, high = (2 * np.pi * end for end in band)
         span = f"{band[0]:.4g} .. {band[1]:.4g} Hz ({low:.3g} .. {high:.3g} rad/s), "
     return setup._replace(
-        start=best.start,
-        stop=best.stop,
+        spans=tuple((run.start, run.stop) for run in runs),
         band=band,
         excitation=f"{what}, {times}{span}{lasted} s",
-        segments=tuple((run.start, run.stop) for run in runs) if len(runs) > 1 else (),
     )
 
 

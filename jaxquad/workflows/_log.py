@@ -81,7 +81,7 @@ def propose_settings(
         segments = [(scaled(first), scaled(last)) for first, last in proposal.segments]
         changes |= {"segments": segments, "start": None, "stop": None}
     elif not settings.segments:  # the time in flight
-        changes |= {"start": scaled(setup.start), "stop": scaled(setup.stop)}
+        changes |= dict(zip(("start", "stop"), map(scaled, setup.longest), strict=True))
     return dataclasses.replace(settings, **changes), proposal
 
 

@@ -50,8 +50,9 @@ def test_the_same_seed_writes_the_same_file_and_another_one_does_not(log, tmp_pa
 def test_the_chirp_of_its_debug_channels_is_the_reference_of_roll(log):
     setup = propose(log).setup
     assert setup.axis == "roll" and setup.reference == "debug[3]"
-    assert setup.start is not None and setup.stop is not None
-    assert setup.stop - setup.start == pytest.approx(15, abs=0.1)
+    [(start, stop)] = setup.spans
+    assert start is not None and stop is not None
+    assert stop - start == pytest.approx(15, abs=0.1)
 
 
 def test_before_take_off_nothing_moves_and_in_flight_no_motor_is_at_its_limit(columns):

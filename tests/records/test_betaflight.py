@@ -179,7 +179,7 @@ def test_a_chirp_shows_in_the_debug_channels_of_its_mode(tmp_path):
         path = tmp_path / "log.csv"
         np.savetxt(path, table, delimiter=",", header=", ".join(names), comments="", fmt="%.9g")
         setup = propose(path, axis="pitch").setup
-        return setup.start, setup.stop, setup.band
+        return *setup.longest, setup.band
 
     assert said() == (1.0, 2.999, (1.0, 40.9))
     assert said(**{"debug[1]": 7 * active}) == (None, None, None)

@@ -89,7 +89,7 @@ def test_everything_of_a_proposal_is_of_the_flight_that_is_chosen(joined, data, 
     assert ours.rate == label + theirs.rate and ours.reference == label + theirs.reference
     assert ours.throttle == {label + name: x for name, x in theirs.throttle.items()}
     assert ours.hold == pytest.approx({1: 250e-6, 2: 252e-6}[number], rel=1e-9)
-    assert (ours.start, ours.stop, ours.band) == (theirs.start, theirs.stop, theirs.band)
+    assert (ours.spans, ours.band) == (theirs.spans, theirs.band)
     assert ours.remarks[1:] == tuple(
         x.replace("gyroADC", f"{label}gyroADC") for x in theirs.remarks
     )
@@ -124,13 +124,14 @@ def test_a_file_of_one_flight_has_number_1_alone(data):
 def test_the_ground_before_take_off_is_left_out_and_flight_is_kept(data, name):
     """The motors arm at 6.5 s, throttle comes at 7.6 s, and flight begins at 8 s."""
     setup = propose(data / FIRMWARE / f"{name}.BFL", axis="roll").setup
-    assert setup.start is not None and 7.3 < setup.start <= 8 and setup.stop is None
+    start, stop = setup.longest
+    assert start is not None and 7.3 < start <= 8 and stop is None
     assert any("left out, as no flight: t = 6.65516 .. 7" in each for each in setup.remarks)
 
 
 def test_a_chirp_keeps_its_own_window(data):
     setup = propose(data / FIRMWARE / "A_chirp_roll.BFL").setup
-    assert (setup.start, setup.stop) == (pytest.approx(9.0, abs=2e-3), pytest.approx(29, abs=2e-3))
+    assert setup.longest == (pytest.approx(9.0, abs=2e-3), pytest.approx(29, abs=2e-3))
     assert not any("left out" in each for each in setup.remarks)
 
 
@@ -174,30 +175,31 @@ def test_a_landing_is_left_out(flown, sticks):
     rows = sticks.time > 30
     still = 0.1 * np.sin(50 * sticks.time[rows])
     setup = flown(rows, **dict.fromkeys(RATES, still), **{"setpoint[3]": 0.0})
-    assert setup.stop is not None and 30 - 0.25 <= setup.stop < 30.5
+    stop = setup.longest[1]
+    assert stop is not None and 30 - 0.25 <= stop < 30.5
     assert "(landed)" in left_out(setup)
 
 
 def test_a_crash_is_left_out_although_the_motors_still_run(flown, sticks):
     setup = flown(sticks.time > 32, **{"gyroADC[0]": 1500})
-    assert setup.stop == pytest.approx(32, abs=0.26) and "(a crash)" in left_out(setup)
+    assert setup.longest[1] == pytest.approx(32, abs=0.26) and "(a crash)" in left_out(setup)
 
 
 def test_a_dive_without_throttle_is_flight(flown, sticks):
     dived, plain = flown((sticks.time > 15) & (sticks.time < 20), **{"setpoint[3]": 0}), flown()
-    assert (dived.start, dived.stop) == (plain.start, plain.stop)
+    assert dived.spans == plain.spans
 
 
 def test_a_log_that_never_leaves_the_ground_says_so(flown):
     setup = flown(slice(None), **{"setpoint[3]": 0})
-    assert (setup.start, setup.stop) == (None, None)
+    assert setup.longest == (None, None)
     assert any("no flight" in each for each in setup.remarks)
 
 
 def test_start_and_stop_of_the_user_win(data):
     path = data / FIRMWARE / "A_sticks.BFL"
     setup = propose(path, start=6.7, stop=20).setup
-    assert (setup.start, setup.stop) == (6.7, 20)
+    assert setup.longest == (6.7, 20)
     assert not any("left out" in each for each in setup.remarks)
     opened = open_logs(path, IdentifySettings(stop=20.0))
     assert 7.3 < (opened.settings.start or 0) < 8 and opened.settings.stop == 20
@@ -234,7 +236,7 @@ def test_stamps_that_are_as_the_header_says_leave_the_hold_as_it_is(data):
 def test_what_was_injected_outside_of_start_and_stop_is_not_used(data):
     for start, stop in ((10.0, 12.0), (29.5, 30.5)):
         setup = propose(data / FIRMWARE / "A_chirp_roll.BFL", start=start, stop=stop).setup
-        assert (setup.start, setup.stop, setup.segments) == (start, stop, ())
+        assert setup.spans == ((start, stop),)
 
 
 def test_a_set_point_that_rests_is_no_reference(data):

@@ -21,7 +21,7 @@ def test_ardupilot_chirps_are_found_with_axis_time_band_and_summing_point(tmp_pa
     assert setup.injected_at == ("angle", "angle", "rate", "mixer")[(place - 1) // 3]
     assert setup.late_s == {f"RATE.{letter}Des": 0.0025, "SIDD.Targ": 0.0025}
     assert setup.band == (0.5, 8.0)
-    assert (setup.start, setup.stop) == (pytest.approx(22.0), pytest.approx(30.0, abs=0.01))
+    assert setup.longest == (pytest.approx(22.0), pytest.approx(30.0, abs=0.01))
     record = read(proposal.path, **proposal.options)
     if place >= 10:
         w = WAVE[IN_RUN] * {"roll": 0.1, "pitch": 0.2, "yaw": 1.0}[axis]
@@ -142,7 +142,7 @@ def test_a_chirp_that_turns_no_axis_is_refused_with_what_to_fly(tmp_path, place,
 def test_the_hovers_throttle_that_the_firmware_learns_is_no_change_of_the_loop(tmp_path):
     changes = ((25.0, 0.2), (27.0, 0.25))
     proposal = propose(ardupilot(tmp_path, 10, changes=changes, changed="MOT_THST_HOVER"))
-    assert not proposal.changes and proposal.setup.stop == pytest.approx(30, abs=0.01)
+    assert not proposal.changes and proposal.setup.longest[1] == pytest.approx(30, abs=0.01)
 
 
 @pytest.mark.parametrize("terms", [False, True])
@@ -161,7 +161,7 @@ def test_a_log_of_a_plane_is_refused_by_its_name(tmp_path, terms):
 
 def test_a_change_of_the_loops_parameters_splits_the_log_there(tmp_path):
     proposal = propose(ardupilot(tmp_path, 10, changes=((25.0, 0.2), (27.0, 0.2))))
-    assert (proposal.setup.start, proposal.setup.stop) == (
+    assert proposal.setup.longest == (
         pytest.approx(25.0, abs=0.01),
         pytest.approx(30.0, abs=0.01),
     )
@@ -181,7 +181,7 @@ def test_injections_with_other_parameters_are_no_segments_of_the_same_record(tmp
 
 def test_px4s_parameter_updates_split_a_log_without_injections(tmp_path):
     proposal = propose(px4(tmp_path, nav_state=10, change=28.0), axis="roll")
-    assert proposal.setup.stop == pytest.approx(28.0, abs=0.01)
+    assert proposal.setup.longest[1] == pytest.approx(28.0, abs=0.01)
     assert proposal.options["start"] == pytest.approx(20.0, abs=0.01)
     assert "MC_ROLLRATE_P 0.15" in str(proposal)
 
@@ -241,7 +241,7 @@ def test_px4_autotune_is_found_with_its_axis_and_time(tmp_path, state, axis, i):
     assert setup.axis == axis and setup.command == {f"vehicle_torque_setpoint.xyz[{i}]": 1.0}
     assert setup.rate == f"vehicle_angular_velocity.xyz[{i}]"
     assert setup.reference == f"autotune_attitude_control_status.rate_sp[{i}]"
-    assert (setup.start, setup.stop) == (pytest.approx(22.0), pytest.approx(30.0, abs=0.01))
+    assert setup.longest == (pytest.approx(22.0), pytest.approx(30.0, abs=0.01))
 
 
 def test_two_runs_of_autotune_are_two_segments(tmp_path):
