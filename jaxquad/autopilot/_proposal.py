@@ -337,7 +337,7 @@ def _write_axes(
         return [*written, *files.stages, files.revert, files.table]
 
     pages = lambda origin: [pilot_page(one, origin, overview) for one in axes]
-    log, settings = axes[0].identification.path, result.settings
+    log, settings = axes[0].identification.paths[0], result.settings
     return write_result(folder, log, settings, result.content(), files, pages)
 
 

@@ -55,13 +55,13 @@ class Identification:
 
     **Attributes:**
 
+    - `paths`: the log, or all that were taken together.
     - `settings`: those that were used, a proposal included.
     - `records`: one for each segment of each log.
     - `responses`: the frequency response by method, the one to trust first.
     - `fits`: the fit to each of them.
     - `parts`: where the misfit is large, the fit beside those to the upper and to the lower part of
       the band; None for one that diverged.
-    - `more`: the logs that were taken together with the first.
     - `flown`: the gyro's filters and the law of an autopilot's log, up to whose filters the model
       is, unless `settings.keep_gyro_filters`.
     - `check`: the second record simulated, where `settings.verify` names one.
@@ -70,14 +70,13 @@ class Identification:
     - `failures`: by title, why something beside the fit could not be computed.
     """
 
-    path: Path
+    paths: tuple[Path, ...]
     settings: IdentifySettings
     records: tuple[Record, ...]
     responses: Mapping[str, FrequencyResponse]
     fits: Mapping[str, Fit]
     parts: Mapping[str, Fit | None]
     proposal: Proposal | None = None
-    more: tuple[Path, ...] = ()
     flown: "FlownLaw | None" = None
     check: Verification | None = None
     bands: Bands | None = None
@@ -99,17 +98,6 @@ class Identification:
         if self.flown.filters and not self.filters:
             return "the gyro's filters are in the model, as `keep_gyro_filters` asks"
         return self.flown.text
-
-    @property
-    def paths(self) -> tuple[Path, ...]:
-        """All logs that were identified together."""
-        return self.path, *self.more
-
-    @property
-    def title(self) -> str:
-        """The name of the log, and how many others were taken with it."""
-        others = f" and {len(self.more)} more" if self.more else ""
-        return f"{self.path.name}{others}"
 
     @property
     def method(self) -> str:
@@ -201,7 +189,9 @@ class Identification:
         name = f"{self.fit.verdict.kind}: where the fit stopped" if stopped else "identified"
         models = {name: self.fit} if self.fit.verdict.fitted else {}
         drawings = [ft.partial(record_figure, record) for record in self.records]
-        drawings += [ft.partial(bode, self.frf, self._other_responses, models, title=self.title)]
+        first, *more = self.paths
+        title = f"{first.name} and {len(more)} more" if more else first.name
+        drawings += [ft.partial(bode, self.frf, self._other_responses, models, title=title)]
         if self.check is not None:
             verified = Path(self.settings.verify or "").name
             drawings += [ft.partial(compare, self.check, title=verified)]
@@ -252,7 +242,8 @@ class Identification:
         **Returns:** the path of `result.json`.
         """
         announce("figures and report")
-        folder, settings, fit = Path(folder or default_folder(self.path)), self.settings, self.fit
+        settings, fit, several = self.settings, self.fit, len(self.paths) > 1
+        folder = Path(folder or default_folder(self.paths[0]))
         sources = [*self.paths, *([settings.verify] if settings.verify else [])]
         command = shlex.join(["jaxquad", "identify", *map(str, self.paths), *settings.words()])
         origin = provenance(*sources, command=command)
@@ -269,7 +260,7 @@ class Identification:
         def title(record: Record) -> str:
             start = clock_start(record.time)
             span = f"t = {show_times(record.time[0], record.time[-1], start=start)}"
-            return f"{Path(record.source).name}, {span}" if self.more else span
+            return f"{Path(record.source).name}, {span}" if several else span
 
         drawn = []
         with staged_files(folder) as draft:
@@ -302,8 +293,8 @@ class Identification:
         spans = [[float(record.time[0]), float(record.time[-1])] for record in self.records]
         return {
             "record": {
-                "file": str(self.path),
-                "more_files": [str(path) for path in self.more],
+                "file": str(self.paths[0]),
+                "more_files": [str(path) for path in self.paths[1:]],
                 "start_s": min(start for start, _ in spans),
                 "stop_s": max(stop for _, stop in spans),
                 "segments_s": spans,
@@ -351,7 +342,7 @@ class Identification:
         try:
             with warnings.catch_warnings():  # the record has said what was repaired
                 warnings.simplefilter("ignore", RecordWarning)
-                return read(self.path, **options)
+                return read(self.paths[0], **options)
         except RecordError as error:
             announce(f"no spectrum over the throttle: {error}")
             return None

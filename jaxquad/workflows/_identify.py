@@ -193,9 +193,8 @@ def _estimate(
     span, parts, changes = _fit_parts(fit, frf, settings)
     fit = finish_fit(fit, settings, records[0], (*further, *changes), remedies)
     parts = {span: fit} | parts if parts else {}
-    responses, fits, more = {method: frf}, {method: fit}, paths[1:]
-    result = Identification(paths[0], settings, records, responses, fits, parts, proposal, more)
-    return result, delay
+    responses, fits = {method: frf}, {method: fit}
+    return Identification(paths, settings, records, responses, fits, parts, proposal), delay
 
 
 def _respond(

@@ -150,7 +150,7 @@ def open_logs(
 def open_again(result: str | Path | StoredResult, *, log: str | Path | None = None) -> OpenedLogs:
     """Read the logs of a stored result with its settings, see `identify_again`."""
     stored = result if isinstance(result, StoredResult) else load_result(result)
-    paths = stored.logs
+    paths = list(stored.logs)
     if log is not None:
         paths = [Path(log) / path.name for path in paths] if len(paths) > 1 else [Path(log)]
     verified = stored.settings.verify
@@ -166,7 +166,7 @@ def open_again(result: str | Path | StoredResult, *, log: str | Path | None = No
                 f"{file}: this is not the log that was identified (SHA-256 {digest[:12]}... "
                 f"instead of {identified[:12]}...)"
             )
-    return open_logs(list(paths), stored.settings)
+    return open_logs(paths, stored.settings)
 
 
 def read_records(

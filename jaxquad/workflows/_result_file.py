@@ -28,15 +28,9 @@ class StoredResult(NamedTuple):
     folder: Path
     content: Mapping[str, object]
     settings: IdentifySettings
-    log: Path
-    hashes: tuple[str, ...]  # SHA-256 of the log, and of the record of a check
+    logs: tuple[Path, ...]  # that were identified together
+    hashes: tuple[str, ...]  # SHA-256 of the logs, and of the record of a check
     band: tuple[float, float]  # rad/s, of the response
-    more: tuple[Path, ...] = ()  # logs that were taken together with the first
-
-    @property
-    def logs(self) -> list[Path]:
-        """All logs that were identified together."""
-        return [self.log, *self.more]
 
     @property
     def _fit(self) -> Mapping[str, Any]:
@@ -122,7 +116,7 @@ class StoredResult(NamedTuple):
         return None if folder is None else load_tuning(folder)
 
     def __str__(self) -> str:
-        lines = [f"{self.log.name}: {self.summary}"]
+        lines = [f"{self.logs[0].name}: {self.summary}"]
         lines += [
             f"  {name} = {value:.5g} +- {self.standard_errors[name]:.2g}"
             for name, value in self.values.items()
@@ -336,15 +330,14 @@ def load_result(path: str | Path) -> StoredResult:
     try:
         content = dict(content)
         settings = IdentifySettings.from_mapping(content["settings"], f"{path}, settings")
-        files = content["provenance"]["files"]
+        files, record = content["provenance"]["files"], content["record"]
         return StoredResult(
             folder=path.parent,
             content=content,
             settings=settings,
-            log=_file(content["record"]["file"]),
+            logs=tuple(map(_file, (record["file"], *record.get("more_files", ())))),
             hashes=tuple(file["sha256"] for file in files),
             band=(float(content["band_rad_per_s"][0]), float(content["band_rad_per_s"][1])),
-            more=tuple(map(_file, content["record"].get("more_files", ()))),
         )
     except (KeyError, IndexError, TypeError, ValueError, RecursionError) as error:
         raise ValueError(

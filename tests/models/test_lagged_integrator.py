@@ -90,6 +90,6 @@ def test_the_formula_of_a_page_has_it():
     frf, formulas = response_of(TRUTH, error=0.01, seed=0, omega=np.asarray(OMEGA)), []
     for start in (TRUTH, jq.LaggedIntegrator(280.0, 0.03, 0.002)):
         fits = {"direct": jq.fit(start, frf)}
-        found = Identification(Path("log.csv"), settings, (), {"direct": frf}, fits, {})
+        found = Identification((Path("log.csv"),), settings, (), {"direct": frf}, fits, {})
         formulas.append(found.formula)
     assert "/ ((s + damping) (lag s + 1))" in formulas[0] and "damping" not in formulas[1]

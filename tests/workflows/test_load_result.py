@@ -26,7 +26,7 @@ def folder(found, tmp_path):
     jq.report.write_results(
         tmp_path, fit=found.fit, frf=found.frf,
         extra={
-            "settings": found.settings.content(), "record": {"file": str(found.path)},
+            "settings": found.settings.content(), "record": {"file": str(found.paths[0])},
             "provenance": {"files": []}, "band_rad_per_s": found.band,
             "model": {"kind": "LaggedIntegrator"} | {
                 name: np.asarray(x).tolist() for name, x in vars(found.fit.model).items()
