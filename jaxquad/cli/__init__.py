@@ -309,7 +309,8 @@ class _Parser(argparse.ArgumentParser):
 
 def make_parser() -> argparse.ArgumentParser:
     """The parser of the whole command line."""
-    listed = (f"  {x.name:<9} {x.help}\n  {'':<9} {x.example}" for x in _COMMANDS)
+    pad, first = f"\n  {'':<9} ", lambda command: command.examples.splitlines()[1].strip()
+    listed = (f"  {x.name:<9} {x.help}{pad}{first(x)}" for x in _COMMANDS)
     parser = _Parser(
         prog="jaxquad",
         usage="jaxquad COMMAND ...",
@@ -321,9 +322,12 @@ def make_parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(
         required=True, metavar="COMMAND", dest="command", help=argparse.SUPPRESS
     )
-    for command in _COMMANDS:
-        command.add_to(commands)
-    for name, declared in commands.choices.items():
+    for name, text, examples, declare in _COMMANDS:
+        declared = commands.add_parser(
+            name, prog=f"jaxquad {name}", description=text, epilog=examples,
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+        )  # fmt: skip
+        declared.set_defaults(run=declare(declared))
         declared.set_defaults(usage=declared.format_usage())
         declared.usage = f"jaxquad {name} {_PLACES[name]}[options]"
     return parser

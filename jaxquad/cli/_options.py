@@ -32,17 +32,6 @@ class Command(NamedTuple):
     examples: str  # the first line of commands is the one that `jaxquad --help` shows
     declare: Declare
 
-    @property
-    def example(self) -> str:
-        return self.examples.splitlines()[1].strip()
-
-    def add_to(self, commands: Any) -> None:  # argparse names the type of its subparsers nowhere
-        declared = commands.add_parser(
-            self.name, prog=f"jaxquad {self.name}", description=self.help, epilog=self.examples,
-            formatter_class=argparse.RawDescriptionHelpFormatter,
-        )  # fmt: skip
-        declared.set_defaults(run=self.declare(declared))
-
 
 def command(help: str, examples: str) -> Callable[[Declare], Command]:
     """Makes a command of the function that declares it."""

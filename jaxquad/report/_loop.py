@@ -229,12 +229,6 @@ class LawLoop(NamedTuple):
     step: StepBand | None  # from set-point to rate, of plants that the fit leaves possible
     unmodelled: Sequence[str] = ()
 
-    @property
-    def note(self) -> str:
-        """What it is, in words."""
-        missing = "; ".join(self.unmodelled)
-        return f"{_BY_LAW} Not in the law: {missing}." if missing else _BY_LAW
-
 
 def loop_section(
     frf: FrequencyResponse, record: Record, law: LawLoop | None = None
@@ -242,7 +236,8 @@ def loop_section(
     """Bode diagram, crossover and margins, by the law where it is known; without it None where the
     units do not tell where the reference enters."""
     if law is not None and law.measured.omega.size >= _FEWEST:
-        loop, model, note = law.measured, law.model, law.note
+        loop, model, missing = law.measured, law.model, "; ".join(law.unmodelled)
+        note = f"{_BY_LAW} Not in the law: {missing}." if missing else _BY_LAW
         origin = "the law times the plant's response"
     else:
         entry = entry_of(record, frf)
