@@ -5,6 +5,7 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import ArrayLike, Float, Int
+from matplotlib.axes import Axes
 
 from jaxquad.identify import GainBand
 from jaxquad.records import clock_start, Record
@@ -14,6 +15,7 @@ from ._panels import AxesLike, look_of, Panels, Style
 
 
 Places = Int[np.ndarray, " kept"]
+Samples = Float[np.ndarray, " samples"]
 _COLUMNS = 1200  # more than a screen shows of a figure's width
 ROWS = 12  # channels that one figure holds
 _COLOURS = {"reference": "tab:green", "input": "tab:blue", "output": "0.15"}
@@ -43,6 +45,12 @@ def extremes(values: Float[np.ndarray, " samples"], columns: int = _COLUMNS) -> 
     return np.unique([*kept, *(full * size + k for k in ends)])
 
 
+def plot_over_time(panel: Axes, time: Samples, values: Samples, style: Style) -> None:
+    """A curve through its extremes; time stamps that are dates count from the first of them."""
+    kept = extremes(values)
+    panel.plot((time - clock_start(time))[kept], values[kept], **style)
+
+
 def channels_of(record: Record) -> list[tuple[str, str]]:
     """Role and name of every channel: references, inputs, outputs."""
     names = (record.reference_names, record.input_names, record.output_names)
@@ -69,10 +77,8 @@ def record_figure(
     labels = lay.short_names([name for _, name in channels])
     for panel, (role, name), label in zip(panels, channels, labels, strict=True):
         scale, unit = lay.unit_label(lay.visible(record.unit(name))[:12])
-        values = record.channel(name)
-        kept = extremes(values)
-        time = record.time[kept] - clock_start(record.time)
-        panel.plot(time, scale * values[kept], color=_COLOURS[role], lw=0.7)
+        line: Style = {"color": _COLOURS[role], "lw": 0.7}
+        plot_over_time(panel, record.time, scale * record.channel(name), line)
         panel.set_ylabel(unit.removeprefix(", "))
         panel.set_title(f"{role}: {label}", loc="left", fontsize=9, pad=3, y=1.0)
         lay.few_ticks(panel.yaxis, 4)
@@ -228,7 +234,6 @@ _LOWEST = 2.0  # Hz
 _HATCHES = (None, "....", "////", "xxxx", "----")  # of bands, for those who see no colours
 _SPAN = 70.0  # dB that a figure shows below the highest level
 Frequencies = Float[np.ndarray, " frequencies"]
-Samples = Float[np.ndarray, " samples"]
 
 
 class Spectrum(NamedTuple):

@@ -5,7 +5,6 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, PyTree
-from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
 import jaxquad.identify as identify
@@ -15,12 +14,9 @@ from jaxquad.records import clock_start, Record
 from jaxquad.spectra import estimate_step, FrequencyResponse, StepResponse
 
 from . import _panels as lay
-from ._flights import extremes
+from ._flights import plot_over_time, Samples
 from ._panels import AxesLike, COHERENT, Panels, Style
 from ._shown import analysed, Channels, Measured, named, named_models, Shown, Thing
-
-
-Samples = Float[np.ndarray, " samples"]
 
 
 def compare(
@@ -66,14 +62,14 @@ def compare(
         scale, unit = lay.unit_label(one.unit)
         measured = scale * first.measured.reshape(-1, count)[:, k]
         ink = {"color": "0.15", "lw": 1.0} if single else {"color": "0.7", "lw": 3.0}
-        _plot(top, first.time, measured, ink | {"label": "measured"})
+        plot_over_time(top, first.time, measured, ink | {"label": "measured"})
         for m, (name, check) in enumerate(checks.items()):
             simulated = scale * check.simulated.reshape(-1, count)[:, k]
             text = name if single else f"{name}: {check.outputs[k].fit_percent:.1f} %"
             look = lay.look_of(m, text) | ({"ls": "--"} if single else {})
             thin: Style = {"lw": 0.9} | ({"color": "tab:red", "ls": "-"} if single else {})
-            _plot(top, check.time, simulated, look)
-            _plot(bottom, check.time, measured - simulated, look | thin)
+            plot_over_time(top, check.time, simulated, look)
+            plot_over_time(bottom, check.time, measured - simulated, look | thin)
         top.legend(loc="upper right", fontsize=9 if single else 8, ncols=2)
         top.set_ylabel(f"{one.name}{unit}")
         bottom.set_ylabel(f"difference{unit}")
@@ -93,12 +89,6 @@ def compare(
         ]
     heights = [2.4, 1.0] if count == 1 else [1.8, 0.9] * count
     return lay.arrange(panels, heights, title="\n".join(filter(None, lines)))
-
-
-def _plot(panel: Axes, time: Samples, values: Samples, style: Style) -> None:
-    """Time stamps that are dates count from the first of them."""
-    kept = extremes(values)
-    panel.plot((time - clock_start(time))[kept], values[kept], **style)
 
 
 class _Answer(NamedTuple):

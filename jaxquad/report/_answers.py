@@ -151,13 +151,11 @@ def _is_of_controller(frf: FrequencyResponse) -> bool:
     return bool(2 * np.sum(good & np.any(frf.of_controller, axis=(1, 2))) > np.sum(good))
 
 
-def _ends(frf: FrequencyResponse, where: Bool[np.ndarray, " frequencies"]) -> tuple[float, float]:
+def _ends(
+    frf: FrequencyResponse, where: Bool[np.ndarray, " frequencies"] | slice = slice(None)
+) -> tuple[float, float]:
     omega = np.asarray(frf.omega)[where]
     return float(omega[0]), float(omega[-1])
-
-
-def _measured_band(frf: FrequencyResponse) -> tuple[float, float]:
-    return _ends(frf, np.ones(frf.omega.size, bool))
 
 
 def _reach(fit: Fit, k: int) -> float:
@@ -197,9 +195,9 @@ def next_flight(
     needs = _needs_of_parameters(fit, frf) if usable else poor
     if _is_of_controller(frf):
         why = "the controller moved the input of this log; record what excites the axis, and name "
-        needs = [_Need(*_measured_band(frf), _LOUDER, f"{why}it as the reference")]
+        needs = [_Need(*_ends(frf), _LOUDER, f"{why}it as the reference")]
     if not fit.identifiable and not needs and not fit.verdict.remedies:
-        low, high = _measured_band(frf)
+        low, high = _ends(frf)
         why = "the band of this record does not determine the model"
         needs = [_Need(low / 2, 2 * high, _LOUDER, why)]
     if needs:
@@ -221,7 +219,7 @@ def next_flight(
         return Flight(what, {}, [*(_sentence(need.why) for need in poor), *wished])
     # A 3-2-1-1 whose spectrum peaks in the middle of the band.
     good = _good(frf)
-    low, high = _ends(frf, good) if good.any() else _measured_band(frf)
+    low, high = _ends(frf, good) if good.any() else _ends(frf)
     unit = three_two_one_one(width=1.0, amplitude=1.0, sample_rate=20.0)
     width = float(np.sqrt(unit.omega_min * unit.omega_max / (low * high)))
     source, text = _amplitude(frf, record, 1.0)
@@ -251,7 +249,7 @@ def _needs_of_parameters(fit: Fit, frf: FrequencyResponse) -> list[_Need]:
     if not loose:
         return []
     omega, unshared = _unshared_effects(fit, frf)
-    low_end, high_end = _measured_band(frf)
+    low_end, high_end = _ends(frf)
     needs = []
     for k in loose:
         if not unshared[k].any():
@@ -286,7 +284,7 @@ def _unshared_effects(
 
     Zero where the others make the same. What ran to zero, where it does nothing, is at its start.
     """
-    low, high = _measured_band(frf)
+    low, high = _ends(frf)
     omega = np.geomspace(low / 2, high * 2, 200)
     places = fit.parameters.places[: len(fit.names)]
     values = np.asarray(fit.values, float)
@@ -314,7 +312,7 @@ def _unshared_effects(
 
 
 def _sweep(needs: Sequence[_Need], frf: FrequencyResponse, record: Record | None) -> Flight:
-    measured = _measured_band(frf)
+    measured = _ends(frf)
     low = min(need.low for need in needs)
     high = max(need.high for need in needs)
     low, high = min(low, measured[1] / 10), max(high, measured[0] * 10)  # at least a decade

@@ -163,17 +163,6 @@ _NARROW = {  # Each process has one core: more threads would only wait for each 
 }
 
 
-@contextlib.contextmanager
-def _without_interrupts() -> Iterator[None]:
-    """A process that starts within it never gets the interrupt that ends this one."""
-    resource_tracker.ensure_running()  # which would let interrupts in
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
-
-
 class _Worker:
     def __init__(self, work: Work, timeout: float | None):
         self.timeout, self.due = math.inf if timeout is None else timeout, math.inf
@@ -181,10 +170,13 @@ class _Worker:
         self.process = _SPAWN.Process(target=_serve, args=(work, theirs), daemon=True)
         missing = {name: text for name, text in _NARROW.items() if name not in os.environ}
         os.environ.update(missing)  # what the user set stays
+        resource_tracker.ensure_running()  # which would let interrupts in
+        # A process that starts now never gets the interrupt that ends this one.
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
         try:
-            with _without_interrupts():
-                self.process.start()
+            self.process.start()
         finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
             for name in missing:
                 os.environ.pop(name, None)
         theirs.close()  # or the end of the process would not show on ours
