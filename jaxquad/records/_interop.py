@@ -22,7 +22,6 @@ _TIMES = ("t", "time", "time_s", "timestamp")
 def frame_stamps(frame: "pandas.DataFrame", time: str | None, unit: TimeUnit | None) -> Times:
     """Time stamps (s): of the column `time`, of one that is called like that, or of the index."""
     from pandas import RangeIndex
-    from pandas.api.types import is_datetime64_any_dtype, is_timedelta64_dtype
 
     clocks = [name for name in _TIMES if name in frame.columns] if time is None else [time]
     if not clocks and isinstance(frame.index, RangeIndex):
@@ -34,8 +33,8 @@ def frame_stamps(frame: "pandas.DataFrame", time: str | None, unit: TimeUnit | N
         raise RecordError(f"time: {unknown_name(clocks[0], map(str, frame.columns))}")
     label = clocks[0] if clocks else "the index"
     series = _column(frame, label) if clocks else frame.index.to_series()
-    dated = is_datetime64_any_dtype(series)
-    if dated or is_timedelta64_dtype(series):
+    dated = series.dtype.kind == "M"
+    if dated or series.dtype.kind == "m":
         if unit is not None:
             raise RecordError("the time stamps are dates or durations: leave «time_unit=» out.")
         # Dates of any time zone, in UTC.
@@ -170,7 +169,7 @@ def _labels(fields: Mapping, name: str, columns: np.ndarray, letter: str) -> lis
     return [f"{letter}{k + 1}" if letter and count > 1 else letter for k in range(count)]
 
 
-def to_iddata(record: Record, path: str | Path, variable: str) -> Path:
+def to_iddata(record: Record, path: str | Path) -> Path:
     """`Record.to_iddata`."""
     from scipy.io import savemat
 
@@ -188,5 +187,5 @@ def to_iddata(record: Record, path: str | Path, variable: str) -> Path:
         "OutputUnit": cell(record.output_units),
         "InterSample": "foh" if record.hold is None else inter_sample,
     }
-    savemat(path, {variable: fields}, do_compression=True)
+    savemat(path, {"z": fields}, do_compression=True)
     return Path(path)

@@ -350,21 +350,20 @@ class Record:
 
         return from_iddata(path, variable, references)
 
-    def to_iddata(self, path: str | Path, *, variable: str = "z") -> Path:
+    def to_iddata(self, path: str | Path) -> Path:
         """A MAT file from which MATLAB makes an `iddata`; references become further inputs.
 
-        In MATLAB: `load z.mat; z = iddata(z.y, z.u, z.Ts, 'InputName', z.InputName)`.
+        It holds the struct `z`: `load z.mat; z = iddata(z.y, z.u, z.Ts, 'InputName', z.InputName)`.
 
         **Arguments:**
 
         - `path`: the file to write.
-        - `variable`: the name of the struct in it.
 
         **Returns:** the path.
         """
         from ._interop import to_iddata
 
-        return to_iddata(self, path, variable)
+        return to_iddata(self, path)
 
     def __str__(self) -> str:
         roles = (
