@@ -40,16 +40,18 @@ def check_unit(unit: TimeUnit | None) -> None:
         raise RecordError(f"time_unit is {unit!r}: use one of {', '.join(PER_SECOND)}.")
 
 
-def doubt_of_seconds(stamps: Times) -> str:
-    """What speaks against steps in s of which nobody said the unit; empty if nothing does."""
+def require_seconds(
+    label: str, stamps: Times, unit: TimeUnit | None, error: type[RecordError] = RecordError
+) -> None:
+    """Raise the error where nobody said the unit of `label`, and its steps may be in another."""
     step = float(np.median(np.abs(np.diff(stamps)))) if stamps.size > 1 else 0.0
-    if not step >= _SLOW:
-        return ""
+    if unit is not None or not step >= _SLOW:
+        return
     doubt = f"{1 / step:.3g} Hz if that is in s, {1e3 / step:.4g} Hz in ms"
     doubt = "which is probably not in seconds" if step >= 1 else doubt
-    return (
-        f"steps by {step:.6g}, {doubt}. Give its unit («time_unit=»): ms, us or ns, or s if the "
-        f"log really is that slow; for a count of rows give the sampling interval («dt=»)"
+    raise error(
+        f"{label} steps by {step:.6g}, {doubt}. Give its unit («time_unit=»): ms, us or ns, or s "
+        f"if the log really is that slow; for a count of rows give the sampling interval («dt=»)."
     )
 
 
@@ -233,12 +235,12 @@ def within(
     return {name: times for name, times in kept.items() if times.size}
 
 
-def check_ranges(valid: Valid, channels: Iterable[str]) -> None:
-    """Raise RecordError for a range of a channel that is not among the `channels`."""
+def check_keys(what: str, keys: Iterable[str], channels: Iterable[str]) -> None:
+    """Raise RecordError, which begins with `what`, for a key that is none of the `channels`."""
     names = list(channels)
-    for name in valid:
+    for name in keys:
         if name not in names:
-            raise RecordError(f"«valid=» names {name!r}: {unknown_name(name, names)}")
+            raise RecordError(f"{what} {name!r}: {unknown_name(name, names)}")
 
 
 def as_float64(label: str, values: ArrayLike, *, copy: bool = True) -> np.ndarray:
@@ -282,9 +284,8 @@ def uniform_stamps(time: ArrayLike, unit: TimeUnit | None) -> Times:
             )
     else:
         stamps = as_float64("time", time) / PER_SECOND[unit or "s"]
-        doubt = doubt_of_seconds(stamps) if unit is None and stamps.ndim == 1 else ""
-        if doubt:
-            raise RecordError(f"time {doubt}.")
+        if stamps.ndim == 1:
+            require_seconds("time", stamps, unit)
     if stamps.ndim != 1:
         raise RecordError(f"time has shape {stamps.shape}: give one value for each sample.")
     if stamps.size < FEWEST:

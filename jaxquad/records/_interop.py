@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ._channel import dates_in_seconds, doubt_of_seconds, PER_SECOND, Times, TimeUnit
+from ._channel import dates_in_seconds, PER_SECOND, require_seconds, Times, TimeUnit
 from ._log import ReadError, RecordError, unknown_name
 from ._record import as_tuple, assemble, Names, Record
 from .formats import load_log
@@ -43,9 +43,7 @@ def frame_stamps(frame: "pandas.DataFrame", time: str | None, unit: TimeUnit | N
         assert seconds is not None  # as nanoseconds have a fixed length
         return seconds
     seconds = _numbers(label, series) / PER_SECOND[unit or "s"]
-    doubt = doubt_of_seconds(seconds) if unit is None else ""
-    if doubt:
-        raise RecordError(f"the time base {label!r} {doubt}.")
+    require_seconds(f"the time base {label!r}", seconds, unit)
     return seconds
 
 

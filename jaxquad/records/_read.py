@@ -12,7 +12,7 @@ import numpy as np
 
 from ._channel import (
     Channel,
-    check_ranges,
+    check_keys,
     clock_start,
     JITTER,
     nonuniformity,
@@ -27,7 +27,7 @@ from ._channel import (
     without_turns,
 )
 from ._edit import resample
-from ._log import GapError, known_unit, located, ReadError, RecordError, unknown_name, warn
+from ._log import GapError, known_unit, located, ReadError, RecordError, warn
 from ._record import as_tuple, assemble, check_distinct, Hold, Record
 from ._timebase import Timebases
 from .formats import load_signals
@@ -153,9 +153,8 @@ class _Logged:
             if power > 1:
                 columns[term], logged[term] = table[:, k] ** power, ""
         mixes = {name: mix for role in roles for name, mix in role.items()}
+        check_keys("a unit is given for", units, mixes)
         for name, unit in units.items():
-            if name not in mixes:
-                raise RecordError(f"a unit is given for {name!r}: {unknown_name(name, mixes)}")
             (source, weight), *others = mixes[name].items()
             said, stated = known_unit(unit), known_unit(logged[source])
             if said and stated and said != stated and weight == 1 and not others:
@@ -212,7 +211,7 @@ def _read_channels(
         logged = [timebases.channel(name) for name in names]
     except ReadError as error:
         raise located(error, path) from error
-    check_ranges(valid, names)
+    check_keys("«valid=» names", valid, names)
     channels, repaired = [], {}
     for channel in logged:
         name, limits = channel.name, valid.get(channel.name)

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from ._channel import (
     as_float64,
     Channel,
-    check_ranges,
+    check_keys,
     clock_start,
     Number,
     repair_values,
@@ -148,7 +148,7 @@ class Record:
         check_distinct(self.names)
         earlier = {name: np.asarray(times, np.float64) for name, times in (repaired or {}).items()}
         vars(self).update(hold=None if hold is None else float(hold), repaired=earlier)
-        check_ranges(valid or {}, self.names)
+        check_keys("«valid=» names", valid or {}, self.names)
         channels = dict(zip(self.names, _all_channels(self), strict=True))
         for name, values in channels.items():
             limits = (valid or {}).get(name)
@@ -293,9 +293,7 @@ class Record:
             raise RecordError(
                 "a record needs at least one input and one output («inputs=», «outputs=»)."
             )
-        for name in units or {}:
-            if name not in flat:
-                raise RecordError(f"a unit is given for {name!r}: {unknown_name(name, flat)}")
+        check_keys("a unit is given for", units or {}, flat)
         units = {**stored.get("units", {}), **(units or {})}
         return assemble(
             stamps, names, values.__getitem__, lambda name: units.get(name, ""),

@@ -12,11 +12,11 @@ from ._channel import (
     Channel,
     check_unit,
     clock_start,
-    doubt_of_seconds,
     Number,
     PER_SECOND,
     repair_time,
     RepairedTime,
+    require_seconds,
     show_times,
     TimeUnit,
     unwrap,
@@ -349,9 +349,7 @@ class Timebases:
             )
         unit = self._unit or stated or _UNIT_OF_NAME.get(re.split(r"[./]", array)[-1])
         seconds = counter.astype(np.float64) / PER_SECOND[unit or "s"]
-        doubt = doubt_of_seconds(seconds) if unit is None else ""
-        if doubt:
-            raise ReadError(f"the time base {base!r} {doubt}.")
+        require_seconds(f"the time base {base!r}", seconds, unit, ReadError)
         return _in_rows(seconds, signal.rows), wraps
 
     def _parts(self, base: str) -> list[str]:
