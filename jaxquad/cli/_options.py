@@ -102,10 +102,14 @@ def folder_to_write(
 ) -> Iterator[Path]:  # fmt: skip
     """The folder that is wanted, or one beside it where that holds the result of other settings.
 
-    Another `jaxquad` that wants to write there waits until this one has written.
+    Another `jaxquad` that wants to write there waits until this one has written, or died.
     """
     wanted.parent.mkdir(parents=True, exist_ok=True)
-    with _locked(wanted.parent):
+    with contextlib.ExitStack() as lock:
+        with contextlib.suppress(OSError):  # a folder that may not be read, a disk without locks
+            place = os.open(wanted.parent, os.O_RDONLY)
+            lock.callback(os.close, place)
+            fcntl.flock(place, fcntl.LOCK_EX)
         folder = wanted if options.force else free_folder(wanted, name, same, sources=sources)
         if folder != wanted:
             text = f"! {wanted} holds the result of other settings or of another file, and is kept:"
@@ -114,20 +118,6 @@ def folder_to_write(
         for draft in folder.glob(".*.part"):  # of a process that was killed
             shutil.rmtree(draft, ignore_errors=True)
         yield folder
-
-
-@contextlib.contextmanager
-def _locked(folder: Path) -> Iterator[None]:
-    """One process at a time is within it; the death of one opens it. Without locks, all are."""
-    place = None
-    with contextlib.suppress(OSError):  # a folder that may not be read, a disk without locks
-        place = os.open(folder, os.O_RDONLY)
-        fcntl.flock(place, fcntl.LOCK_EX)
-    try:
-        yield
-    finally:
-        if place is not None:
-            os.close(place)
 
 
 class _NamedOnce(argparse.Action):

@@ -252,11 +252,6 @@ def read_json(path: Path) -> Any:
         raise ValueError("it is nested too deeply") from error
 
 
-def _file(name: str) -> Path:
-    """The file of a name in UTF-8, also where the system has other letters."""
-    return Path(os.fsdecode(name.encode("utf-8", "replace")))
-
-
 def _part(content: Mapping[str, object], key: str) -> Mapping[str, Any]:
     part = content.get(key)
     return part if isinstance(part, dict) else {}
@@ -331,11 +326,13 @@ def load_result(path: str | Path) -> StoredResult:
         content = dict(content)
         settings = IdentifySettings.from_mapping(content["settings"], f"{path}, settings")
         files, record = content["provenance"]["files"], content["record"]
+        names = [record["file"], *record.get("more_files", ())]
+        names = [name.encode("utf-8", "replace") for name in names]  # for any system's letters
         return StoredResult(
             folder=path.parent,
             content=content,
             settings=settings,
-            logs=tuple(map(_file, (record["file"], *record.get("more_files", ())))),
+            logs=tuple(Path(os.fsdecode(name)) for name in names),
             hashes=tuple(file["sha256"] for file in files),
             band=(float(content["band_rad_per_s"][0]), float(content["band_rad_per_s"][1])),
         )
