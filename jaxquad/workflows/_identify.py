@@ -101,7 +101,7 @@ def identify_opened(opened: OpenedLogs) -> Identification:
         [rate], [axis], [command] = outputs, axes, mix_of(settings.input).values()
         flown = flown_law(opened.paths, rate, axis, command, opened.proposal, settings)
     filters = () if flown is None or settings.keep_gyro_filters else flown.filters
-    result, delay = _estimate(opened, filters, vehicle=flown is not None, compare=True)
+    result, delay = _estimate(opened, filters, vehicle=flown is not None)
     fit, responses, fits = result.fit, dict(result.responses), dict(result.fits)
     if settings.verify is not None and fit.verdict.fitted:
         other = dataclasses.replace(
@@ -154,31 +154,30 @@ def identify_plant(
 
 def _estimate(
     opened: OpenedLogs, filters: Sequence[KnownFilter] = (), *, vehicle: bool = False,
-    compare: bool = False, remedies: Sequence[str] | None = None,
+    remedies: Sequence[str] | None = None,
 ) -> tuple[Identification, float]:  # fmt: skip
     """The estimate to trust with its fit, and the delay in s that was taken out of it.
 
     That delay is what a fit to a quick response finds; where the fit to the response itself finds
     another, it is estimated again. Known `filters` are divided out. The rate of a `vehicle` may be
-    damped by the air. `compare` says that the direct estimate comes later.
+    damped by the air.
     """
     paths, settings, proposal, records, _ = opened
     method = "joint" if settings.reference else "direct"
-    compared = compare and settings.reference
-    said = "joint and direct responses" if compared else f"{method} response"
     announce(f"quick {method} response, for the delay")
     quick = _respond(opened, method, filters, quick=True)
     # To find the remarks takes as long as the fit.
     first = _fit_response(dataclasses.replace(quick, remarks=()), settings)
     delay = _delay_of(first, records)
-    announce(f"{said}, {delay:.4g} s of delay taken out" if delay else said)
+    taken = f", {delay:.4g} s of delay taken out" if delay else ""
+    announce(f"{method} response{taken}")
     frf = _respond(opened, method, filters, delay)
     announce(f"fit to the {method} response")
     fit = _fit_response(frf, settings)
     other = _delay_of(fit, records)
     if other and abs(other - delay) > _NEAR * records[0].dt:
         delay = other
-        announce(f"{said}, {delay:.4g} s of delay taken out")
+        announce(f"{method} response, {delay:.4g} s of delay taken out")
         frf = _respond(opened, method, filters, delay)
         fit = _fit_response(frf, settings)
     damped = vehicle and isinstance(fit.model, LaggedIntegrator) and settings.integrators
