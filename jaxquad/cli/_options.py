@@ -157,7 +157,6 @@ def add_settings(
 
 
 def typed_settings(options: argparse.Namespace, settings: type[Settings]) -> dict[str, object]:
-    """Those that were typed on the command line."""
     return {key: value for key, value in vars(options).items() if key in settings.options()}
 
 
@@ -222,6 +221,5 @@ class _Stages(logging.Handler):
         self.waiting.start()
 
     def forget(self) -> None:
-        """The stage has ended."""
         if self.waiting is not None:
             self.waiting.cancel()

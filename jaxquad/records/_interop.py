@@ -168,7 +168,6 @@ def _labels(fields: Mapping, name: str, columns: np.ndarray, letter: str) -> lis
 
 
 def to_iddata(record: Record, path: str | Path) -> Path:
-    """`Record.to_iddata`."""
     from scipy.io import savemat
 
     cell = lambda texts: np.array(texts, dtype=object).reshape(-1, 1)

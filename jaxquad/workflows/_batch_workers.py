@@ -131,7 +131,6 @@ def stored_result(job: Job) -> Content | None:
 
 
 def store_result(job: Job, content: Mapping[str, object]) -> None:
-    """Put a result on the disk."""
     text = json.dumps(dict(content) | {"key": job.key}, indent=1, allow_nan=False)
     write_file(job.stored, text)
 
