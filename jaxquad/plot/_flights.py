@@ -21,19 +21,12 @@ ROWS = 12  # channels that one figure holds
 _COLOURS = {"reference": "tab:green", "input": "tab:blue", "output": "0.15"}
 
 
-def extremes(values: Float[np.ndarray, " samples"], columns: int = _COLUMNS) -> Places:
-    """The places of the least and the largest value in each of `columns` parts of a signal.
+def extremes(values: Float[np.ndarray, " samples"]) -> Places:
+    """The places of the least and the largest value in each of 1200 parts of a signal, in order.
 
     All places of a short signal. A curve through them loses no peak, however long the signal is.
-
-    **Arguments:**
-
-    - `values`: the signal.
-    - `columns`: the number of parts.
-
-    **Returns:** the places, in order of time.
     """
-    size = -(-values.size // columns)
+    size = -(-values.size // _COLUMNS)
     if size <= 2:
         return np.arange(values.size)
     full = values.size // size
@@ -337,14 +330,9 @@ def spectra_figure(
     return _finished(panels, (2.0, 2.0), title)
 
 
-def steps_figure(
-    steps: Mapping[str, StepBand], *, label: str = "rate after a step of 1", ax: AxesLike = None,
-    title: str = "",
-) -> Panels:  # fmt: skip
-    """Draw step responses by the text of the legend, with the band of the plants that are possible.
-
-    `label` is that of the vertical axis.
-    """
+def steps_figure(steps: Mapping[str, StepBand], *, ax: AxesLike = None, title: str = "") -> Panels:
+    """Draw what the rate does after a step of 1, by the text of the legend, with the band of the
+    plants that are possible."""
     [panel] = panels = lay.stacked(1, ax)
     for k, (name, band) in enumerate(steps.items()):
         look = look_of(k, name)
@@ -354,7 +342,7 @@ def steps_figure(
         )  # fmt: skip
         panel.plot(band.time, band.middle, **look)
     panel.axhline(1.0, color="0.4", lw=0.8, ls=":")
-    panel.set(xlabel="time, s", ylabel=label)
+    panel.set(xlabel="time, s", ylabel="rate after a step of 1")
     panel.margins(x=0)
     return _finished(panels, (2.8,), title)
 

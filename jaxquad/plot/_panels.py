@@ -186,13 +186,10 @@ def look_of(k: int, name: str) -> Style:
 
 
 class _Ticks(LogLocator):
-    """At most so many ticks at round numbers of a logarithmic axis."""
+    """A few ticks at round numbers of a logarithmic axis."""
 
+    MOST = 6
     STEPS = ((1, 1.5, 2, 3, 4, 5, 7), (1, 2, 5), (1,))  # of a decade
-
-    def __init__(self, most: int):
-        super().__init__()
-        self.most = most
 
     def tick_values(self, vmin: float, vmax: float) -> np.ndarray:
         low, high = sorted((vmin, vmax))
@@ -202,11 +199,11 @@ class _Ticks(LogLocator):
             round_numbers = np.multiply.outer(decades, steps).ravel()
             inside = (round_numbers >= low * (1 - 1e-9)) & (round_numbers <= high * (1 + 1e-9))
             ticks = round_numbers[inside]
-            if ticks.size <= self.most:
+            if ticks.size <= self.MOST:
                 break
         if ticks.size < 2:
-            return np.asarray(MaxNLocator(self.most).tick_values(low, high))
-        return ticks[:: -(-ticks.size // self.most)]
+            return np.asarray(MaxNLocator(self.MOST).tick_values(low, high))
+        return ticks[:: -(-ticks.size // self.MOST)]
 
 
 def few_ticks(axis: Axis, most: int) -> None:
@@ -214,9 +211,9 @@ def few_ticks(axis: Axis, most: int) -> None:
     axis.set_major_locator(MaxNLocator(most, steps=[1, 2, 2.5, 5, 10]))
 
 
-def plain_ticks(axis: Axis, most: int = 6) -> None:
-    """At most so many ticks of a logarithmic axis, as plain numbers, not as 2 x 10^1."""
-    axis.set_major_locator(_Ticks(most))
+def plain_ticks(axis: Axis) -> None:
+    """At most six ticks of a logarithmic axis, as plain numbers, not as 2 x 10^1."""
+    axis.set_major_locator(_Ticks())
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axis.set_minor_locator(NullLocator())
 
