@@ -331,8 +331,7 @@ def spectra_figure(
 
 
 def steps_figure(steps: Mapping[str, StepBand], *, ax: AxesLike = None, title: str = "") -> Panels:
-    """Draw what the rate does after a step of 1, by the text of the legend, with the band of the
-    plants that are possible."""
+    """Draw the rate after a step of 1, by the text of the legend, with a band of 95 % of plants."""
     [panel] = panels = lay.stacked(1, ax)
     for k, (name, band) in enumerate(steps.items()):
         look = look_of(k, name)
