@@ -115,7 +115,7 @@ def test_a_result_is_made_again_from_its_settings(found, folder, log, tmp_path):
     np.testing.assert_array_equal(again.fit.values, found.fit.values)
     moved = tmp_path / "moved.csv"
     moved.write_bytes(log.read_bytes())
-    assert identify_again(folder, log=moved).path == moved
+    assert identify_again(folder, log=moved).paths == (moved,)
     moved.write_bytes(log.read_bytes() + b"\n")
     with pytest.raises(ValueError, match="not the log that was identified"):
         identify_again(folder, log=moved)
