@@ -196,8 +196,8 @@ def test_all_axes_are_of_one_flight_of_a_file_with_several(data, tmp_path, capsy
 @pytest.mark.slow
 @pytest.mark.usefixtures("without_type_checks")  # of the stand-ins
 def test_an_axis_that_fails_costs_no_other(data, monkeypatch):
-    def tune(axis, filters):
-        if axis.settings.axis == "pitch":
+    def tune(path, settings, filters):
+        if settings.axis == "pitch":
             raise ValueError("the gain is not above 0")
         return SimpleNamespace(kind="kept", verdict="as it flew", shared_filters={})
 
