@@ -10,6 +10,7 @@ import difflib
 import io
 import os
 import re
+import shlex
 import sys
 import warnings
 from collections.abc import Callable, Sequence
@@ -262,7 +263,21 @@ def _run(words: Sequence[str]) -> int:
     if not words:
         print(_WAY, end="")
         return 0
-    options, unknown = make_parser().parse_known_args(words)
+    parser, first = make_parser(), words[0]
+    if first == "help":
+        parser.print_help()
+        return 0
+    if not first.startswith("-") and first not in _PLACES:
+        if Path(first).exists():
+            file = shlex.quote(first)
+            return _fail(
+                f"{first} is a file, not a command: jaxquad identify {file} gives a model, "
+                f"jaxquad autopilot {file} the gains of an autopilot.", _UNUSABLE
+            )  # fmt: skip
+        near = difflib.get_close_matches(first, _PLACES, n=1)
+        meant = f" Did you mean {near[0]}?" if near else ""
+        return _fail(f"there is no command {first!r}.{meant} See jaxquad --help.", _UNUSABLE)
+    options, unknown = parser.parse_known_args(words)
     if unknown:  # words that no command declares: what is wrong, and the option that was meant
         command = f"jaxquad {options.command}"
         first = next((word for word in unknown if word.startswith("-")), unknown[0])

@@ -149,7 +149,8 @@ def add_settings(
             on = f"store_{'false' if option.flag.startswith('--no-') else 'true'}"
             group.add_argument(option.flag, action=on, **how)
             continue
-        how |= {"type": kind.read, "metavar": kind.metavar, "choices": kind.choices}
+        read = str.lower if kind.choices and kind.read is str else kind.read
+        how |= {"type": read, "metavar": kind.metavar, "choices": kind.choices}
         how |= {"nargs": kind.words} if kind.words > 1 else {}
         how |= {"action": "append"} if kind.repeated else {}
         how |= {"action": _NamedOnce} if key in ("input", "output", "reference") else {}

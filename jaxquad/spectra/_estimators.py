@@ -105,6 +105,11 @@ def check_distinct(records: Sequence[Record]) -> None:
         for a, name in enumerate(record.names):
             for b in range(a):
                 if _same(columns[a], columns[b]):
+                    if np.ptp(columns[a]) == 0:
+                        raise ValueError(
+                            f"{record.names[b]!r} and {name!r} are both {columns[a][0]:g} "
+                            "throughout: choose channels that move, or another part of the log"
+                        )
                     raise ValueError(
                         f"{name!r} is the same signal as {record.names[b]!r}: choose different "
                         "channels for input, output and reference"

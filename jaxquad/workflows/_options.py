@@ -96,8 +96,10 @@ class Settings:
         required = [x.name for x in fields if x.default is x.default_factory is _REQUIRED]
         try:
             check_keys(content, cls.options())
-            if missing := [f"`{key}`" for key in required if key not in content]:
-                raise SettingsError(f"{' and '.join(missing)} must be given")
+            if missing := [key for key in required if key not in content]:
+                known = cls.options()
+                texts = (f"`{key}` ({known[key].help.partition(';')[0]})" for key in missing)
+                raise SettingsError(f"give {' and '.join(texts)}")
             return cls(**content)
         except SettingsError as error:
             raise within_file(where, error) from error

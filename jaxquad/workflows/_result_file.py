@@ -2,6 +2,7 @@
 
 import json
 import os
+import shlex
 from collections.abc import Mapping, Sequence
 from itertools import chain, count
 from pathlib import Path
@@ -213,7 +214,8 @@ def require_radians(name: str, unit: str) -> None:
         options = f"(--output angle=0.017453293*{name} --unit angle={radians})"
     raise ValueError(
         f"the unit of {name} is {unit or 'not known'}, but gains are for an angle in rad: "
-        f"identify with the output in rad/s or rad {options}"
+        f"identify with the output in rad/s or rad {options}; an autopilot's own gains come from "
+        "jaxquad autopilot"
     )
 
 
@@ -320,7 +322,8 @@ def load_result(path: str | Path) -> StoredResult:
         raise ValueError(f"{path}: no such result: run jaxquad identify first") from error
     except ValueError as error:
         raise ValueError(
-            f"{path}: this is no result of jaxquad identify ({error}): run it first"
+            f"{path}: this is no result of jaxquad identify: give its folder. A log is identified "
+            f"first: jaxquad identify {shlex.quote(str(path))}"
         ) from error
     try:
         content = dict(content)

@@ -191,8 +191,9 @@ class TuneSettings(Settings):
 
     **The vehicle:**
 
-    - `inertia`: nominal inertia of the axis, in kg m^2; required
-    - `limit`: largest command, to either side, in its unit; required
+    - `inertia`: nominal inertia of the axis, in kg m^2, from CAD, a swing test or a guess with a
+      wide `spread`; required
+    - `limit`: largest command, to either side, in its unit, as the log has it; required
     - `spread`: range of the true inertia, as factors of the nominal one; 0.5 3 by default
     - `inertia_error`: relative standard error of the inertia that the controller's gains are
       scheduled with; 0.1 by default

@@ -103,6 +103,10 @@ def test_what_holds_no_model_is_said(demo, tmp_path, capsys):
     (tmp_path / "result.json").write_text("[1]")
     assert main(["verify", str(tmp_path), "x.csv"]) == 2
     assert "no result of" in capsys.readouterr().err
+    (tmp_path / "log.bbl").write_bytes(b"\xa0\xff")
+    assert main(["report", str(tmp_path / "log.bbl")]) == 2
+    said = capsys.readouterr().err
+    assert f"jaxquad identify {tmp_path / 'log.bbl'}" in said and "codec" not in said
 
 
 @pytest.mark.parametrize("kind", ["sweep", "multisine"])
@@ -240,12 +244,25 @@ def test_every_command_has_help_with_an_example(name, capsys):
         (["identify", "x", "--referense=r"], "no option --referense. Did you mean --reference?"),
         (["channels", "x", "--zzz", "1"], "has no option --zzz. See jaxquad channels --help."),
         (["channels", "x", "y"], "jaxquad channels takes no further argument 'y'."),
+        (["identfy", "x"], "no command 'identfy'. Did you mean identify? See jaxquad --help."),
+        (["zzz"], "there is no command 'zzz'. See jaxquad --help."),
     ],
 )
 def test_an_option_that_does_not_exist_is_answered_with_the_nearest(words, said, capsys):
     assert main(words) == 2
     printed = capsys.readouterr()
     assert said in printed.err and not printed.out and printed.err.count("\n") == 1
+
+
+def test_a_log_without_a_command_is_answered_with_what_to_do_with_it(tmp_path, capsys):
+    log = tmp_path / "my log.bfl"
+    log.touch()
+    assert main([str(log)]) == 2
+    said = capsys.readouterr().err
+    assert f"jaxquad identify '{log}' gives a model" in said
+    assert f"jaxquad autopilot '{log}' the gains" in said
+    assert main(["help"]) == 0
+    assert "commands, in order of use:" in capsys.readouterr().out
 
 
 def test_channels_are_listed_as_json(demo, capsys):

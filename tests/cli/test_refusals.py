@@ -1,6 +1,7 @@
 """What a command cannot do is said in one line, with exit code 2, before anything is computed."""
 
 import os
+import zipfile
 
 import numpy as np
 import pytest
@@ -16,6 +17,8 @@ def place(tmp_path_factory):
     np.savetxt(folder / "log.csv", rows, delimiter=",", header="t,u,q", comments="")
     rows[:, 2] = np.nan
     np.savetxt(folder / "nan.csv", rows, delimiter=",", header="t,u,q", comments="")
+    with zipfile.ZipFile(folder / "log.zip", "w") as archive:
+        archive.writestr("flight.bbl", "H Product:Blackbox")
     (folder / "folder").mkdir()
     return folder
 
@@ -88,6 +91,8 @@ def test_a_channel_is_named_once(name, place, capsys):
     [
         (["channels", "folder"], "folder is a folder, and no bag of ROS 2: name the file in it"),
         (["autopilot", "log.csv"], "jaxquad identify takes it all the same"),
+        (["autopilot", "log.csv", "--axis", "Roll"], "jaxquad identify takes it all the same"),
+        (["autopilot", "log.zip"], "it holds flight.bbl): unpack it"),
         (
             ["identify", "nan.csv", "--input", "u", "--output", "q", "--quiet"],
             "channel 'q' holds no usable number: all 400 samples are nan, or out of the range",

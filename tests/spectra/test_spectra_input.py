@@ -118,6 +118,15 @@ def test_a_constant_channel_is_no_excitation(channel, name):
         frequency_response(still(channel), OMEGA)
 
 
+def test_channels_that_are_the_same_are_refused_also_where_they_rest():
+    with pytest.raises(ValueError, match="is the same signal as"):
+        frequency_response(Record(TIME, DRAW[:, 0], DRAW[:, 0]), OMEGA)
+    with pytest.warns(RecordWarning, match="constant"):
+        record = Record(TIME, np.zeros(SAMPLES), np.zeros(SAMPLES))
+    with pytest.raises(ValueError, match="are both 0 throughout"):
+        frequency_response(record, OMEGA)
+
+
 def test_a_trend_that_detrending_removes_is_no_excitation():
     ramp = Record(TIME, 1e6 + 3 * TIME, DRAW[:, 1])
     with pytest.raises(

@@ -111,7 +111,7 @@ def test_a_segment_is_a_start_and_a_later_stop(text):
 
 
 def test_required_settings_are_named():
-    with pytest.raises(SettingsError, match="`inertia` and `limit` must be given"):
+    with pytest.raises(SettingsError, match=r"`inertia` \(.*kg m\^2.*\) and `limit` \(.*\)"):
         TuneSettings.from_mapping({})
     with pytest.raises(SettingsError, match="`spread` is .*the lower one first"):
         TuneSettings(inertia=1, limit=1, spread=(3, 0.5))

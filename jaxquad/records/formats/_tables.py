@@ -64,6 +64,9 @@ def load_numpy(path: Path) -> Log:
                         offset=member.header_offset,
                     ) from error
                 add_columns(arrays, columns, remarks)
+    if not arrays and members:
+        names = ", ".join(printable(member.filename) for member in members[:3])
+        raise ReadError(f"an archive without arrays (it holds {names}): unpack it, and give a log")
     return Log({"": Table(arrays)}, tuple(remarks))
 
 
