@@ -3,7 +3,6 @@
 import argparse
 import atexit
 import contextlib
-import fcntl
 import gc
 import json
 import logging
@@ -106,7 +105,10 @@ def folder_to_write(
     """
     wanted.parent.mkdir(parents=True, exist_ok=True)
     with contextlib.ExitStack() as lock:
-        with contextlib.suppress(OSError):  # a folder that may not be read, a disk without locks
+        # Windows has no locks, some disks neither; a folder may not be readable.
+        with contextlib.suppress(ImportError, OSError):
+            import fcntl
+
             place = os.open(wanted.parent, os.O_RDONLY)
             lock.callback(os.close, place)
             fcntl.flock(place, fcntl.LOCK_EX)

@@ -5,7 +5,6 @@ A result is on the disk whole or not there.
 
 import atexit
 import contextlib
-import fcntl
 import gc
 import json
 import math
@@ -141,7 +140,11 @@ def locked(out: Path) -> Iterator[None]:
     out.mkdir(parents=True, exist_ok=True)
     with (out / ".lock").open("w") as file:
         try:
+            import fcntl
+
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except ImportError:  # Windows: two batches in one folder do the same work twice, no harm.
+            pass
         except OSError as error:
             raise ValueError(
                 f"{out}: another batch is running in this folder: wait for it, or choose another "
@@ -162,6 +165,20 @@ _NARROW = {  # Each process has one core: more threads would only wait for each 
 }
 
 
+@contextlib.contextmanager
+def _without_interrupts() -> Iterator[None]:
+    """A process that starts within it never gets the interrupt that ends this one."""
+    if not hasattr(signal, "pthread_sigmask"):  # Windows
+        yield
+        return
+    resource_tracker.ensure_running()  # which would let interrupts in
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
 class _Worker:
     def __init__(self, work: Work, timeout: float | None):
         self.timeout, self.due = math.inf if timeout is None else timeout, math.inf
@@ -169,13 +186,10 @@ class _Worker:
         self.process = _SPAWN.Process(target=_serve, args=(work, theirs), daemon=True)
         missing = {name: text for name, text in _NARROW.items() if name not in os.environ}
         os.environ.update(missing)  # what the user set stays
-        resource_tracker.ensure_running()  # which would let interrupts in
-        # A process that starts now never gets the interrupt that ends this one.
-        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
         try:
-            self.process.start()
+            with _without_interrupts():
+                self.process.start()
         finally:
-            signal.pthread_sigmask(signal.SIG_SETMASK, before)
             for name in missing:
                 os.environ.pop(name, None)
         theirs.close()  # or the end of the process would not show on ours
@@ -254,7 +268,8 @@ def perform_locally(
 
 
 def _serve(work: Work, connection: Connection) -> None:
-    os.setpgid(0, 0)  # What it starts ends with it, see _kill.
+    if hasattr(os, "setpgid"):
+        os.setpgid(0, 0)  # What it starts ends with it, see _kill.
 
     def end_with_the_parent() -> None:
         """At once: a batch that is started again must not find the job under way."""
@@ -275,8 +290,9 @@ def _serve(work: Work, connection: Connection) -> None:
 
 def _kill(process: BaseProcess | None) -> None:
     """A process (None: this one) with the readers that it has started."""
-    with contextlib.suppress(OSError):  # It has no group of its own yet.
-        os.killpg((process and process.pid) or os.getpid(), signal.SIGKILL)
+    if hasattr(os, "killpg"):
+        with contextlib.suppress(OSError):  # It has no group of its own yet.
+            os.killpg((process and process.pid) or os.getpid(), signal.SIGKILL)
     if process is None:
         os._exit(1)
     process.kill()

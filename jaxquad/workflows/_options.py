@@ -97,8 +97,8 @@ class Settings:
         try:
             check_keys(content, cls.options())
             if missing := [key for key in required if key not in content]:
-                known = cls.options()
-                texts = (f"`{key}` ({known[key].help.partition(';')[0]})" for key in missing)
+                options = cls.options()
+                texts = (f"`{key}` ({options[key].help.partition(';')[0]})" for key in missing)
                 raise SettingsError(f"give {' and '.join(texts)}")
             return cls(**content)
         except SettingsError as error:
