@@ -1,7 +1,7 @@
 """Controllers (LADRC, PID, adaptive LADRC), observers and estimators of the inertia."""
 
 from ._ladrc import LADRC as LADRC, LADRCLaw as LADRCLaw
-from ._lock_in import LockInInertia as LockInInertia, ProbeTones as ProbeTones
+from ._lock_in import LockInInertia as LockInInertia, NoProbe as NoProbe, ProbeTones as ProbeTones
 from ._pid import (
     BackCalculation as BackCalculation,
     Clamping as Clamping,

@@ -154,10 +154,7 @@ class ProbeTones(eqx.Module):
 
     - `frequencies`: in Hz.
     - `amplitude`: of each sine in units of the command, a scalar or one value per axis. 0 says that
-        other signals excite the loop all the time, injected ones or a busy reference, and that
-        every sample counts. Where only gusts move the Hover, least squares finds the controller
-        instead of the plant: of 64 loops with b0 = 1.6 one in seven trusted an inertia that was up
-        to 40 % off.
+        other signals excite the loop all the time.
     - `above`, `below`: relative standard deviations; `above=0` keeps the tones on.
 
     **Raises:** `ValueError`: a frequency is not positive, or `below` is above `above`.
@@ -207,6 +204,24 @@ class ProbeTones(eqx.Module):
     def _amplitude(self, like):
         amplitude = self.amplitude[None] if self.amplitude.ndim == 0 else self.amplitude
         return broadcast_gain(amplitude, like)
+
+
+class NoProbe(eqx.Module):
+    """No test signal: the estimator uses every sample.
+
+    Only for loops that are excited by other means, an injected signal or a busy reference. Where
+    only gusts move the Hover, least squares finds the controller instead of the plant: of 64 loops
+    with b0 = 1.6 one in seven trusted an inertia that was up to 40 % off.
+    """
+
+    def init(self, like: Signal) -> ProbeState:
+        return ProbeState(jnp.zeros((), jnp.int32), jnp.ones_like(like))
+
+    def step(self, state: ProbeState, estimate: InertiaEstimate) -> ProbeState:
+        return state
+
+    def signal(self, state: ProbeState, dt: float) -> Signal:
+        return jnp.zeros_like(state.exciting)
 
 
 def solve(

@@ -16,6 +16,7 @@ from ._lock_in import (
     empty_past,
     LastEstimate,
     motion,
+    NoProbe,
     Past,
     ProbeState,
     ProbeTones,
@@ -78,7 +79,7 @@ class AbstractRegression(AbstractInertia):
     bandwidth: Float[Array, ""] = eqx.field(converter=as_float, default=15.0, kw_only=True)  # rad/s
     order: int = eqx.field(static=True, default=3, kw_only=True)  # stages of the filter
     nuisance: tuple[str, ...] = eqx.field(static=True, default=("offset", "rate"), kw_only=True)
-    tones: ProbeTones = eqx.field(default=ProbeTones(amplitude=0.0), kw_only=True)
+    tones: ProbeTones | NoProbe = eqx.field(default=NoProbe(), kw_only=True)
     excitation: float = eqx.field(static=True, default=0.02, kw_only=True)  # rad/s^2
     correlation: float = eqx.field(static=True, default=0.5, kw_only=True)  # s
 
