@@ -170,16 +170,19 @@ def usable(frf: FrequencyResponse, band: Band, least: float) -> Mask:
     exceeds the response as sharper neighbours show it, as beyond the end of an excitation.
     """
     omega, error = np.asarray(frf.omega), np.asarray(frf.random_error)
+    response = np.asarray(frf.response)
     kernel = _third_of_an_octave(omega.tobytes())
     mean = lambda values: (kernel @ values.reshape(len(values), -1)).reshape(values.shape)
-    finite = np.isfinite(np.asarray(frf.response)) & np.isfinite(error)
+    finite = np.isfinite(response) & np.isfinite(error)
     coherent = mean(np.asarray(frf.coherence)) >= least
     sharp = mean(np.fmin(error, 1.0)) <= _LARGEST
-    weights = np.where(finite, np.maximum(np.where(finite, error, 1.0), 1e-3) ** -2.0, 0.0)
-    size = np.log(np.maximum(np.abs(np.where(finite, np.asarray(frf.response), 1.0)), 1e-300))
-    around = mean(weights * size) / np.maximum(mean(weights), 1e-300)
-    usual = np.log(np.fmax(error, 1e-300)) + size <= around
-    chosen = finite & coherent & sharp & usual
+    chosen = finite & coherent & sharp
+    poor = chosen & (error > _LARGEST)
+    if np.any(poor):  # as sharper neighbours show the size of the response
+        weights = finite / np.fmax(error, 1e-3) ** 2
+        size = np.log(np.abs(response), out=np.zeros(error.shape), where=finite & (response != 0))
+        around = mean(weights * size) / mean(weights)
+        chosen[poor] = np.log(error[poor]) + size[poor] <= around[poor]
 
     def within(limits: Range | None) -> np.ndarray:  # annotations of shapes take time at each call
         low, high = limits or (0.0, np.inf)
