@@ -1,6 +1,7 @@
 """What CPUs compute eight at a time: sines, arctangents, responses in real arithmetic."""
 
 import functools as ft
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
@@ -137,6 +138,9 @@ class Split(NamedTuple):
     imag: Float[Array, "rows columns frequencies"]
 
 
+Scales = tuple[ByState, ByState]
+
+
 def _product(a: Split, b: Split) -> Split:
     """The matrix product at each frequency."""
     real = imag = jnp.zeros((), a.real.dtype)
@@ -147,10 +151,43 @@ def _product(a: Split, b: Split) -> Split:
     return Split(real, imag)
 
 
+@jax.custom_jvp
+def inverse(matrix: Split, scales: Scales) -> Split:
+    """The inverse at each frequency, by Gauss-Jordan elimination with partial pivoting.
+
+    Rows and columns are first scaled alike by `scales`, see `equilibrium`, so that the unit of a
+    state does not matter. A pivot of zero becomes a very small one: the inverse is then huge, not
+    undefined.
+    Source: Higham, Accuracy and Stability of Numerical Algorithms, section 14.4.
+    """
+    rows, columns = scales
+    result = _invert_in_place(Split(*(rows[:, None] * part * columns[None] for part in matrix)))
+    return Split(*(columns[:, None] * part * rows[None] for part in result))
+
+
+@inverse.defjvp
+def _inverse_jvp(primals, tangents):
+    result = inverse(*primals)  # whatever the scales
+    change = _product(_product(result, tangents[0]), result)
+    return result, Split(-change.real, -change.imag)
+
+
+def equilibrium(size: Float[Array, "states states frequencies"]) -> tuple[ByState, ByState]:
+    # Ruiz: divide rows and columns by the square root of their largest element, several times.
+    log = jnp.log2(size)
+    rows = columns = jnp.zeros_like(size[0])
+    for _ in range(_ROUNDS):
+        current = log + rows[:, None] + columns[None]
+        largest = jnp.max(current, axis=1), jnp.max(current, axis=0)
+        by_row, by_column = (jnp.where(jnp.isfinite(x), x, 0) / 2 for x in largest)
+        rows, columns = rows - by_row, columns - by_column
+    return jnp.exp2(jnp.round(rows)), jnp.exp2(jnp.round(columns))
+
+
+_ROUNDS = 5  # units 12 decades apart end within a factor of 2.4
+
+
 def _invert_in_place(matrix: Split) -> Split:
-    # Gauss-Jordan elimination with partial pivoting; a pivot of zero becomes a very small one, so
-    # that the inverse is huge, not undefined. Source: Higham, Accuracy and Stability of Numerical
-    # Algorithms, section 14.4.
     # Each step exchanges one unknown with one right side, in place: what was the matrix from x to y
     # becomes that from y to x. Rows stay where they are and are put in order at the end.
     states, _, frequencies = matrix.real.shape
@@ -214,59 +251,76 @@ class Matrices(NamedTuple):
     late: Float[Array, "outputs inputs"] | None  # s, of input and output together
 
 
+@jax.custom_jvp
 def response(matrices: Matrices, omega: Omega) -> Split:
     """(H0 + s H1) (s M - F)^-1 G exp(-s late); rows are outputs and columns inputs.
 
     Infinite, with an undefined phase, where a pole lies so near that more than a hundredth of the
     states may be rounding. Source: Tischler & Remple, eq. 12.11 and 12.12.
     """
-    (real, imag), states, resolvent = _solve(matrices, omega)
-    lost = _is_rounding(*jax.lax.stop_gradient((matrices, omega, states, resolvent)))
+    return _mark_rounding(matrices, omega, _solve_states(matrices, omega))
+
+
+class Solved(NamedTuple):
+    """The response and what it is made of."""
+
+    value: Split  # (outputs, inputs, frequencies), rounding or not
+    resolvent: Split  # R = (s M - F)^-1
+    states: Split  # X = R G
+    scales: Scales
+
+
+def _solve_states(matrices: Matrices, omega: Omega) -> Solved:
+    """The response without a look at its rounding error."""
+    # Scales from the geometric mean of the frequencies: units know no frequency.
+    middle = jnp.exp(jnp.mean(jnp.log(jnp.where(omega > 0, omega, 1.0))))[None]
+    shape = (len(matrices.F), omega.size)
+    real, imag = _pencil(matrices, middle)
+    rows, columns = equilibrium(jnp.maximum(jnp.abs(real), jnp.abs(imag)))
+    scales = jax.lax.stop_gradient(
+        (jnp.broadcast_to(rows, shape), jnp.broadcast_to(columns, shape))
+    )
+    resolvent = inverse(_pencil(matrices, omega), scales)
+    states = Split(*(no_fuse(_multiply_columns, part, matrices.G) for part in resolvent))
+    value = _apply_delay(_output_of(matrices, omega, states), matrices.late, omega)
+    return Solved(value, resolvent, states, scales)
+
+
+def _mark_rounding(matrices: Matrices, omega: Omega, solved: Solved) -> Split:
+    lost = _is_rounding(*jax.lax.stop_gradient((matrices, omega, solved)))
+    real, imag = solved.value
     return Split(jnp.where(lost, jnp.inf, real), jnp.where(lost, jnp.nan, imag))
 
 
-@jax.custom_jvp
-def _solve(matrices: Matrices, omega: Omega) -> tuple[Split, Split, Split]:
-    """The response, rounding or not, the states X = R G, and R = (s M - F)^-1."""
-    rows, columns = _scales(matrices, omega)
-    pencil = (rows[:, None] * part * columns[None] for part in _pencil(matrices, omega))
-    result = _invert_in_place(Split(*pencil))
-    resolvent = Split(*(columns[:, None] * part * rows[None] for part in result))
-    states = Split(*(no_fuse(_multiply_columns, part, matrices.G) for part in resolvent))
-    value = _apply_delay(_output_of(matrices, omega, states), matrices.late, omega)
-    return value, states, resolvent
-
-
-@ft.partial(_solve.defjvp, symbolic_zeros=True)
-def _solve_jvp(primals, tangents):
-    # With L = (H0 + s H1) R, small: dT = L P + d(H0 + s H1) X, late, and -j d(omega late) T, by the
-    # push P = dG + dF X - d(s M) X; dX = R P, and dR likewise, without a dG.
+@ft.partial(response.defjvp, symbolic_zeros=True)
+def _response_jvp(primals, tangents):
+    # With the states X = R G and L = (H0 + s H1) R, both small, instead of the products R dF R:
+    # dT = L (dG + dF X - d(s M) X) + d(H0 + s H1) X, late, and -j d(omega late) T.
     matrices, omega = primals
     # None for tangents that are known to be zero.
     absent = lambda x: isinstance(x, SymbolicZero)
     d, d_omega = jax.tree.map(lambda x: None if absent(x) else x, tangents, is_leaf=absent)
-    value, states, resolvent = _solve(*primals)
-    none = jnp.zeros_like(states.real)
-    of_G = Split(none if d.G is None else none + d.G[:, :, None], none)
-
-    def move(by: Split, x: Split, push: Split) -> Split:
-        pushes = [_multiply(d.F, x), _multiply(d.M, _derivative(x, -omega))]
-        if d_omega is not None:
-            turned = _derivative(x, -d_omega)
-            pushes.append(turned if matrices.M is None else _multiply(matrices.M, turned))
-        return no_fuse(_product, by, _add(push, *pushes))
-
+    solved = _solve_states(matrices, omega)
+    value, states = _mark_rounding(matrices, omega, solved), solved.states
+    push = [_multiply(d.F, states), _multiply(d.M, _derivative(states, -omega))]
+    if d.G is not None:
+        real = jnp.broadcast_to(d.G[:, :, None], states.real.shape)
+        push.append(Split(real, jnp.zeros_like(states.imag)))
     change = [_multiply(d.H0, states), _multiply(d.H1, _derivative(states, omega))]
     if d_omega is not None:
+        turned = _derivative(states, -d_omega)
+        push.append(turned if matrices.M is None else _multiply(matrices.M, turned))
         change.append(_multiply(matrices.H1, _derivative(states, d_omega)))
-    moved = _add(move(_output_of(matrices, omega, resolvent), states, of_G), *change)
-    moved = _apply_delay(moved, matrices.late, omega)
+    pushed = _add_present(push)
+    if pushed is not None:
+        change.append(no_fuse(_product, _output_of(matrices, omega, solved.resolvent), pushed))
+    changed = _add_present(change)
+    moved = [None if changed is None else _apply_delay(changed, matrices.late, omega)]
     for late, frequency in ((d.late, omega), (matrices.late, d_omega)):
         if late is not None and frequency is not None:
             angle = late[:, :, None] * frequency[None, None]
-            moved = _add(moved, Split(angle * value.imag, -angle * value.real))
-    of_resolvent = move(resolvent, resolvent, Split(*map(jnp.zeros_like, resolvent)))
-    return (value, states, resolvent), (moved, move(resolvent, states, of_G), of_resolvent)
+            moved.append(Split(angle * value.imag, -angle * value.real))
+    return value, _add(Split(*(jnp.zeros_like(part) for part in value)), *moved)
 
 
 def _apply_delay(parts: Split, late: Array | None, omega: Omega) -> Split:
@@ -284,26 +338,6 @@ def _pencil(matrices: Matrices, omega: Omega) -> Split:
     return Split(jnp.broadcast_to(-F[:, :, None], shape), M[:, :, None] * omega[None, None])
 
 
-_ROUNDS = 5  # units 12 decades apart end within a factor of 2.4
-
-
-def _scales(matrices: Matrices, omega: Omega) -> tuple[ByState, ByState]:
-    """Of rows and columns, which make them alike, so that the unit of a state does not matter."""
-    # From the geometric mean of the frequencies: units know no frequency.
-    middle = jnp.exp(jnp.mean(jnp.log(jnp.where(omega > 0, omega, 1.0))))[None]
-    real, imag = jax.lax.stop_gradient(_pencil(matrices, middle))
-    log = jnp.log2(jnp.maximum(jnp.abs(real), jnp.abs(imag)))
-    rows = columns = jnp.zeros_like(log[0])
-    for _ in range(_ROUNDS):  # Ruiz: by the square roots of the largest elements
-        current = log + rows[:, None] + columns[None]
-        largest = jnp.max(current, axis=1), jnp.max(current, axis=0)
-        by_row, by_column = (jnp.where(jnp.isfinite(x), x, 0) / 2 for x in largest)
-        rows, columns = rows - by_row, columns - by_column
-    shape = (len(log), omega.size)
-    rows, columns = (jnp.broadcast_to(jnp.exp2(jnp.round(x)), shape) for x in (rows, columns))
-    return rows, columns
-
-
 def _output_of(matrices: Matrices, omega: Omega, states: Split) -> Split:
     """(H0 + s H1) times `states`, or times the resolvent."""
     rates = _multiply(matrices.H1, _derivative(states, omega))
@@ -311,12 +345,12 @@ def _output_of(matrices: Matrices, omega: Omega, states: Split) -> Split:
 
 
 def _is_rounding(
-    matrices: Matrices, omega: Omega, states: Split, resolvent: Split
+    matrices: Matrices, omega: Omega, solved: Solved
 ) -> Bool[Array, "outputs inputs frequencies"]:
     # A first-order bound of the rounding error in the states, beside the largest state in the
     # units that make the equations alike; and what only a pivot of zero can make so large.
-    row, unit = (scale[:, None] for scale in _scales(matrices, omega))
-    size, gain = (jnp.abs(x.real) + jnp.abs(x.imag) for x in (states, resolvent))
+    row, unit = (scale[:, None] for scale in solved.scales)
+    size, gain = (jnp.abs(x.real) + jnp.abs(x.imag) for x in (solved.states, solved.resolvent))
     mass = size if matrices.M is None else _dot(jnp.abs(matrices.M), size)
     terms = _dot(jnp.abs(matrices.F), size) + omega[None, None] * mass
     error = sum(gain[:, k, None] * terms[k][None] for k in range(len(gain)))
@@ -344,6 +378,11 @@ def _multiply_real(matrix: Array, states: Split) -> Split:
     both = jnp.concatenate(states, axis=1)
     product, inputs = _dot(matrix, both), states.real.shape[1]
     return Split(product[:, :inputs], product[:, inputs:])
+
+
+def _add_present(terms: Sequence[Split | None]) -> Split | None:
+    present = [term for term in terms if term is not None]
+    return _add(*present) if present else None
 
 
 def _add(first: Split, *others: Split | None) -> Split:
