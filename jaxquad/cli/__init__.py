@@ -268,8 +268,11 @@ def _run(words: Sequence[str]) -> int:
         parser.print_help()
         return 0
     if not first.startswith("-") and first not in _PLACES:
+        file = shlex.quote(first)
+        if Path(first).is_dir():
+            text = f"{first} is a folder, not a command: jaxquad batch {file} identifies its logs."
+            return _fail(text, _UNUSABLE)
         if Path(first).exists():
-            file = shlex.quote(first)
             return _fail(
                 f"{first} is a file, not a command: jaxquad identify {file} gives a model, "
                 f"jaxquad autopilot {file} the gains of an autopilot.", _UNUSABLE

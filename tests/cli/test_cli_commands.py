@@ -261,6 +261,8 @@ def test_a_log_without_a_command_is_answered_with_what_to_do_with_it(tmp_path, c
     said = capsys.readouterr().err
     assert f"jaxquad identify '{log}' gives a model" in said
     assert f"jaxquad autopilot '{log}' the gains" in said
+    assert main([str(tmp_path)]) == 2
+    assert f"jaxquad batch {tmp_path} identifies its logs" in capsys.readouterr().err
     assert main(["help"]) == 0
     assert "commands, in order of use:" in capsys.readouterr().out
 

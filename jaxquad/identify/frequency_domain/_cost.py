@@ -179,10 +179,10 @@ def usable(frf: FrequencyResponse, band: Band, least: float) -> Mask:
     chosen = finite & coherent & sharp
     poor = chosen & (error > _LARGEST)
     if np.any(poor):  # as sharper neighbours show the size of the response
-        weights = finite / np.fmax(error, 1e-3) ** 2
+        weights = (finite / np.fmax(error, 1e-3)) ** 2
         size = np.log(np.abs(response), out=np.zeros(error.shape), where=finite & (response != 0))
-        around = mean(weights * size) / mean(weights)
-        chosen[poor] = np.log(error[poor]) + size[poor] <= around[poor]
+        around = mean(weights * size)[poor] / mean(weights)[poor]
+        chosen[poor] = np.log(error[poor]) + size[poor] <= around
 
     def within(limits: Range | None) -> np.ndarray:  # annotations of shapes take time at each call
         low, high = limits or (0.0, np.inf)
