@@ -15,6 +15,11 @@ from ._convert import (
     realise as realise,
     state_space as state_space,
 )
+from ._declared import declares as declares, parameter_units as parameter_units
+from ._discrete import (
+    DiscreteTransferFunction as DiscreteTransferFunction,
+    require_sampled as require_sampled,
+)
 from ._multirotor import (
     Allocation as Allocation,
     CRAZYFLIE as CRAZYFLIE,
@@ -30,7 +35,9 @@ from ._simulate_linear import (
     free_responses as free_responses,
     matrix_exponential as matrix_exponential,
     sample_rational as sample_rational,
+    sample_states as sample_states,
     SampledRational as SampledRational,
+    SampledStates as SampledStates,
     simulate_linear as simulate_linear,
     split_delay as split_delay,
 )
@@ -45,10 +52,8 @@ from ._transfer_function import (
     Convertible as Convertible,
     evaluate_response as evaluate_response,
     imaginary as imaginary,
-    is_optional as is_optional,
     LaggedIntegrator as LaggedIntegrator,
     Model as Model,
-    parameter_units as parameter_units,
     TransferFunction as TransferFunction,
     with_arrays as with_arrays,
 )

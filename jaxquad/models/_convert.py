@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ._discrete import DiscreteTransferFunction
 from ._state_space import dot, explicit, Realisation, StateSpace
 from ._transfer_function import (
     coefficients_of,
@@ -21,8 +22,10 @@ from ._transfer_function import (
 
 
 @eqx.filter_jit  # one compilation instead of one for each small operation
-def realise(model: TransferFunction) -> Realisation:
+def realise(model: TransferFunction | DiscreteTransferFunction) -> Realisation:
     """A, B, C, D of dx/dt = A x + B u, y = C x + D u: the model without its delay.
+
+    Of a discrete model they are those of x[k+1] = A x[k] + B u[k], y[k] = C x[k] + D u[k].
 
     The controllable canonical form, in a time measured in units of the fastest pole: written in
     seconds, its coefficients spread over many decades and its exponential loses digits.
@@ -100,8 +103,10 @@ class HasMatrices(Protocol):
     def dt(self) -> float | int | bool | None: ...  # s; None or 0 where it is continuous
 
 
-def from_control(system: HasCoefficients | HasMatrices) -> TransferFunction | StateSpace:
-    """A continuous model of python-control or scipy.signal.
+def from_control(
+    system: HasCoefficients | HasMatrices,
+) -> TransferFunction | StateSpace | DiscreteTransferFunction:
+    """A model of python-control or scipy.signal.
 
     A direct passage from input to output, which H0 x + H1 x' does not have, becomes a share of x';
     where the inputs drive no states of their own, each gets one that cancels in the response. A
@@ -117,10 +122,11 @@ def from_control(system: HasCoefficients | HasMatrices) -> TransferFunction | St
     **Arguments:** `system`: a `TransferFunction` or a `StateSpace` of python-control or
     scipy.signal. Neither has delays: put them in with `dataclasses.replace`.
 
-    **Returns:** A `jq.TransferFunction` for a ratio of polynomials with one input and one output,
-    otherwise a `jq.StateSpace`.
+    **Returns:** A `jq.TransferFunction` for a ratio of polynomials with one input and one output, a
+    `jq.models.DiscreteTransferFunction` if it is sampled, otherwise a `jq.StateSpace`.
 
-    **Raises:** `ValueError`: the system is sampled, improper, or of another kind.
+    **Raises:** `ValueError`: the system is improper, of another kind, or sampled with several
+    inputs or outputs, in state space, or every unknown seconds.
     """
     if isinstance(system, HasMatrices):
         require_continuous(system.dt)
@@ -130,7 +136,11 @@ def from_control(system: HasCoefficients | HasMatrices) -> TransferFunction | St
     if isinstance(system, HasCoefficients):
         above, below = coefficients_of(system)
         if len(above) == len(above[0]) == 1:
+            if system.dt and system.dt is not True:
+                return DiscreteTransferFunction(above[0][0], below[0][0], system.dt)
+            require_continuous(system.dt)
             return TransferFunction(above[0][0], below[0][0])
+        require_continuous(system.dt)
         outputs, inputs = len(above), len(above[0])
         parts, D = [], np.zeros((outputs, inputs))
         for row in range(outputs):  # a bank of all pairs
@@ -206,8 +216,19 @@ def convert(model: Convertible, package: str, pade: int | None) -> Any:
             over, under = _pade_coefficients(float(delay), pade)
             above, below = np.convolve(above, over), np.convolve(below, under)
         coefficients = (above, below)
+    return _made_by(package, kind, *coefficients)
+
+
+def convert_discrete(model: DiscreteTransferFunction, package: str) -> Any:
+    """A model of samples for python-control or scipy.signal."""
+    above, below = (np.asarray(x, float) for x in (model.numerator, model.denominator))
+    below = np.pad(below, (0, model.delay))
+    return _made_by(package, "TransferFunction", above, below, dt=model.dt)
+
+
+def _made_by(package: str, kind: str, *coefficients: np.ndarray, **options: float) -> Any:
     try:
-        return getattr(importlib.import_module(package), kind)(*coefficients)
+        return getattr(importlib.import_module(package), kind)(*coefficients, **options)
     except ImportError as error:
         raise ImportError(
             f"{package} is not installed: run pip install 'jaxquad[interop]', or pip install "

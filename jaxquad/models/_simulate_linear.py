@@ -6,12 +6,22 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Int
 
 from jaxquad._compile import brief_options, Jit
-from jaxquad._core import require_all_positive
+from jaxquad._core import is_concrete, require_all_positive
 
 from ._convert import realise
+from ._difference import (
+    free_motion,
+    free_samples,
+    run_states,
+    shift_samples,
+    simulate_samples,
+    step_with_bias,
+)
+from ._discrete import DiscreteTransferFunction, require_sampled
 from ._state_space import dot, explicit, StateSpace
 from ._transfer_function import TransferFunction
 
@@ -43,7 +53,7 @@ def matrix_exponential(matrix: Square, dot: Callable[[Array, Array], Array] = do
 
     It compiles in a fraction of the time of `jax.scipy.linalg.expm`, and without LAPACK under vmap.
     """
-    size = jnp.maximum(jnp.max(jnp.sum(jnp.abs(matrix), axis=0)), 1.0)
+    size = jnp.max(jnp.sum(jnp.abs(matrix), axis=0), initial=1.0)
     halvings = jax.lax.stop_gradient(jnp.clip(jnp.ceil(jnp.log2(size)), 0, _SQUARINGS))
     small = matrix * jnp.exp2(-halvings)
     unit = jnp.eye(len(matrix), dtype=matrix.dtype)
@@ -134,36 +144,17 @@ def _delay_input(
 ) -> Float[Array, " samples"]:
     """The input itself, `delay` s late, at the samples; where it jumps, the value just after."""
     shift, late = split_delay(delay, dt)
-    old, new = _shift_samples(segments, shift + 1), _shift_samples(segments, shift)
+    old, new = shift_samples(segments, shift + 1), shift_samples(segments, shift)
     # At whole samples the slope by the delay is that of a longer one.
     now = new[:, 0] - late * old[:, 1]
     return jnp.where(late <= _WHOLE, now, old[:, 0] + (1 - late) * old[:, 1])
-
-
-def _shift_samples(
-    x: Float[Array, "samples columns"], shift: Int[Array, ""]
-) -> Float[Array, "samples columns"]:
-    """`x` so many samples later, and zero before."""
-    index = jnp.arange(len(x)) - shift
-    return jnp.where(index[:, None] >= 0, x[jnp.maximum(index, 0)], 0)
-
-
-def _powers(A: Square, count: int) -> tuple[Float[Array, "count states states"], Square]:
-    """A^0 to A^(count - 1), and A^count."""
-    one = jnp.eye(len(A), dtype=A.dtype)
-    last, below = jax.lax.scan(lambda P, _: (dot(A, P), P), one, length=count)
-    return below, last
-
-
-def _chunk(samples: int) -> int:
-    return max(1, round(samples**0.5))
 
 
 _HOLDS = ("zero", "first")
 
 
 def simulate_linear(
-    model: TransferFunction | StateSpace,
+    model: TransferFunction | StateSpace | DiscreteTransferFunction,
     u: Float[ArrayLike, " samples"] | Float[ArrayLike, "samples inputs"], dt: Number, *,
     hold: str = "zero", direct_samples: Float[ArrayLike, "outputs inputs"] | None = None,
 ) -> Float[Array, " samples"] | Float[Array, "samples outputs"]:  # fmt: skip
@@ -174,9 +165,10 @@ def simulate_linear(
 
     **Arguments:**
 
-    - `model`: a `TransferFunction`, or a `StateSpace`.
-    - `u`: the input, (samples,) for a `TransferFunction`, (samples, inputs) for a `StateSpace`; it
-        was 0 before the first sample.
+    - `model`: a `TransferFunction`, a `StateSpace`, or a `DiscreteTransferFunction`, which has hold
+        and `direct_samples` in it.
+    - `u`: the input, (samples, inputs) for a `StateSpace`, (samples,) for the others; it was 0
+        before the first sample.
     - `dt`: the sample interval in s.
     - `hold`: between samples the input stays at the last one ("zero") or is straight ("first").
     - `direct_samples`: after how many samples a held input passes directly, outputs per inputs; by
@@ -184,26 +176,30 @@ def simulate_linear(
 
     **Returns:** The outputs, (samples,) or (samples, outputs).
 
-    **Raises:** `ValueError`: `hold` is unknown, `dt` is not positive, or `u` has another shape.
+    **Raises:** `ValueError`: `hold` is unknown, `dt` is not positive or not that of a discrete
+    model, or `u` has another shape.
     """
     require_all_positive(dt=dt)
     if hold not in _HOLDS:
         raise ValueError(f"hold is {hold!r}, but it must be one of {_HOLDS}.")
-    columns = None if isinstance(model, TransferFunction) else model.G.shape[1]
+    columns = model.G.shape[1] if isinstance(model, StateSpace) else None
     shape = "(samples,)" if columns is None else f"(samples, {columns})"
     u = jnp.asarray(u)
     if u.ndim != (1 if columns is None else 2) or u.shape[1:] not in ((), (columns,)):
         raise ValueError(f"u has the shape {u.shape}, but this model takes {shape}: reshape it.")
+    if isinstance(model, DiscreteTransferFunction):
+        if is_concrete(dt):
+            require_sampled(model.dt, samples=float(dt))
+        return simulate_samples(model, u)
     u = u[:, None] if columns is None else u
-    change = jnp.diff(u, axis=0, append=u[-1:]) if hold == "first" else jnp.zeros_like(u)
-    segments = jnp.stack([u.T, change.T], axis=2)
+    segments = _segments(u, hold)
     direct = None if direct_samples is None else jnp.asarray(direct_samples)
     outputs = _simulate(_plant(model), segments, dt, direct)
     return outputs[:, 0] if columns is None else outputs
 
 
 def free_responses(
-    model: TransferFunction | StateSpace, samples: int, dt: Number
+    model: TransferFunction | StateSpace | DiscreteTransferFunction, samples: int, dt: Number
 ) -> tuple[Float[Array, "samples *outputs states"], Float[Array, "samples *outputs states"]]:
     """The outputs due to each unit initial state, and due to each unit constant bias.
 
@@ -213,15 +209,19 @@ def free_responses(
 
     **Arguments:**
 
-    - `model`: a `TransferFunction`, or a `StateSpace`.
+    - `model`: a `TransferFunction`, a `StateSpace`, or a `DiscreteTransferFunction`, whose biases
+        add to the state at each sample.
     - `samples`: how many, `dt` seconds apart.
 
-    **Returns:** Two arrays, (samples, outputs, states) of a `StateSpace`, (samples, states) of a
-    `TransferFunction`. The states of the latter are those of `realise`, so that only the span of
-    the columns has a meaning.
+    **Returns:** Two arrays, (samples, outputs, states) of a `StateSpace`, (samples, states) of the
+    others. The states of these are those of `realise`, so that only the span of the columns has a
+    meaning.
     """
-    start, bias = _free_outputs(_plant(model), samples, dt)
-    if isinstance(model, TransferFunction):
+    if isinstance(model, DiscreteTransferFunction):
+        start, bias = free_samples(model, samples)
+    else:
+        start, bias = _free_outputs(_plant(model), samples, dt)
+    if not isinstance(model, StateSpace):
         return start[:, 0], bias[:, 0]
     return start, bias
 
@@ -236,12 +236,15 @@ class SampledRational(NamedTuple):
     rows: Float[Array, "1 both"]  # from these to the output
 
 
-def sample_rational(model: TransferFunction, dt: Number, hold: str) -> SampledRational:
+def sample_rational(
+    model: TransferFunction | DiscreteTransferFunction, dt: Number, hold: str
+) -> SampledRational:
     """The difference equation that `simulate_linear` solves, and what `free_responses` shows.
 
     **Arguments:**
 
-    - `model`: with a numerator of no higher degree than its denominator.
+    - `model`: with a numerator of no higher degree than its denominator. A discrete one is its
+        difference equation, whatever the hold.
     - `dt`: the sample interval in s.
     - `hold`: as in `simulate_linear`.
 
@@ -251,6 +254,10 @@ def sample_rational(model: TransferFunction, dt: Number, hold: str) -> SampledRa
     Source: Faddeev and LeVerrier's recursion for C adj(qI - A); Astrom & Wittenmark,
     Computer-Controlled Systems, sec. 2.3.
     """
+    if isinstance(model, DiscreteTransferFunction):
+        above, below = (c / model.denominator[0] for c in (model.numerator, model.denominator))
+        above = jnp.pad(above, (below.size - above.size, 1))
+        return SampledRational(above, below[1:], jnp.asarray(model.delay), *step_with_bias(model))
     plant = _plant(model)
     states, one = len(plant.A), jnp.ones((), plant.A.dtype)
     shift, late = split_delay(plant.input_delay, dt)
@@ -300,6 +307,116 @@ def _plant(model: TransferFunction | StateSpace) -> _Plant:
     return _Plant(A, B, C, passing, model.H1, late, model.output_delay)
 
 
+class SampledStates(NamedTuple):
+    """x[k+1] = step x[k] + pushed[k], y[k] = rows x[k] + direct[k], on the host.
+
+    The states are those of the model, a constant bias on the derivative of each, and what output
+    delays remember of them.
+    """
+
+    step: Float[np.ndarray, "all all"]
+    rows: Float[np.ndarray, "outputs all"]
+    pushed: Float[np.ndarray, "samples all"]
+    direct: Float[np.ndarray, "samples outputs"]
+
+
+def sample_states(
+    model: TransferFunction | StateSpace | DiscreteTransferFunction,
+    u: Float[ArrayLike, "samples inputs"], dt: Number, *, hold: str = "zero",
+) -> SampledStates:  # fmt: skip
+    """The difference equation of the states that `simulate_linear` solves, for observers.
+
+    **Arguments:**
+
+    - `model`: a `StateSpace`, or a `TransferFunction` or `DiscreteTransferFunction`, whose states
+        are those of `realise`.
+    - `u`, `dt`, `hold`: as in `simulate_linear`, with one column for each input.
+
+    **Returns:** a `SampledStates`.
+
+    Source: Astrom & Wittenmark, Computer-Controlled Systems, sec. 2.3 (systems with time delay).
+    """
+    if isinstance(model, DiscreteTransferFunction):
+        late = shift_samples(jnp.asarray(u), jnp.asarray(model.delay))
+        (_, B, _, D), (step, rows) = realise(model), step_with_bias(model)
+        pushed = dot(late, jnp.pad(B.T, ((0, 0), (0, len(B)))))
+        return SampledStates(*map(np.asarray, (step, rows, pushed, dot(late, D.T))))
+    plant = _plant(model)
+    passing = jnp.zeros_like(plant.C) if plant.bias is None else plant.bias
+    plant = plant._replace(
+        A=_with_bias(plant.A),
+        B=jnp.pad(plant.B, ((0, len(plant.A)), (0, 0))),
+        C=jnp.concatenate([plant.C, passing], axis=1),
+    )
+    step, rows, pushed, late_pushed, direct = map(
+        np.asarray, _sampled(plant, _segments(jnp.asarray(u), hold), jnp.asarray(dt))
+    )
+    if plant.output_delay is None:
+        return SampledStates(step, rows, pushed, direct)
+    # An output that is late is the last of a row of states, each of them a sample behind the other.
+    first, places = len(step), []
+    behind = np.asarray(split_delay(plant.output_delay, dt)[0]) + 1
+    total = first + int(behind.sum())
+    A, C = np.zeros((total, total)), np.zeros((len(rows), total))
+    A[:first, :first] = step
+    for output, count in enumerate(behind):
+        at = first + int(behind[:output].sum())
+        A[at, :first] = rows[output]
+        A[at + 1 : at + count, at : at + count - 1] = np.eye(count - 1)
+        C[output, at + count - 1] = 1.0
+        places.append(at)
+    driven = np.zeros((len(pushed), total))
+    driven[:, :first], driven[:, places] = pushed, late_pushed
+    return SampledStates(A, C, driven, direct)
+
+
+@ft.partial(Jit, options=brief_options)
+def _sampled(
+    plant: _Plant, segments: Float[Array, "inputs samples 2"], dt: Float[Array, ""]
+) -> tuple[Array, Array, Array, Array, Array]:
+    """Of state and output: what goes over to the next sample, and what the inputs add to it."""
+    late = split_delay(plant.input_delay, dt)[1]
+    acting = _acting(plant, segments, dt)
+    step, drive = _propagation(plant.A, plant.B, late, jnp.ones((), late.dtype), dt)
+    rows, shown = plant.C, jnp.zeros((len(acting), len(plant.C)), acting.dtype)
+    if plant.output_delay is not None:
+        rows, ways = jax.vmap(lambda *one: _late_row(plant, late, dt, *one))(
+            plant.C, plant.output_delay
+        )
+        shown = dot(acting, ways.T)
+    direct = _passed(plant, segments, dt, None)
+    return step, rows, dot(acting, drive), shown, jnp.zeros_like(shown) + direct
+
+
+def _segments(u: Float[Array, "samples inputs"], hold: str) -> Float[Array, "inputs samples 2"]:
+    """Value and change of each input from each sample to the next."""
+    change = jnp.diff(u, axis=0, append=u[-1:]) if hold == "first" else jnp.zeros_like(u)
+    return jnp.stack([u.T, change.T], axis=2)
+
+
+def _acting(
+    plant: _Plant, segments: Float[Array, "inputs samples 2"], dt: Number
+) -> Float[Array, "samples segments"]:
+    """What acts on the states in each sample: the old and the new segment of each input."""
+    shift = split_delay(plant.input_delay, dt)[0]
+    parts = [jax.vmap(shift_samples)(segments, shift + n) for n in (1, 0)]
+    acting = jnp.swapaxes(jnp.concatenate(parts, axis=2), 0, 1)
+    return acting.reshape(segments.shape[1], 4 * len(segments))
+
+
+def _late_row(
+    plant: _Plant,
+    late: Float[Array, " inputs"],
+    dt: Number,
+    row: Float[Array, " states"],
+    delay: Float[Array, ""],
+) -> tuple[Float[Array, " states"], Float[Array, " segments"]]:
+    """Of an output that shows the state somewhere within an earlier sample."""
+    wait = split_delay(delay, dt)[1]
+    step, drive = _propagation(plant.A, plant.B, late, 1 - wait, dt)
+    return dot(row, step), dot(drive, row)
+
+
 @ft.partial(Jit, options=brief_options)
 def _simulate(
     plant: _Plant,
@@ -307,48 +424,42 @@ def _simulate(
     dt: Number,
     direct_samples: Float[Array, "outputs inputs"] | None,
 ) -> Float[Array, "samples outputs"]:
-    shift, late = split_delay(plant.input_delay, dt)
-    parts = [jax.vmap(_shift_samples)(segments, shift + n) for n in (1, 0)]
-    acting = jnp.swapaxes(jnp.concatenate(parts, axis=2), 0, 1)
-    acting = acting.reshape(segments.shape[1], 4 * len(segments))
+    late = split_delay(plant.input_delay, dt)[1]
+    acting = _acting(plant, segments, dt)
     step, drive = _propagation(plant.A, plant.B, late, jnp.ones((), late.dtype), dt)
-    # x[k] of x[k+1] = step x[k] + pushed[k], from x[0] = 0, by chunks.
-    pushed = dot(acting, drive)
-    samples, count = pushed.shape
-    length = _chunk(samples)
-    chunks = -(-samples // length)
-    padded = jnp.pad(pushed, ((0, chunks * length - samples), (0, 0)))
-    by_place = jnp.swapaxes(padded.reshape(chunks, length, count), 0, 1)
-    advance = lambda x, w: (dot(x, step.T) + w, x)
-    ends, within = jax.lax.scan(advance, jnp.zeros((chunks, count), pushed.dtype), by_place)
-    steps, over = _powers(step, length)
-    starts = jax.lax.scan(lambda x, w: (dot(over, x) + w, x), jnp.zeros_like(ends[0]), ends)[1]
-    carried = jnp.einsum("lij,cj->lci", steps, starts, precision="highest")
-    states = jnp.swapaxes(within + carried, 0, 1).reshape(chunks * length, count)[:samples]
+    states = run_states(step, dot(acting, drive))
 
     def late_output(row, delay):
-        # An output that is late shows the state somewhere within an earlier sample.
-        shift, wait = split_delay(delay, dt)
-        step, drive = _propagation(plant.A, plant.B, late, 1 - wait, dt)
-        within = dot(states, dot(row, step)) + dot(acting, dot(drive, row))
-        return _shift_samples(within[:, None], shift + 1)[:, 0]
+        over, way = _late_row(plant, late, dt, row, delay)
+        within = dot(states, over) + dot(acting, way)
+        return shift_samples(within[:, None], split_delay(delay, dt)[0] + 1)[:, 0]
 
     if plant.output_delay is None:
         outputs = dot(states, plant.C.T)
     else:
         outputs = jax.vmap(late_output, out_axes=1)(plant.C, plant.output_delay)
+    return outputs if plant.D is None else outputs + _passed(plant, segments, dt, direct_samples)
+
+
+def _passed(
+    plant: _Plant,
+    segments: Float[Array, "inputs samples 2"],
+    dt: Number,
+    direct_samples: Float[Array, "outputs inputs"] | None,
+) -> Float[Array, "samples outputs"] | Float[Array, ""]:
+    """What the inputs pass directly to the outputs."""
     if plant.D is None:
-        return outputs
+        return jnp.zeros((), segments.dtype)
     if direct_samples is not None:
-        shifted = jax.vmap(_shift_samples, in_axes=(0, 0))
+        shifted = jax.vmap(shift_samples, in_axes=(0, 0))
         by_both = jax.vmap(shifted, in_axes=(None, 0))(segments, direct_samples.astype(int))
-        return outputs + jnp.einsum("oi,oik->ko", plant.D, by_both[..., 0], precision="highest")
+        return jnp.einsum("oi,oik->ko", plant.D, by_both[..., 0], precision="highest")
     wait = plant.output_delay
     wait = jnp.zeros(len(plant.D), plant.D.dtype) if wait is None else wait
     one = lambda wait, late, segments: _delay_input(segments, wait + late, dt)
     by_input = jax.vmap(one, in_axes=(None, 0, 0))
     by_both = jax.vmap(by_input, in_axes=(0, None, None))(wait, plant.input_delay, segments)
-    return outputs + jnp.einsum("oi,oik->ko", plant.D, by_both, precision="highest")
+    return jnp.einsum("oi,oik->ko", plant.D, by_both, precision="highest")
 
 
 @ft.partial(Jit, options=brief_options)
@@ -361,12 +472,7 @@ def _free_outputs(
     if plant.output_delay is not None:
         back = jax.vmap(lambda delay: matrix_exponential(-delay * block))(plant.output_delay)
         rows = jnp.einsum("oi,oij->oj", rows, back, precision="highest")
-    length = _chunk(samples)  # rows A^k for each sample k, from powers of powers
-    steps, over = _powers(matrix_exponential(block * dt), length)
-    chunks = _powers(over, -(-samples // length))[0]
-    starts = jnp.einsum("oi,cij->coj", rows, chunks, precision="highest")
-    motion = jnp.einsum("coi,lij->cloj", starts, steps, precision="highest")
-    motion = motion.reshape(len(chunks) * length, *rows.shape)[:samples]
+    motion = free_motion(matrix_exponential(block * dt), rows, samples)
     return motion[:, :, :states], motion[:, :, states:]
 
 

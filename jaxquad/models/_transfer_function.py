@@ -1,9 +1,8 @@
 """What a model needs to be fitted, plotted and compared; models of one input and one output."""
 
 import dataclasses
-import re
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from collections.abc import Sequence
+from typing import Any, Protocol, runtime_checkable, TYPE_CHECKING
 
 import equinox as eqx
 import jax
@@ -21,6 +20,11 @@ from jaxquad._core import (
     require_positive,
 )
 
+from ._declared import OPTIONAL, Scale, unit
+
+
+if TYPE_CHECKING:
+    from ._discrete import DiscreteTransferFunction
 
 Frequencies = ArrayLike | Sequence[float | int]  # rad/s
 
@@ -96,24 +100,6 @@ def as_floats(omega: Frequencies) -> Float[Array, "..."]:
     return omega if eqx.is_inexact_array(omega) else omega.astype(float)
 
 
-class Scale(NamedTuple):
-    """The unit of a coefficient: (output unit / input unit) / s^power, or 1 / s^power alone."""
-
-    power: int
-    of_ratio: bool = True
-
-
-Unit = str | Callable[[PyTree, int], Scale]  # by the model, and by the index within an array
-
-
-def unit(declared: Unit) -> dict[str, Unit]:
-    """The metadata of a field whose numbers have this unit."""
-    return {"unit": declared}
-
-
-OPTIONAL = {"optional": True}  # metadata of a field that is no term of the model while it is 0
-
-
 class Convertible(eqx.Module):
     """A linear model that python-control and scipy.signal can take, as all of `jq.models` can.
 
@@ -142,69 +128,26 @@ class Convertible(eqx.Module):
 
         return convert(self, "scipy.signal", pade)
 
+    def to_discrete(self, dt: float, *, hold: str = "zero") -> "DiscreteTransferFunction":
+        """The model of its samples, exact for any delay; a part of a sample adds a pole at z = 0.
 
-_NAME = re.compile(r"([A-Za-z_][\w.]*)(?:\[(\d+)\])?.*")
-_PER_SECOND = re.compile(r"(.*?)(?:/s(?:\^(\d+))?)?")
+        On the host, not under jit. Source: Astrom & Wittenmark, Computer-Controlled Systems, 2.3.
 
+        **Arguments:** `dt` in s; `hold`: the input stays ("zero") or is straight ("first").
 
-def parameter_units(
-    model: PyTree, names: Sequence[str], *, output: str = "output", input: str = "input"
-) -> tuple[str, ...]:
-    """The units of numbers of a model, as its fields declare them.
+        **Raises:** `ValueError`: another hold, dt is not above 0, or the model is a state space.
+        """
+        from ._discrete import discretise
 
-    **Arguments:**
-
-    - `model`: for instance `Fit.model`.
-    - `names`: of its numbers, as `Fit.names`: `gain`, `numerator[0]`, `plant.lag`.
-    - `output`, `input`: the units of the channels, or their names where those are not known.
-
-    **Returns:** a text for each name, such as `rad/s^2 per N m`; empty where the model declares
-    none.
-    """
-    units = []
-    for name in names:
-        owner, metadata = _declared(model, name)
-        kind = metadata.get("unit", "")
-        if not isinstance(kind, str):
-            match = _NAME.fullmatch(name)
-            power, of_ratio = kind(owner, int(match[2] or 0) if match else 0)
-            if of_ratio:
-                kind = f"{_over_seconds(output, power)} per {input}"
-            else:
-                kind = _over_seconds("1", power) if power else ""
-        units.append(kind)
-    return tuple(units)
-
-
-def is_optional(model: PyTree, name: str) -> bool:
-    """Whether a number of a model is no term of it while it is 0, as its field declares."""
-    return bool(_declared(model, name)[1].get("optional"))
-
-
-def _declared(model: PyTree, name: str) -> tuple[PyTree, Mapping]:
-    """The part of a model that has a number, and the metadata of its field there."""
-    match = _NAME.fullmatch(name)
-    *owners, leaf = match[1].split(".") if match else ("",)
-    for owner in owners:
-        model = vars(model).get(owner) if dataclasses.is_dataclass(model) else None
-    fields = dataclasses.fields(model) if dataclasses.is_dataclass(model) else ()
-    return model, {field.name: field.metadata for field in fields}.get(leaf, {})
-
-
-def _over_seconds(unit: str, power: int) -> str:
-    """`rad/s` over s is `rad/s^2`."""
-    match = _PER_SECOND.fullmatch(unit)
-    if match and unit != match[1]:
-        unit, power = match[1], power + int(match[2] or 1)
-    return unit if power == 0 else f"{unit}/s" if power == 1 else f"{unit}/s^{power}"
+        return discretise(self, dt, hold)
 
 
 def require_continuous(dt: float | int | bool | None) -> None:
     """Raise ValueError for a sampled system."""
     if dt:
         raise ValueError(
-            f"The system is sampled (dt = {dt}), and models here are continuous: convert the one "
-            "that it was sampled from, or fit one to its response with jq.fit_transfer_function."
+            f"The system is sampled (dt = {dt}), and this model is continuous: convert the one "
+            "that it was sampled from. jq.models.from_control takes a sampled ratio of one pair."
         )
 
 
@@ -225,11 +168,7 @@ class HasCoefficients(Protocol):
 def coefficients_of(
     system: HasCoefficients,
 ) -> tuple[list[list[np.ndarray]], list[list[np.ndarray]]]:
-    """Numerators and denominators, outputs per inputs, without leading zeros.
-
-    Raises ValueError for a sampled system.
-    """
-    require_continuous(system.dt)
+    """Numerators and denominators, outputs per inputs, without leading zeros."""
     trim = lambda x: np.trim_zeros(np.atleast_1d(np.asarray(x, float)), "f")
     polynomials = []
     for rows in (system.num, system.den):
@@ -294,6 +233,7 @@ class TransferFunction(Convertible):
                     f"TransferFunction has a {type(numerator).__name__} and a denominator: leave "
                     "one out."
                 )
+            require_continuous(numerator.dt)
             above, below = coefficients_of(numerator)
             if len(above) * len(above[0]) != 1:
                 raise ValueError(
