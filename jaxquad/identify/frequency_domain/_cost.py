@@ -291,8 +291,8 @@ def points_of(frf: FrequencyResponse, used: Mask) -> Points:
 
 _DOUBT = 0.3  # of the variance of a point's share in the noise of all points
 
-Square = Complex[np.ndarray, "outputs inputs frequencies frequencies"]
-Across = Complex[np.ndarray, "frequencies pairs pairs"]
+Square = Complex[np.ndarray, "*members outputs inputs frequencies frequencies"]
+Across = Complex[np.ndarray, "*members frequencies pairs pairs"]
 
 
 class Mixing(NamedTuple):
@@ -360,49 +360,49 @@ def unmixed(shape: tuple[int, ...]) -> Mixing:
     return Mixing(*along, *across, idle=np.array(True))
 
 
-Columns = Float[np.ndarray, "frequencies outputs inputs 2 *columns"]
+Columns = Float[np.ndarray, "*members frequencies outputs inputs 2 columns"]
 
 
 def mix(mixing: Mixing | None, weighted: Columns, *, twice: bool = False) -> Columns:
     """Weighted misfits, or their slopes, taken together; `twice`: by the adjoints, too."""
     if mixing is None:
         return weighted
-    joined = np.moveaxis(weighted[:, :, :, 0] + 1j * weighted[:, :, :, 1], 0, 2)
-    flat = joined.reshape(*joined.shape[:3], -1)
-    outputs, inputs, count, columns = flat.shape
+    joined = np.moveaxis(weighted[..., 0, :] + 1j * weighted[..., 1, :], -4, -2)
+    shape = joined.shape
 
     def apply_across(across: Across, x: np.ndarray) -> np.ndarray:
-        pairs = np.moveaxis(x.reshape(outputs * inputs, count, columns), 0, 1)
-        return np.moveaxis(across @ pairs, 1, 0).reshape(x.shape)
+        pairs = np.swapaxes(x.reshape(*shape[:-4], -1, *shape[-2:]), -3, -2)
+        return np.swapaxes(across @ pairs, -3, -2).reshape(shape)
 
-    flat = mixing.factor @ flat
+    flat = mixing.factor @ joined
     if mixing.across is not None:
         flat = apply_across(mixing.across, flat)
     if twice and mixing.across is not None:
-        flat = apply_across(np.conj(np.swapaxes(mixing.across, 1, 2)), flat)
+        flat = apply_across(np.conj(np.swapaxes(mixing.across, -1, -2)), flat)
     if twice:
-        flat = np.conj(np.swapaxes(mixing.factor, 2, 3)) @ flat
-    turned = np.moveaxis(flat.reshape(joined.shape), 2, 0)
-    return np.stack([np.real(turned), np.imag(turned)], axis=3)
+        flat = np.conj(np.swapaxes(mixing.factor, -1, -2)) @ flat
+    turned = np.moveaxis(flat, -2, -4)
+    return np.stack([np.real(turned), np.imag(turned)], axis=-2)
 
 
 def expected_cost(
-    mixing: Mixing | None, sizes: Float[np.ndarray, "frequencies outputs inputs 2"]
-) -> Float[np.ndarray, "outputs inputs"]:
+    mixing: Mixing | None, sizes: Float[np.ndarray, "*members frequencies outputs inputs 2"]
+) -> Float[np.ndarray, "*members outputs inputs"]:
     """What noise alone leaves of each pair's cost; `sizes` are weights times random errors.
     Whitened along frequency, pairs count as correlated at each frequency as before."""
     if mixing is None:
-        return np.sum(sizes**2, axis=(0, 3))
-    size = np.moveaxis(sizes[..., 0], 0, -1)
+        return np.sum(sizes**2, axis=(-4, -1))
+    size = np.moveaxis(sizes[..., 0], -3, -1)
     noise = size[..., :, None] * mixing.correlation * size[..., None, :]
     shaped = mixing.factor @ noise
+    power = np.real(np.einsum("...fg,...fg->...f", shaped, np.conj(mixing.factor)))
     if mixing.across is None or mixing.between is None:
-        return 2 * np.real(np.einsum("oifg,oifg->oi", shaped, np.conj(mixing.factor)))
-    power = np.real(np.einsum("oifg,oifg->foi", shaped, np.conj(mixing.factor)))
-    deviation = np.sqrt(np.maximum(power, 0.0)).reshape(len(power), -1)
-    noise = deviation[:, :, None] * mixing.between * deviation[:, None, :]
-    left = np.sum(np.real(mixing.across @ noise * np.conj(mixing.across)), axis=(0, 2))
-    return 2 * left.reshape(power.shape[1:])
+        return 2 * np.sum(power, axis=-1)
+    power = np.moveaxis(power, -1, -3)
+    deviation = np.sqrt(np.maximum(power, 0.0)).reshape(*power.shape[:-2], -1)
+    noise = deviation[..., :, None] * mixing.between * deviation[..., None, :]
+    left = np.sum(np.real(mixing.across @ noise * np.conj(mixing.across)), axis=(-3, -1))
+    return 2 * left.reshape(*left.shape[:-1], *power.shape[-2:])
 
 
 def mix_parts(

@@ -18,11 +18,12 @@ import numpy as np
 from jaxtyping import Array, Float, PyTree
 
 from jaxquad._compile import hasty_options
-from jaxquad._core import is_traced
+from jaxquad._core import invert_definite, is_traced
 from jaxquad.models import with_arrays
 from jaxquad.spectra import FrequencyResponse
 
-from ..uncertainty._error_budget import find_discrepancy, PriorRows, ResponseTerm
+from ..uncertainty._discrepancy import find_discrepancy
+from ..uncertainty._response_term import PriorRows, ResponseTerm
 from ..uncertainty._verdict import NO_MINIMUM
 from ._cost import Cost, mixing_of, Points
 from ._parameters import Condition, Numbers, require_conditions
@@ -242,7 +243,8 @@ def _unexplained(step: _Step, points: Sequence[Points], reached: Sensitivity) ->
         for one, misfit, slopes in zip(points, reached.misfits, reached.slopes, strict=True)
     ]
     prior = PriorRows(reached.prior_misfits, reached.prior_slopes)
-    mixture = find_discrepancy(terms, points, prior, np.flatnonzero(step.moving).tolist())[0]
+    shared, moving = [one.shared for one in points], np.flatnonzero(step.moving).tolist()
+    mixture = find_discrepancy(terms, shared, prior, moving)[0]
     return jnp.sqrt(jnp.sum(mixture.powers))
 
 
@@ -261,7 +263,7 @@ def _minimum_jvp(frame, primals, tangents):
     along = lambda arrays: _gradient(frame, z, arrays)
     pull = jax.jvp(along, (arrays,), (tangents[2],))[1]
     unit, size = _unit(_curvature(frame, z, arrays), moving)
-    return z, -moving * jnp.linalg.solve(unit, moving * pull / size) / size
+    return z, -moving * (invert_definite(unit)[0] @ (moving * pull / size)) / size
 
 
 def _unit(curvature: Matrix, moving: Float[Numbers, " parameters"]) -> tuple[Matrix, Vector]:

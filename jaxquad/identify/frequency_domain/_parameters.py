@@ -18,7 +18,7 @@ from jaxquad._core import (
     require_float64,
     require_positive,
 )
-from jaxquad.models import is_optional, StateSpace
+from jaxquad.models import declares, StateSpace
 
 
 _MOVED = 1.01  # factor on the free parameters at which ties are looked at
@@ -225,6 +225,8 @@ def select_parameters(
         if not np.isfinite(value):
             raise ValueError(f"parameter {name} starts at {value}: give a finite starting value")
         scale = float(np.sign(value))
+        if isinstance(item, str) and declares(model, place.path, "signed"):
+            item = Real(name)
         if isinstance(item, Real):
             scale = item.scale or abs(value)
             if not scale > 0:
@@ -277,7 +279,7 @@ def _expand(
     """All free parameters, with the entries of arrays in the place of these."""
     if free is None:
         values = _numbers(model, places)
-        absent = lambda p: values[p.name] == 0 and is_optional(model, p.path)
+        absent = lambda p: values[p.name] == 0 and declares(model, p.path, "optional")
         return [p.name for p in places if p.name not in bound and not absent(p)]
     if callable(free):
         flags = jax.tree.map(lambda _: False, eqx.filter(model, eqx.is_inexact_array))

@@ -24,7 +24,7 @@ from jaxquad.spectra import FrequencyResponse
 
 from ._cost import mix_parts, Mixing, unmixed
 from ._parameters import Condition, find_place, Numbers, Parameters, require_conditions
-from ._sampled import Aliases, evaluate_sampled, hold_of, plan_aliases
+from ._sampled import Aliases, evaluate_sampled, hold_before, plan_aliases
 
 
 _FEW = 5  # frequencies of the trial of a model
@@ -154,7 +154,7 @@ def make_problem(
         mixings=(None,) * len(measured),
         prior=np.asarray(numbers, dtype=float).reshape(-1, 2),
         aliases=tuple(
-            plan_aliases(change(on_host(model)), frf) if hold_of(frf) else None
+            plan_aliases(change(on_host(model)), frf) if hold_before(model, frf) else None
             for change, frf in pairs
         ),
         silent=tuple(_silent_pairs(model, parameters, *pair) for pair in pairs),
@@ -164,6 +164,8 @@ def make_problem(
 def on_device(model: PyTree) -> PyTree:
     """The model with JAX's arrays in the place of NumPy's."""
     hosted, rest = eqx.partition(model, lambda leaf: isinstance(leaf, np.ndarray))
+    if not jax.tree.leaves(hosted):
+        return model
     return eqx.combine(jax.device_put(hosted), rest)
 
 

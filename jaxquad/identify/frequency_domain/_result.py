@@ -1,7 +1,7 @@
 """An identified model with its doubts: values, errors, covariance, verdict."""
 
 import functools as ft
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import equinox as eqx
@@ -27,7 +27,8 @@ from ..uncertainty._derived import (
     tied_parameters,
     with_reach,
 )
-from ..uncertainty._error_budget import Discrepancy, SHARES
+from ..uncertainty._discrepancy import Discrepancy
+from ..uncertainty._log_density import Evidence, LogDensity, PriorDensity
 from ..uncertainty._verdict import (
     Combination,
     pooled_freedom,
@@ -37,19 +38,10 @@ from ..uncertainty._verdict import (
     Verdict,
 )
 from ..uncertainty._zero_bounds import Profile
+from ._fit_table import parameter_lines, quality_lines
 from ._parameters import Parameters
 from ._refits import Bands, explain_misfit, Explanation, fit_bands, Origin
 from ._solve import Minimum
-
-
-_SHOWN = 6  # optima of several starts
-_MARK = " *"  # behind the name of a parameter that is not determined
-_NO_PERCENTS = f"{'-':>7} {'-':>9}"
-_BY_NOISE = f"{'by noise alone':>23} {'width':>6}"
-_NOT_DETERMINED = {
-    "no minimum": "not determined, because the fit found no minimum",
-    "no model": "not determined, because no model of this structure holds",
-}
 
 
 @pytree_node
@@ -93,6 +85,7 @@ class Fit:
     noise_models: tuple[tuple[NoiseModel, ...], ...] = ()  # of each record's outputs, by jq.refine
     origin: Origin | None = None  # the responses and options of `jq.fit`
     profiles: tuple[Profile, ...] = ()  # of weak parameters that keep their sign
+    evidence: Evidence | None = None  # what `log_density` evaluates
     parameter_units: tuple[str, ...] = eqx.field(static=True, default=())  # for tables
 
     @property
@@ -153,8 +146,7 @@ class Fit:
         **Raises:** what `jq.verify` raises; UndeterminedError where nothing was fitted.
         """
         self._require_model("a simulation")
-        band = self.used_band if band is None else band
-        return verify(self.model, record, band=band, hold=hold)
+        return verify(self, record, band=band, hold=hold)
 
     def _require_model(self, what: str) -> None:
         if not self.verdict.fitted:
@@ -345,87 +337,52 @@ class Fit:
         scores = jax.random.normal(key, (len(self.names), n))
         return draw_models(self, scores, hold_undetermined=hold_undetermined)
 
+    @property
+    def coordinates(self) -> Float[np.ndarray, " parameters"]:
+        """The fitted values as `log_density` takes them: where samplers start.
+
+        Logarithms of the sizes of parameters that keep their sign, of one at zero that of the
+        change which shows; others relative to their typical size. `fit.parameters.coordinates`
+        converts other values, `fit.parameters.values` converts back, by JAX too.
+        """
+        values = np.where(self.values == 0, self.units, self.values)
+        return np.asarray(self.parameters.coordinates(values))
+
+    def log_density(
+        self,
+        z: Float[ArrayLike, " parameters"],
+        *,
+        prior: Mapping[str, PriorDensity] | None = None,
+        model_error: bool = True,
+    ) -> Float[Array, ""]:
+        """The logarithm of the parameters' posterior density at `z`, up to a constant.
+
+        JAX differentiates, compiles and maps it, so NumPyro and BlackJAX sample it. Near the fit
+        it has the covariance and Student's t of the default intervals, farther out the misfit's
+        own shape, in units of half a chi-squared: docs/identification.md, "Posterior". `priors`
+        of `jq.fit` are in it. `jq.identify.LogDensity(fit)` is the same for many fits at once.
+
+        **Arguments:**
+
+        - `z`: one coordinate for each parameter, as of `fit.coordinates`.
+        - `prior`: `jq.ensembles.Normal(deviation, mean=...)`, `LogNormal`, `Uniform`, `LogUniform`
+            by the parameter's name, in its unit. Others are flat in `z`, that is in the logarithm
+            of what keeps its sign; within six standard errors of zero, where that has no finite
+            integral, flat in the value.
+        - `model_error`: as in `interval`.
+
+        **Raises:** ValueError for another number of coordinates, a distribution without density or
+        of the other sign, and a fit by another cost or of `jq.refine`; KeyError for an unknown
+        name; UndeterminedError where neither record nor prior bounds a parameter; PrecisionError
+        in 32 bits.
+        """
+        return LogDensity(self, prior, model_error=model_error)(z)
+
     def __str__(self) -> str:
         lines = [] if self.identifiable else [str(self.verdict)]
         if self.verdict.fitted:
-            lines += [*_parameter_lines(concrete_values(self, "str(fit)")), *_quality_lines(self)]
+            lines += [*parameter_lines(concrete_values(self, "str(fit)")), *quality_lines(self)]
         return "\n".join(lines + [f"! {remark}" for remark in self.remarks])
-
-
-def counted(number: int, one: str, many: str = "") -> str:
-    """`1 start`, `2 starts`."""
-    return f"{number} {one if number == 1 else many or one + 's'}"
-
-
-def _parameter_lines(fit: Fit) -> list[str]:
-    rows, discrepancy = [], fit.discrepancy
-    for k, name in enumerate(fit.names):
-        percents = _NO_PERCENTS
-        if np.isfinite(fit.insensitivity[k]):
-            percents = f"{fit.cramer_rao[k]:7.2f} {fit.insensitivity[k]:9.2f}"
-        unit = fit.parameter_units[k] if fit.parameter_units else ""
-        width = "" if discrepancy is None else discrepancy.widths[k]
-        numbers = fit.values[k], fit.standard_errors[k], ft.partial(fit.interval, name)
-        rows.append((name, unit, *numbers, width, percents, bool(fit.determined[k])))
-    for tied in fit.tied:
-        numbers = tied.value, tied.standard_error, tied.interval
-        rows.append((tied.name, "", *numbers, "tied", _NO_PERCENTS, tied.determined))
-    labels = [row[0] if row[-1] else f"{row[0]}{_MARK}" for row in rows]
-    width, wide = max(9, *map(len, labels)), max(len(row[1]) for row in rows)
-    pad = lambda text: [f"{text:<{max(4, wide)}}"] if wide else []
-    heads = [f"{'parameter':<{width}}", *pad("unit"), f"{'value':>11}", f"{'std. error':>10}"]
-    heads += [f"{'95 % interval':>23}", *([_BY_NOISE] if discrepancy is not None else [])]
-    heads += [f"{'CR %':>7}", f"{'insens. %':>9}"]
-    lines = [" ".join([*heads, *([] if fit.identifiable else [f"{'stopped at':>11}"])])]
-    between = lambda ends: f"{ends[0]:.5g} .. {ends[1]:.5g}"
-    for label, (_, unit, value, error, interval, source, percents, determined) in zip(
-        labels, rows, strict=True
-    ):
-        shown, ends, stopped = f"{value:.5g}", between(interval()), ""
-        by_noise = f"{between(interval(model_error=False)):>23} {source:>6}"
-        if not determined:
-            shown, ends, stopped = "-", "not determined", shown
-            by_noise = " " * len(_BY_NOISE)
-        cells = [f"{label:<{width}}", *pad(unit), f"{shown:>11}", f"{error:10.2g}"]
-        cells += [f"{ends:>23}", *([by_noise] if discrepancy is not None else [])]
-        lines.append(" ".join([*cells, percents, f"{stopped:>11}"]).rstrip())
-    if fit.tied:
-        ties = (f"{t.name} to {', '.join(t.follows) or 'fixed numbers'}" for t in fit.tied)
-        lines.append(f"tied: {'; '.join(ties)}")
-    if discrepancy is not None:
-        size, degrees = 100 * SHARES[0] * discrepancy.amplitude, np.degrees(discrepancy.amplitude)
-        none = f" (probability of none: {100 * discrepancy.none:.0f} %)"
-        lines.append(
-            f"95 % intervals count model error: {size:.2g} % of magnitude, {degrees:.2g} deg of "
-            f"phase{none if discrepancy.none > 0.05 else ''}"
-        )
-        if "prior" in discrepancy.widths:
-            lines.append(
-                "width prior: the record cannot show this error; it is that of usual models"
-            )
-    if not fit.identifiable:
-        individually = "this record does not determine it individually"
-        why = _NOT_DETERMINED.get(fit.verdict.kind, individually)
-        lines.append(f"* {why}: where the solver stopped is for comparison alone")
-    return lines
-
-
-def _quality_lines(fit: Fit) -> list[str]:
-    """How good the fit is, and the optima at which the starts ended, if there were several."""
-    condition = f"{fit.condition:.3g}" if fit.condition < 1e6 else "singular"
-    lines = [
-        f"cost {fit.cost:.4g} (average {fit.average_cost:.4g}), misfit / random error "
-        f"{np.sqrt(fit.chi_squared):.2f}, {fit.points} points, condition {condition}, "
-        f"Newton decrement {fit.newton_decrement:.1e}, {counted(fit.steps, 'step')}"
-    ]
-    if fit.minima:
-        starts = counted(sum(len(point.starts) for point in fit.minima), "start")
-        lines.append(f"{starts}, {counted(len(fit.minima), 'optimum', 'optima')}:")
-    for point in fit.minima[:_SHOWN]:
-        values = ", ".join(f"{value:.4g}" for value in point.values)
-        lines.append(f"  cost {point.cost:9.4g} from {len(point.starts)}: {point.kind}; {values}")
-    rest = len(fit.minima) - _SHOWN
-    return lines + ([f"  and {rest} more of higher cost"] if rest > 0 else [])
 
 
 def _content(fit: Fit) -> dict[str, object]:

@@ -11,10 +11,22 @@ import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, PyTree
 
 from jaxquad._core import Message, pytree_node
-from jaxquad.models import evaluate_response, feedthrough, imaginary, StateSpace, TransferFunction
+from jaxquad.models import (
+    evaluate_response,
+    feedthrough,
+    imaginary,
+    require_sampled,
+    StateSpace,
+    TransferFunction,
+)
 from jaxquad.spectra import FrequencyResponse
 
-from ..output_error._simulated import HasStateSpace, HasTransferFunction, linear_model
+from ..output_error._simulated import (
+    HasStateSpace,
+    HasTransferFunction,
+    linear_model,
+    sample_interval,
+)
 from ._parameters import namespace_of, Numbers
 
 
@@ -127,7 +139,8 @@ def direct_part(
 ) -> tuple[Float[Array, "outputs inputs"], Float[Array, "outputs inputs"]] | None:
     """The gain and the delay in s of what passes directly, as far as the model tells them."""
     kinds = TransferFunction | StateSpace | HasStateSpace | HasTransferFunction
-    return feedthrough(linear_model(model)) if isinstance(model, kinds) else None
+    plant = linear_model(model) if isinstance(model, kinds) else None
+    return feedthrough(plant) if isinstance(plant, TransferFunction | StateSpace) else None
 
 
 def whole_samples(
@@ -278,12 +291,23 @@ def as_sampled(model: PyTree, frf: FrequencyResponse) -> PyTree:
 
     It is the model itself, or one whose response has the hold of the input and its aliases.
     """
-    return behind_hold(model, hold_of(frf))
+    return behind_hold(model, hold_before(model, frf))
 
 
 def behind_hold(model: PyTree, hold: float, aliases: int = _COUNTS[0]) -> PyTree:
     """The model behind an input that is held for `hold` s; itself for 0."""
     return SampledModel(model, hold, aliases) if hold else model
+
+
+def hold_before(model: PyTree, frf: FrequencyResponse) -> float:
+    """`hold_of` the response; 0 for a discrete model, which has it in it.
+
+    Raises ValueError where such a model is of samples at another rate.
+    """
+    if (dt := sample_interval(model)) is None:
+        return hold_of(frf)
+    require_sampled(dt, samples=frf.dt or None, omega=np.asarray(frf.omega))
+    return 0.0
 
 
 def hold_of(frf: FrequencyResponse) -> float:
@@ -295,9 +319,11 @@ def hold_of(frf: FrequencyResponse) -> float:
 
 
 def remarks_on_hold(
-    frfs: Sequence[FrequencyResponse], used: Sequence[Bool[np.ndarray, "..."]]
+    model: PyTree, frfs: Sequence[FrequencyResponse], used: Sequence[Bool[np.ndarray, "..."]]
 ) -> list[Message]:
     """Remark on inputs of which nobody said how they are held, where it would show."""
+    if sample_interval(model) is not None:
+        return []
     for frf, mine in zip(frfs, used, strict=True):
         if frf.hold is not None or not frf.dt or not np.any(mine):
             continue

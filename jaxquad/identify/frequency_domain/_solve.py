@@ -14,18 +14,18 @@ from jaxquad._compile import evaluate_once, FEW, hasty_options, KeptPrograms
 from jaxquad._core import (
     advance,
     begin,
+    invert_definite,
     Normal,
     normal_equations,
     RUNNING,
     settle,
-    solve_definite,
     STALLED,
     TOLERANCE,
 )
 
 from ._cost import mix
 from ._parameters import namespace_of, Numbers
-from ._problem import misfits, Problem, problem_normal, residuals, weigh_parts
+from ._problem import misfits, on_device, Problem, problem_normal, residuals, weigh_parts
 
 
 _FEW = 2000  # points times parameters, whose slopes take a tenth of a ms
@@ -52,7 +52,8 @@ class Sensitivity(NamedTuple):
         with np.errstate(invalid="ignore", over="ignore"):  # a model that is not finite there
             for weights, mixing, misfit in parts:
                 weights = np.asarray(weights)
-                rows.append(mix(mixing, weights * np.asarray(misfit))[weights > 0])
+                misfit = (weights * np.asarray(misfit))[..., None]
+                rows.append(mix(mixing, misfit)[..., 0][weights > 0])
         return np.concatenate([*rows, np.asarray(self.prior_misfits)])
 
 
@@ -358,15 +359,83 @@ def _solve_by_default(z0: Float[Array, " parameters"], problem: Problem, max_ste
     z = jnp.concatenate([stop.z, parameters.start[z0.size :]])
     values = parameters.values(z)
     model = parameters.replace(problem.model, values[: z0.size])
+    return stop, take_apart(model)[1], values, *_around(z, problem, z0.size)
+
+
+def _around(z: Float[Array, " all"], problem: Problem, count: int) -> tuple[Numbers, ...]:
+    """Slopes of the values, misfits and their slopes, and the costs to either side of a stop, of
+    which the first `count` parameters are free; for problems of a single record."""
     lined_up, slopes = misfits_and_slopes(z, problem)
     # The costs to either side, from misfits and slopes.
-    both = jnp.concatenate([lined_up[None], slopes[: z0.size]])
+    both = jnp.concatenate([lined_up[None], slopes[:count]])
     parts = both.reshape(len(both), 2, *jnp.moveaxis(problem.measured[0], 0, -1).shape)
     weighed = jax.vmap(ft.partial(weigh_parts, problem, 0))(parts[:, 0], parts[:, 1])
     rows = jnp.concatenate([part.reshape(len(both), -1) for part in weighed], axis=1)
-    sides = _sides(stop.z, rows[1:] @ rows[1:].T, rows[0] @ rows[0])
+    sides = _sides(z[:count], rows[1:] @ rows[1:].T, rows[0] @ rows[0])
     costs = jax.vmap(lambda z: jnp.sum(residuals(z, problem) ** 2))(sides)
-    return stop, take_apart(model)[1], values, parameters.slopes(z), lined_up, slopes, costs
+    return problem.parameters.slopes(z), lined_up, slopes, costs
+
+
+def _around_each(z: Float[Array, "stops all"], problems: Problem, count: int) -> tuple:
+    """The values at stops of problems that differ by their numbers, and what is around them."""
+    numbers, rest = eqx.partition(problems, eqx.is_array)
+
+    def one(parts: tuple) -> tuple[Numbers, ...]:
+        z, problem = parts[0], eqx.combine(parts[1], rest)
+        return problem.parameters.values(z), *_around(z, problem, count)
+
+    return jax.lax.map(one, (z, numbers))
+
+
+_STOPS = 16  # of one call
+
+
+class Stops(NamedTuple):
+    """What is around the stops of many problems of one record."""
+
+    values: Float[np.ndarray, "stops all"]
+    slopes: Float[np.ndarray, "stops all"]  # of the values, by z
+    misfits: Float[np.ndarray, "stops frequencies outputs inputs 2"]
+    misfit_slopes: Float[np.ndarray, "stops frequencies outputs inputs 2 all"]
+    aside: Float[np.ndarray, "stops sides"]  # costs to either side
+
+
+def stops_at(problems: Sequence[Problem], z: Float[np.ndarray, "stops parameters"]) -> Stops:
+    """Where each of many problems of one record stopped, which are alike but for their numbers."""
+    alike = problems
+    if any(mixing is not None for problem in problems for mixing in problem.mixings):
+        alike = [problem.mixed() for problem in problems]
+    frames, arrays = zip(*map(take_apart, alike), strict=True)
+    z_all = np.tile(np.asarray(problems[0].parameters.start), (len(z), 1))
+    z_all[:, : z.shape[1]] = z
+    numbers = [z_all, *map(np.stack, zip(*arrays, strict=True))]
+    run, parts = _program(frames[0], "stops", z.shape[1]), []
+    # All calls have one size, so that one program is compiled: the last is filled up.
+    for first in range(0, len(problems), _STOPS):
+        here = np.minimum(np.arange(first, first + _STOPS), len(problems) - 1)
+        parts.append(run([array[here] for array in numbers]))
+    columns = (np.concatenate(column)[: len(problems)] for column in zip(*parts, strict=True))
+    values, slopes, lined_up, by_all, aside = columns
+    shape = (len(problems), -1, 2, *np.moveaxis(np.asarray(problems[0].measured[0]), 0, -1).shape)
+    ordered = [np.moveaxis(x.reshape(shape), (1, 5, 2), (5, 1, 4)) for x in (lined_up, by_all)]
+    return Stops(values, slopes, ordered[0][..., 0], ordered[1], aside)
+
+
+def solutions_at(
+    problems: Sequence[Problem],
+    z: Float[np.ndarray, "problems parameters"],
+    messages: Sequence[str],
+    steps: Sequence[int],
+) -> list[Solution]:
+    """As `solution_at` of each of many problems, of one record and alike but for their numbers."""
+    stops, solutions = stops_at(problems, z), []
+    pairs = zip(problems, stops.values, strict=True)
+    models = on_device([p.parameters.replace(p.model, x[: z.shape[1]]) for p, x in pairs])
+    none = np.zeros(0), np.zeros((0, stops.values.shape[1]))
+    for k, (values, slopes, lined_up, by_all, aside) in enumerate(zip(*stops, strict=True)):
+        numbers = z[k], models[k], values, slopes, messages[k], steps[k]
+        solutions.append(Solution(*numbers, Sensitivity([lined_up], [by_all], *none), aside=aside))
+    return solutions
 
 
 _KEPT = {
@@ -375,6 +444,7 @@ _KEPT = {
     "short": KeptPrograms(_descend, hasty_options),
     "long": KeptPrograms(_descend, dict),
     "at once": KeptPrograms(_solve_by_default, hasty_options),
+    "stops": KeptPrograms(_around_each, hasty_options),
 }
 
 
@@ -409,9 +479,7 @@ def _sides(
     else:
         # A kept program that calls LAPACK crashes in a process that has not traced it. So: the 32nd
         # power of the inverse, in whose columns nothing is left but the weakest direction.
-        identity = jnp.eye(z.size, dtype=z.dtype)
-        ridged = jnp.broadcast_to((unit + _RIDGE * identity)[..., None], (z.size,) * 3)
-        inverse = solve_definite(ridged, identity)[0]
+        inverse = invert_definite(unit + _RIDGE * jnp.eye(z.size, dtype=z.dtype))[0]
         power = inverse / jnp.trace(inverse)
         for _ in range(5):
             power = power @ power

@@ -20,6 +20,7 @@ from jaxquad.spectra import FrequencyResponse, TwoLags
 from ..uncertainty._error_budget import FOLLOWS
 from ._cost import Band, Cost, MaximumLikelihood
 from ._fit import fit_with
+from ._fit_table import counted
 from ._parameters import Free, Parameters, Positive, select_parameters, Tie
 from ._refits import (
     Candidate,
@@ -31,7 +32,7 @@ from ._refits import (
     require_origin,
     require_responses,
 )
-from ._result import counted, Fit
+from ._result import Fit
 
 
 class Step(NamedTuple):
