@@ -1,9 +1,11 @@
-from ._fit_batch import BatchFit as BatchFit, fit_batch as fit_batch
+from ._batch_result import BatchFit as BatchFit
+from ._fit_batch import fit_batch as fit_batch
 from ._gain_over_throttle import (
     gain_over_throttle as gain_over_throttle,
     throttle_levels as throttle_levels,
     ThrottledIntegrator as ThrottledIntegrator,
 )
+from ._guess_discrete import guess_discrete as guess_discrete
 from ._known_filters import (
     behind_filters as behind_filters,
     filter_response as filter_response,
@@ -24,6 +26,11 @@ from ._thrust_curve import (
     PlantsOverThrottle as PlantsOverThrottle,
     ScaledB0 as ScaledB0,
     ThrottleLevels as ThrottleLevels,
+)
+from .frequency_domain._black_box import (
+    BalancedStateSpace as BalancedStateSpace,
+    fit_state_space as fit_state_space,
+    StateSpaceFit as StateSpaceFit,
 )
 from .frequency_domain._cost import (
     coherence_weight as coherence_weight,
@@ -75,12 +82,14 @@ from .frequency_domain._transfer_function import (
     fit_transfer_function as fit_transfer_function,
     guess_transfer_function as guess_transfer_function,
 )
+from .output_error._compare import compare as compare, Comparison as Comparison
 from .output_error._noise import (
     ARMA as ARMA,
     AutoRegressive as AutoRegressive,
     Noise as Noise,
     NoiseModel as NoiseModel,
 )
+from .output_error._predict import Prediction as Prediction, WhiteNoise as WhiteNoise
 from .output_error._problem import (
     KnownController as KnownController,
     SampledFeedback as SampledFeedback,
@@ -93,12 +102,13 @@ from .output_error._simulated import (
 )
 from .output_error._verify import (
     Agreement as Agreement,
-    compare as compare,
-    Comparison as Comparison,
+    AGREES as AGREES,
     CONTRADICTS as CONTRADICTS,
     GOOD_TIC as GOOD_TIC,
+    predict as predict,
     Verification as Verification,
     verify as verify,
+    WEAK as WEAK,
 )
 from .uncertainty._derived import (
     check_drawable as check_drawable,
@@ -113,7 +123,8 @@ from .uncertainty._derived import (
     StepBand as StepBand,
     Tied as Tied,
 )
-from .uncertainty._error_budget import Discrepancy as Discrepancy
+from .uncertainty._discrepancy import Discrepancy as Discrepancy
+from .uncertainty._log_density import LogDensity as LogDensity
 from .uncertainty._misfit import MISFIT as MISFIT
 from .uncertainty._verdict import (
     Bound as Bound,

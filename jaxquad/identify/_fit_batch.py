@@ -18,24 +18,25 @@ from jaxquad._core import (
     begin,
     CONVERGED,
     decrement,
+    default_device,
+    free_memory,
     Message,
     Normal,
     require_x64,
     RUNNING,
     settle,
-    STALLED,
     TOLERANCE,
 )
 from jaxquad.models import evaluate_response, StateSpace, with_arrays
 from jaxquad.spectra import FrequencyResponse
 
+from ._batch_result import BatchFit
 from .frequency_domain._cost import (
     Cost,
     least_coherence,
     MaximumLikelihood,
     Mixing,
     mixing_of,
-    Points,
     points_of,
     Range,
     usable,
@@ -52,11 +53,7 @@ from .frequency_domain._parameters import (
 )
 from .frequency_domain._problem import make_problem, Problem, problem_normal
 from .frequency_domain._refits import check_options
-from .frequency_domain._result import Fit
-from .frequency_domain._sampled import behind_hold, count_aliases, direct_part, hold_of
-from .frequency_domain._solve import solution_at, stopped_early
-from .uncertainty._assess import assess
-from .uncertainty._error_budget import weighting_at
+from .frequency_domain._sampled import behind_hold, count_aliases, direct_part, hold_before
 
 
 class Member(NamedTuple):
@@ -81,7 +78,10 @@ class Batch(NamedTuple):
     @property
     def evaluates_singly(self) -> bool:
         """Whether members are evaluated one by one: a `jq.StateSpace`, whose states are a loop of
-        their own. Other models become one kernel, at a quarter of the cost."""
+        their own. Other models become one kernel, at a quarter of the cost. An accelerator
+        evaluates all side by side."""
+        if default_device().platform != "cpu":
+            return False
         return type(self.model) is StateSpace and not self.parameters.ties and not self.hold
 
 
@@ -200,9 +200,11 @@ def _write(model: PyTree, places: tuple[Place, ...], values: list[Array]) -> PyT
     return eqx.combine(jax.tree.unflatten(structure, leaves), rest)
 
 
-_CHUNK = 32  # fits side by side
+_CHUNK = 32  # fits side by side on a core
 _CHUNK_OF_SINGLES = 8  # fits of which each is evaluated by itself
 _CHUNKS = 8  # of one call
+_MOST = 2**17  # fits side by side on an accelerator
+_SHARE = 0.1  # of its free memory, for what is computed at all frequencies
 
 
 class BatchSolution(NamedTuple):
@@ -269,9 +271,22 @@ def _places(batch: int, chunk: int) -> Int[np.ndarray, "chunks chunk"]:
     return np.minimum(np.arange(batch + -batch % chunk), batch - 1).reshape(-1, chunk)
 
 
+def _chunk_sizes(where: Batch, members: Member) -> tuple[int, int]:
+    """Fits of a chunk, and chunks of a call: what suits the caches of a core, or as many fits as
+    the memory of an accelerator takes, in powers of two, so that few programs are compiled."""
+    device, batch = default_device(), len(members.weights)
+    if device.platform == "cpu":
+        chunk = _CHUNK_OF_SINGLES if where.evaluates_singly else _CHUNK
+        return chunk, _CHUNKS if members.factor is None else 1  # factors are large
+    bytes_of_one = sum(x.nbytes for x in jax.tree.leaves(members)) / batch
+    bytes_of_one += members.weights[0].nbytes * (where.parameters.count + 1)
+    most = max(_SHARE * (free_memory(device) or 0.0) / bytes_of_one, _CHUNK)
+    return 1 << int(np.log2(min(most, _MOST, 2 * batch - 1))), 1
+
+
 def _solve(where: Batch, members: Member, start: np.ndarray, max_steps: int) -> BatchSolution:
     """Fit every member from its start, by Levenberg-Marquardt."""
-    chunks = _CHUNKS if members.factor is None else 1  # factors are large
+    chunk, chunks = _chunk_sizes(where, members)
 
     def solve(places: Int[np.ndarray, "chunks chunk"]) -> BatchSolution:
         # Chunks first and members last; all calls have one size: few programs are compiled.
@@ -285,13 +300,14 @@ def _solve(where: Batch, members: Member, start: np.ndarray, max_steps: int) -> 
         parts = _solve_call(where, mine, z0, np.asarray(len(places)), np.asarray(max_steps))
         return BatchSolution(*(np.asarray(part)[: places.size] for part in parts))
 
-    places = _places(len(start), _CHUNK_OF_SINGLES if where.evaluates_singly else _CHUNK)
+    places = _places(len(start), chunk)
     count = max(-(-len(places) // chunks), min(len(places), available_cores()))
     calls = np.array_split(places, count)
     if len(calls) > 1:
         solve(calls[0][:0])  # of no chunk: compiled here, once for all threads
-    # A program runs on one core.
-    with ThreadPoolExecutor(max_workers=min(len(calls), available_cores())) as pool:
+    # A program runs on one core, or on all of an accelerator.
+    workers = min(len(calls), available_cores()) if default_device().platform == "cpu" else 1
+    with ThreadPoolExecutor(max_workers=workers) as pool:
         solutions = list(pool.map(solve, calls))
     parts = zip(*solutions, strict=True)
     return BatchSolution(*(np.concatenate(part)[: len(start)] for part in parts))
@@ -335,48 +351,6 @@ def _descend(evaluate: Evaluate, z0: Array, max_steps: Array) -> tuple:
     left = decrement(normal)
     converged = (settle(state).status == CONVERGED) & (left <= 1e-6 * normal.cost + 1e-12)
     return state.z, 2 * normal.cost, left, state.steps, converged
-
-
-class BatchFit(eqx.Module):
-    """Fits of one model to many responses; `fit(k)` is the whole result for response k."""
-
-    names: tuple[str, ...] = eqx.field(static=True)
-    values: Float[np.ndarray, "batch parameters"]
-    costs: Float[np.ndarray, " batch"]
-    decrements: Float[np.ndarray, " batch"]  # what one more step would save of half the cost
-    steps: Int[np.ndarray, " batch"]
-    converged: Bool[np.ndarray, " batch"]
-    model: PyTree
-    parameters: Parameters
-    points: tuple[Points, ...]
-    weights: Float[np.ndarray, "batch frequencies outputs inputs 2"]
-    mixed: bool = eqx.field(static=True)  # whether points that share noise count together
-    z: Float[np.ndarray, "batch parameters"]
-
-    def fit(self, k: int) -> Fit:
-        """The fit of response k, with standard errors, verdict and remarks.
-
-        Its standard errors count what the model leaves unexplained. Its values are those of the
-        batch, where that is no floor on the random error as it is in `jq.fit`: it would take each
-        response through a solution of its own.
-        """
-        points, steps = self.points[k], int(self.steps[k])
-        problem = make_problem(self.model, self.parameters, [points.frf])
-        mixing = mixing_of(points, self.weights[k]) if self.mixed else None
-        problem = problem.weighted([self.weights[k]], [mixing])
-        message = "" if self.converged[k] else stopped_early(STALLED, steps)
-        solution = solution_at(problem, self.z[k], message, steps)
-        return assess(problem, weighting_at(problem, [points], solution), solution)
-
-    def __str__(self) -> str:
-        lost = int(np.sum(~self.converged))
-        lines = [f"{len(self.values)} fits; {lost} of them reached no minimum"]
-        good = self.values[self.converged]
-        if len(good):
-            low, middle, high = np.percentile(good, [5, 50, 95], axis=0)
-            for row in zip(self.names, middle, low, high, strict=True):
-                lines.append("{:<16} median {:11.5g}, 5 to 95 %: {:.5g} .. {:.5g}".format(*row))
-        return "\n".join(lines)
 
 
 def fit_batch(
@@ -433,7 +407,7 @@ def fit_batch(
         )
     pairs = zip(used, frfs, strict=True)
     measured = np.stack([np.where(mask, np.asarray(frf.response), 1.0) for mask, frf in pairs])
-    holds = sorted({hold_of(frf) for frf in frfs})
+    holds = sorted({hold_before(model, frf) for frf in frfs})
     if len(holds) > 1:
         raise ValueError(
             f"the inputs of the responses are held for {holds} s: fit those of one hold together"
@@ -492,7 +466,9 @@ def _sizes(where, z) -> Float[Array, "batch frequencies outputs inputs"]:
 
 def _ratios(where: Batch, measured: np.ndarray, solution: BatchSolution) -> np.ndarray:
     """|model / measurement| of every member; 1 where a fit ran away."""
-    parts = [_sizes(where, solution.z[chunk]) for chunk in _places(len(solution.z), 2 * _CHUNK)]
+    side_by_side = min(_MOST, 1 << (len(solution.z) - 1).bit_length())
+    chunk = 2 * _CHUNK if default_device().platform == "cpu" else side_by_side
+    parts = [_sizes(where, solution.z[members]) for members in _places(len(solution.z), chunk)]
     sizes = np.concatenate([np.asarray(part) for part in parts])
     with np.errstate(invalid="ignore"):
         ratios = sizes[: len(measured), : measured.shape[1]] / np.abs(measured)

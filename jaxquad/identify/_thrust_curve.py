@@ -10,7 +10,8 @@ from jaxtyping import ArrayLike, Float
 
 from jaxquad._core import plain_content
 
-from .frequency_domain._result import counted, Fit
+from .frequency_domain._fit_table import counted
+from .frequency_domain._result import Fit
 from .uncertainty._derived import draw_models
 from .uncertainty._verdict import Combination, reach_of_interval, UndeterminedError
 

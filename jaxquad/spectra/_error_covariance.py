@@ -2,7 +2,7 @@
 
 import dataclasses
 import functools as ft
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import equinox as eqx
@@ -149,6 +149,28 @@ class ErrorCovariance:
             part = part.reshape(-1, count)
             total += 0.5 * np.real(part.T @ part.conj())
         return total
+
+    @staticmethod
+    def project_each(
+        errors: "Sequence[ErrorCovariance]",
+        columns: Complex[np.ndarray, "members frequencies outputs inputs columns"],
+    ) -> Float[np.ndarray, "members columns columns"]:
+        """As `project`, of many; all at once where no two frequencies share an atom."""
+        alone = columns.shape[2:4] == (1, 1) and all(
+            one.windows is None and one.sensitivity is None and one.effect.shape[2] == 1
+            and one.noise.shape[2] == 1 and one.first is not None
+            for one in errors
+        )  # fmt: skip
+        rises = lambda: np.diff(np.stack([np.asarray(one.first) for one in errors]), axis=1) > 0
+        if not (alone and np.all(rises())):
+            pairs = zip(errors, columns, strict=True)
+            return np.stack([type(one).project(one, mine) for one, mine in pairs])
+        parts = columns[:, :, 0, 0].conj()
+        if any(one.share is not None for one in errors):
+            parts = parts * np.stack([one._shares[:, 0, 0] for one in errors])
+        for factor in ([one.noise for one in errors], [one.effect for one in errors]):
+            parts = parts * np.asarray(factor)[:, :, 0]
+        return 0.5 * np.real(np.swapaxes(parts, 1, 2) @ parts.conj())
 
     def variance(self) -> Pairs:
         """Mean squared error E|dT|^2 of each response, for independent atoms (no windows)."""

@@ -3,7 +3,8 @@
 import dataclasses
 import itertools
 from collections.abc import Callable, Sequence
-from typing import NamedTuple, Protocol, runtime_checkable
+from pathlib import Path
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -12,8 +13,6 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Complex, Float
 
 from jaxquad._core import (
-    concrete_values,
-    is_traced,
     pytree_node,
     require_float64,
     require_x64,
@@ -44,6 +43,16 @@ from ._estimators import (
     Responses,
     Square,
     Welch,
+)
+from ._table import (
+    as_grid,
+    as_responses,
+    channel_names,
+    FrequencyUnit,
+    HasFrequencyData,
+    on_host,
+    random_errors,
+    read_idfrd,
 )
 
 
@@ -86,19 +95,6 @@ class Distortion(eqx.Module):
             lines.append(f"  {name}: noise {noise:.1f} dB, nonlinear distortion {distortion}")
         return "\n".join(lines)
 
-
-@runtime_checkable
-class HasFrequencyData(Protocol):
-    """A `FrequencyResponseData` of python-control: outputs, inputs, frequencies."""
-
-    @property
-    def omega(self) -> np.ndarray: ...  # rad/s
-
-    @property
-    def frdata(self) -> np.ndarray: ...
-
-
-_LEAST = 1e-6  # random error: a response without any would count infinitely
 
 _METHODS = {
     "direct": "direct estimate (H1, unbiased in open loop; with feedback, name a reference)",
@@ -153,23 +149,32 @@ class FrequencyResponse:
         omega: Float[ArrayLike, " frequencies"] | HasFrequencyData,
         response: Complex[ArrayLike, "frequencies ..."] | None = None,
         *,
+        magnitude_db: Float[ArrayLike, "frequencies ..."] | None = None,
+        phase_deg: Float[ArrayLike, "frequencies ..."] | None = None,
+        frequency_unit: FrequencyUnit = "rad/s",
         coherence: Float[ArrayLike, "..."] | None = None,
+        averages: float | int | None = None,
         random_error: Float[ArrayLike, "..."] | None = None,
-        averages: float | int = 1,
         input_names: Sequence[str] = (),
         output_names: Sequence[str] = (),
+        dt: float = 0.0,
+        hold: float | None = None,
     ) -> "FrequencyResponse":
         """A response that was measured elsewhere, as every fit and margin takes it.
 
         **Arguments:**
 
-        - `omega`: in rad/s, rising; or a `FrequencyResponseData` of python-control alone.
+        - `omega`: frequencies, rising; or a `FrequencyResponseData` of python-control alone, whose
+            names and sample interval are kept.
         - `response`: complex, one number for each frequency, or (frequencies, outputs, inputs).
+        - `magnitude_db`, `phase_deg`: instead, in the same shapes.
+        - `frequency_unit`: of `omega`: "rad/s" or "Hz".
         - `coherence`: of each number (gamma squared). Then the relative random error is
             sqrt((1 - coherence) / (2 averages coherence)).
+        - `averages`: how many independent windows the coherence is from.
         - `random_error`: instead, relative and in rad, one standard error.
-        - `averages`: how many independent windows the coherence is from; 1 gives the largest error.
         - `input_names`, `output_names`: by default `u0`, `y0`, and so on.
+        - `dt`, `hold`: sample interval, and time for which the inputs were held, in s.
 
         **Returns:** a `FrequencyResponse` whose errors at different frequencies are independent.
 
@@ -178,75 +183,19 @@ class FrequencyResponse:
 
         Source: Bendat and Piersol, "Random Data", 4th ed., Table 9.6.
         """
-
-        xp = jnp if is_traced((response, coherence, random_error)) else np
-        seen = lambda x: np.asarray(concrete_values(x, "FrequencyResponse.from_table"))
-
-        def like(name: str, numbers: ArrayLike) -> Array | np.ndarray:
-            """A number, one for each frequency, or one for each pair, as all of the response."""
-            array = xp.asarray(numbers, float)
-            array = array[:, None, None] if array.ndim == 1 else array
-            try:
-                return xp.broadcast_to(array, values.shape).copy()
-            except ValueError:
-                raise ValueError(
-                    f"{name} has the shape {np.shape(numbers)} and the response {values.shape}: "
-                    "give one number, one for each frequency, or one for each number of the "
-                    "response"
-                ) from None
-
-        def names(kind: str, chosen: Sequence[str], letter: str, count: int) -> tuple[str, ...]:
-            names = tuple(chosen) or tuple(f"{letter}{k}" for k in range(count))
-            if len(names) != count:
-                raise ValueError(f"{kind} has {len(names)} names and the response {count} channels")
-            return names
-
         if isinstance(omega, HasFrequencyData):
-            if response is not None:
+            columns = response, magnitude_db, phase_deg
+            if any(x is not None for x in columns) or frequency_unit != "rad/s":
                 raise ValueError("give a FrequencyResponseData alone, or omega and response")
+            input_names = input_names or omega.input_labels
+            output_names = output_names or omega.output_labels
+            if not isinstance(omega.dt, bool):  # True is a sampled system of unknown interval
+                dt = dt or omega.dt or 0.0
             omega, response = np.asarray(omega.omega), np.moveaxis(np.asarray(omega.frdata), -1, 0)
-        elif response is None:
-            raise ValueError("a table needs its response: give omega and as many complex numbers")
-        grid, values = np.asarray(omega, float), xp.asarray(response, complex)
-        values = values[:, None, None] if values.ndim == 1 else values
-        if grid.ndim != 1 or values.ndim != 3 or len(values) != grid.size:
-            raise ValueError(
-                f"omega has the shape {grid.shape} and the response {np.shape(response)}: give one "
-                "row of frequencies, and as many complex numbers or (frequencies, outputs, inputs)"
-            )
-        if not (np.all(np.isfinite(grid)) and np.all(grid > 0) and np.all(np.diff(grid) > 0)):
-            raise ValueError("omega must be finite, above 0 and rising: sort the table, in rad/s")
-        finite = np.isfinite(seen(values)).all(axis=(1, 2))
-        if not np.all(finite):
-            first = grid[int(np.argmin(finite))]
-            raise ValueError(f"the response is not finite at {first:.4g} rad/s: leave that row out")
-        if (coherence is None) == (random_error is None):
-            raise ValueError(
-                "a table needs its errors, one of two: coherence= with averages=, or "
-                "random_error=, the relative standard error of the magnitude (0.02 for 2 %)"
-            )
-        if not averages > 0:
-            raise ValueError(
-                f"averages is {averages}: give how many windows were averaged, 1 or more"
-            )
-        if coherence is not None:
-            coherent = like("coherence", coherence)
-            low, high = seen(coherent).min(), seen(coherent).max()
-            if not 0 < low <= high <= 1:
-                ends = f"{low:.4g} to {high:.4g}"
-                raise ValueError(f"the coherence runs from {ends}: give numbers above 0, up to 1")
-            error = xp.sqrt((1 - coherent) / (2 * averages * coherent))
-        else:
-            assert random_error is not None
-            error = like("random_error", random_error)
-            low = seen(error).min()
-            if not low > 0:
-                raise ValueError(
-                    f"the random error is {low:.4g} at its least: give it above 0, 0.02 for 2 %"
-                )
-            coherent = 1 / (1 + 2 * averages * error**2)
-        error = xp.maximum(error, _LEAST)
-        variance = 2 * (seen(error) * np.abs(seen(values))) ** 2
+        grid = as_grid(omega, frequency_unit)
+        values = as_responses(grid, response, magnitude_db, phase_deg)
+        coherent, error = random_errors(values, coherence, averages, random_error)
+        variance = 2 * (on_host(error) * np.abs(on_host(values))) ** 2
         _, outputs, inputs = values.shape
         return cls(
             omega=jnp.asarray(grid),
@@ -257,9 +206,44 @@ class FrequencyResponse:
             direct_coherence=jnp.asarray(coherent),
             multiple_coherence=jnp.asarray(coherent.max(axis=2)),
             method="direct",
-            input_names=names("input_names", input_names, "u", inputs),
-            output_names=names("output_names", output_names, "y", outputs),
+            input_names=channel_names("input_names", input_names, "u", inputs),
+            output_names=channel_names("output_names", output_names, "y", outputs),
+            dt=dt,
+            hold=hold,
         )
+
+    @classmethod
+    def from_idfrd(
+        cls,
+        path: str | Path,
+        variable: str | None = None,
+        *,
+        coherence: Float[ArrayLike, "..."] | None = None,
+        averages: float | int | None = None,
+        random_error: Float[ArrayLike, "..."] | None = None,
+    ) -> "FrequencyResponse":
+        """The response of a MAT file with the properties of an `idfrd` of MATLAB's toolbox.
+
+        In MATLAB: `s = get(g); save('g.mat', 's', '-v7')`.
+
+        **Arguments:**
+
+        - `path`: the file.
+        - `variable`: the name of the struct, where the file has several.
+        - `coherence`, `averages`, `random_error`: as in `from_table`, for an `idfrd` without
+            `CovarianceData`, as `etfe` makes it; or in their place.
+
+        **Raises:** ValueError as `from_table`, and for delays or units that the response does not
+        contain; `jq.records.ReadError` for a file that holds no such struct.
+        """
+        table = read_idfrd(path, variable)
+        if coherence is None and random_error is None:
+            random_error = table.random_error
+        return cls.from_table(
+            table.omega, table.response, coherence=coherence, averages=averages,
+            random_error=random_error, input_names=table.input_names,
+            output_names=table.output_names, dt=table.dt, hold=table.hold,
+        )  # fmt: skip
 
     @property
     def magnitude_db(self) -> Pairs:

@@ -83,7 +83,7 @@ def test_what_has_no_derivative_says_so():
 
 def test_a_table_takes_what_is_traced():
     def first(y):
-        table = jq.spectra.FrequencyResponse.from_table(OMEGA, y, coherence=0.9)
+        table = jq.spectra.FrequencyResponse.from_table(OMEGA, y, coherence=0.9, averages=1)
         return table.response[0, 0, 0].real
 
     y = response_of(TRUTH).response[:, 0, 0]

@@ -89,6 +89,52 @@ def test_points_that_share_noise_count_together_as_in_one_fit():
 
 
 @pytest.mark.slow
+def test_errors_intervals_and_verdicts_of_all_are_those_of_each():
+    frfs = [response_of(START, seed=seed) for seed in range(3)]
+    coherence = frfs[1].coherence.at[8:].set(0.0)  # slow points alone, which show no delay
+    frfs[1] = dataclasses.replace(frfs[1], coherence=coherence)
+    fit = lambda: jq.identify.fit_batch(START, frfs, free=FREE)
+    batch, singly = fit(), fit()
+    errors, determined, intervals = batch.standard_errors, batch.determined, batch.intervals
+    for k in range(3):
+        one = singly.fit(k)
+        np.testing.assert_allclose(errors[k], one.standard_errors, rtol=1e-9)
+        np.testing.assert_array_equal(determined[k], one.determined)
+        assert str(batch.fit(k).verdict) == str(one.verdict)
+        assert batch.fit(k).remarks == one.remarks
+        ends = np.array([one.interval(name) for name in batch.names])
+        ends[~one.determined] = np.nan
+        np.testing.assert_allclose(intervals[k], ends, rtol=1e-9)
+    assert determined[0].all() and determined[2].all() and not determined[1].all()
+    table = batch.to_dataframe()
+    assert table["delay"][0] == batch.values[0, 3] == pytest.approx(0.02, abs=0.01)
+    assert table["delay low"][0] == intervals[0, 3, 0]
+    assert list(table["verdict"]) == [str(one.verdict.kind) for one in batch.fits]
+    np.testing.assert_array_equal(np.isnan(table["delay"]), ~determined[:, 3])
+
+
+@pytest.mark.slow
+def test_many_plain_fits_have_the_numbers_of_single_ones_beside_those_that_are_not_plain():
+    frfs = [response_of(START, seed=k, correlation=0.5 * (k % 2)) for k in range(12)]
+    omega, notched = np.asarray(frfs[3].omega), frfs[3].response
+    notch = 1 - 0.6 / (1 + 1j * (omega / 6 - 6 / omega) / 0.2)
+    frfs[3] = dataclasses.replace(frfs[3], response=notched * notch[:, None, None])
+    frfs[5] = dataclasses.replace(frfs[5], random_error=8 * frfs[5].random_error)
+    batch = jq.identify.fit_batch(START, frfs, free=FREE)
+    errors, determined, intervals = batch.standard_errors, batch.determined, batch.intervals
+    for k in range(12):
+        one = batch.fit(k)
+        np.testing.assert_allclose(errors[k], one.standard_errors, rtol=1e-12)
+        np.testing.assert_array_equal(determined[k], one.determined)
+        ends = np.array([one.interval(name) for name in batch.names])
+        ends[~one.determined] = np.nan
+        np.testing.assert_allclose(intervals[k], ends, rtol=1e-12)
+    assert any("misfit" in remark for remark in batch.fit(3).remarks)
+    # The notch is in the place of the natural frequency: what it may move is in no plain error.
+    assert np.max(errors[3]) > 2 * np.median(np.max(errors, axis=1))
+
+
+@pytest.mark.slow
 def test_all_ways_to_the_normal_equations_end_at_the_same_minimum():
     frfs = [response_of(START, correlation=c, seed=k) for k, c in enumerate((0.6, 0.0, 0.3))]
     fit = lambda: jq.identify.fit_batch(START, frfs, free=FREE)
@@ -116,6 +162,40 @@ def test_state_spaces_are_fitted_as_single_ones_are():
         one = jq.fit(start, frf, free=free)
         np.testing.assert_allclose(batch.values[k], one.values, rtol=1e-7)
         assert batch.costs[k] == pytest.approx(one.cost, rel=1e-10)
+
+
+class Accelerator:
+    """As a GPU says of itself."""
+
+    platform = "gpu"
+
+    def __init__(self, gigabytes):
+        self.bytes_limit = int(1e9 * gigabytes)
+
+    def memory_stats(self):
+        return {"bytes_limit": self.bytes_limit, "bytes_in_use": 0}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("gigabytes", [80.0, 1e-5])  # all side by side, and by chunks
+def test_all_side_by_side_as_on_an_accelerator_they_are_the_same_fits(monkeypatch, gigabytes):
+    _, responses = measured()
+    F, G = [[-1.0, 0.3], [0.2, -4.0]], [[2.0], [1.5]]
+    states = jq.StateSpace(F=F, G=G, H0=np.eye(2), input_delay=[0.05])
+    shared = [response_of(START, correlation=0.5, seed=k, omega=np.asarray(OMEGA)) for k in (0, 1)]
+
+    def fits():
+        free = ("F[0][0]", "G[0][0]", "input_delay[0]")
+        several = fit_batch(states, [response_of(states, seed=k) for k in range(3)], free=free)
+        return solved(responses), several, fit_batch(START, shared, free=FREE)
+
+    mine = fits()
+    device = Accelerator(gigabytes)
+    monkeypatch.setattr("jaxquad.identify._fit_batch.default_device", lambda: device)
+    for one, other in zip(mine, fits(), strict=True):
+        np.testing.assert_allclose(one.values, other.values, rtol=1e-8)
+        np.testing.assert_allclose(one.costs, other.costs, rtol=1e-10)
+        assert np.array_equal(one.converged, other.converged)
 
 
 @pytest.mark.slow

@@ -303,7 +303,8 @@ def test_a_fit_that_still_moves_by_a_quarter_of_an_error_has_no_numbers(steps):
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(6))
 def test_no_number_has_an_error_of_more_than_half_its_size(seed):
-    frf = response_of(jq.LaggedIntegrator(8.0, 0.02, 0.0), error=0.3, seed=seed)
+    # at .3, the largest error of a point that counts, rounding would say which points do
+    frf = response_of(jq.LaggedIntegrator(8.0, 0.02, 0.0), error=0.29, seed=seed)
     fit = jq.fit(jq.LaggedIntegrator(8.0, 0.03), frf, free=("gain", "lag"), cost=ML)
     bounded = np.isin(fit.names, [bound.name for bound in fit.verdict.bounds])
     sharp = fit.determined & ~bounded

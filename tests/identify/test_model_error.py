@@ -11,7 +11,7 @@ import pytest
 from synthetic import OMEGA, response_of
 
 import jaxquad as jq
-from jaxquad.identify.uncertainty import _error_budget
+from jaxquad.identify.uncertainty import _discrepancy
 
 
 TRUTH = jq.LaggedIntegrator(80.0, 0.06, 0.03)
@@ -138,8 +138,8 @@ def test_kernels_have_the_same_roots_with_and_without_a_matrix(count, monkeypatc
     omega = np.random.default_rng(3).permutation(np.geomspace(0.6, 60.0, count))
     bases = []
     for dense in (count, count - 1):
-        monkeypatch.setattr(_error_budget, "_DENSE", dense)
-        bases.append(_error_budget.kernel_basis.__wrapped__(omega.tobytes()))
+        monkeypatch.setattr(_discrepancy, "_DENSE", dense)
+        bases.append(_discrepancy.kernel_basis.__wrapped__(omega.tobytes()))
     for one, other in zip(*bases, strict=True):
         np.testing.assert_allclose(one @ one.T, other @ other.T, atol=1e-10)
 
@@ -147,7 +147,7 @@ def test_kernels_have_the_same_roots_with_and_without_a_matrix(count, monkeypatc
 def test_many_frequencies_may_hold_one_twice():
     # The inverse of their kernel does not exist.
     omega = np.append(np.geomspace(0.6, 60.0, 299), 60.0)
-    for root in _error_budget.kernel_basis(omega.tobytes()):
+    for root in _discrepancy.kernel_basis(omega.tobytes()):
         np.testing.assert_allclose(root[-2], root[-1], atol=1e-9)
 
 

@@ -36,6 +36,7 @@ from ._noise import (
     WHITE,
 )
 from ._problem import evaluate_misfits, Evaluation, OutputError
+from ._simulated import sample_interval
 
 
 CLOSE = 1e-6  # last step of a descent, relative to 1 + |z|
@@ -277,7 +278,7 @@ def descend_with_noise(
             if all(np.all(np.isfinite(misfit)) for misfit in evaluation.misfits):
                 sizes = sizes_of(problem, evaluation)
                 return problem.reweighted(sizes), z, evaluation.reweighted(sizes), 0
-        first = descend_by_turns(problem, max_steps, start, tolerance=_NEAR)
+        first = descend_by_turns(problem, max_steps, start, tolerance=_near(problem))
         return first.problem, np.asarray(first.z), first.evaluation, first.solution.steps
 
     ends: list[_End] = []
@@ -301,6 +302,11 @@ def descend_with_noise(
     return Descent(
         problem.reweighted(sizes), np.asarray(stop.z), solution, evaluation, tuple(noises)
     )
+
+
+def _near(problem: OutputError) -> float:
+    """The last step of each turn's descent. Coefficients in z are known to many more digits."""
+    return _NEAR if sample_interval(problem.base.model) is None else CLOSE
 
 
 def _alternate(
@@ -329,7 +335,7 @@ def _alternate(
             for term, row in zip(plain.terms, models, strict=True)
         ]
         problem = dataclasses.replace(plain, terms=tuple(terms))
-        stop, more, message = descend(problem, z, max_steps, _NEAR)
+        stop, more, message = descend(problem, z, max_steps, _near(problem))
         change, steps, z = stop.z - z, steps + more, stop.z
         for end in () if turn else ends:
             if stop.errors_of(z - end.stop.z) < _NEXT:

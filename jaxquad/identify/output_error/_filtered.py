@@ -22,12 +22,12 @@ import numpy as np
 from jaxtyping import Array, Float, PyTree
 
 from jaxquad._core import Normal
-from jaxquad.models import sample_rational, TransferFunction
+from jaxquad.models import sample_rational
 
 from ..frequency_domain._parameters import Numbers
 from ..frequency_domain._solve import evaluate, Frame, take_apart
 from ._problem import Evaluation, insert_parameters, OutputError, RecordTerm
-from ._simulated import band_filter, linear_model
+from ._simulated import band_filter, linear_model, Rational
 
 
 _MOST = 4  # poles, beyond which the coefficients of A may say too little of them
@@ -82,7 +82,7 @@ def is_filtered(problem: OutputError) -> bool:
     if any(term.direct_samples is not None for term in problem.terms):
         return False
     plant = linear_model(base.model)
-    rational = isinstance(plant, TransferFunction) and 2 <= plant.denominator.size <= _MOST + 1
+    rational = isinstance(plant, Rational) and 2 <= plant.denominator.size <= _MOST + 1
     plain = (term.whitener is None and term.feedback is None for term in problem.terms)
     return rational and all(plain)
 
@@ -203,7 +203,7 @@ def _program(frame: Frame, hold: str) -> Callable[[np.ndarray, float, list[Numbe
 
         def coefficients(z):
             plant = linear_model(insert_parameters(z, problem))
-            assert isinstance(plant, TransferFunction)
+            assert isinstance(plant, Rational)
             model = sample_rational(plant, dt, hold)
             both = jnp.concatenate([model.above, model.below])
             return both, (both, jnp.concatenate([model.step, model.rows]), model.shift)

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int, PyTree
 
 from jaxquad._core import Message, Normal, solve_definite
-from jaxquad.models import simulate_linear, TransferFunction
+from jaxquad.models import simulate_linear, StateSpace
 from jaxquad.records import Record
 
 from ..frequency_domain._parameters import Numbers
@@ -119,7 +119,7 @@ def close_loop(
     """
     samples = len(x)
     pulse = jnp.zeros(samples).at[0].set(1.0)
-    inputs = pulse if isinstance(plant, TransferFunction) else pulse[:, None]
+    inputs = pulse[:, None] if isinstance(plant, StateSpace) else pulse
     response = simulate_linear(plant, inputs, dt, direct_samples=direct_samples)
     response = jnp.asarray(response).reshape(samples)
     sensitivity = invert_series(pulse - convolve(response, feedback))

@@ -34,12 +34,9 @@ from ..uncertainty._error_budget import (
     calibrated_covariance,
     Matrix,
     Noise as MisfitNoise,
-    prior_rows,
-    PriorRows,
-    rescale,
     scaled_inverse,
-    units_of,
 )
+from ..uncertainty._response_term import prior_rows, PriorRows, rescale, units_of
 from ..uncertainty._verdict import identifiability_of, Information, NO_MINIMUM, Verdict
 from ._descent import descend_within_samples, Descent, with_fixed_slopes
 from ._noise import ARMA, AutoRegressive, Noise, orthonormal, projected_noise
@@ -54,7 +51,8 @@ from ._problem import (
 from ._simulated import (
     band_filter,
     band_gain,
-    check_plant,
+    check_channels,
+    check_growth,
     count_states,
     DifferentialModel,
     inputs_between_samples,
@@ -95,7 +93,9 @@ def refine(
     **Arguments:**
 
     - `model`: its values are the start. A linear model (`jq.TransferFunction`, `jq.StateSpace`, or
-        one with `transfer_function()` or `state_space()`) is discretised exactly; initial state,
+        one with `transfer_function()` or `state_space()`) is discretised exactly, a
+        `jq.models.DiscreteTransferFunction` (output error, or Box-Jenkins with `noise`) is at its
+        samples already: `jq.identify.guess_discrete` makes a start of one. The initial state,
         biases on the state derivatives and a shift of each output are eliminated by least squares.
         Any other `eqx.Module` with `init()`, `derivative(state, inputs, disturbance)` and
         `measure(state)` is integrated by diffrax with a disturbance of zero; its initial state is
@@ -188,10 +188,12 @@ def _term(
     band: tuple[float, float] | None,
     loop: KnownController | None,
 ) -> RecordTerm:
-    u, between = inputs_between_samples(record, hold)
+    differential = isinstance(model, DifferentialModel) and not isinstance(model, Linear)
+    plant = None if differential else linear_model(model)
+    u, between = inputs_between_samples(record, hold, plant)
     gain = band_gain(band, record)
     feedback = None if loop is None else np.asarray(feedback_response(loop, record, between))
-    if isinstance(model, DifferentialModel) and not isinstance(model, Linear):
+    if plant is None:
         if loop is not None:
             raise ValueError(
                 f"{type(model).__name__} is given by its differential equation, but a loop needs a "
@@ -207,8 +209,9 @@ def _term(
                 )
             )
     else:
-        plant = linear_model(model)
-        check_plant(plant, record)
+        check_channels(plant, record)
+        remedy = "cut the record« with jq.records.trim», or fit frequency responses"
+        check_growth(plant, record.duration, f"{remedy}, which need no simulation")
         motions, start = unknown_motions(plant, record.duration)[:2], np.zeros(0)
     y = band_filter(np.asarray(record.outputs), gain)
     weights = 1 / np.std(y, axis=0)

@@ -3,6 +3,7 @@
 import functools as ft
 from typing import NamedTuple, Protocol, runtime_checkable
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,9 +13,11 @@ from jaxtyping import Array, Float, PyTree
 from jaxquad._compile import brief_options, Jit
 from jaxquad._core import Message
 from jaxquad.models import (
+    DiscreteTransferFunction,
     explicit,
     free_responses,
     realise,
+    require_sampled,
     simulate_linear,
     StateSpace,
     TransferFunction,
@@ -23,7 +26,8 @@ from jaxquad.records import Record
 
 
 Numbers = Array | np.ndarray
-Plant = TransferFunction | StateSpace
+Rational = TransferFunction | DiscreteTransferFunction
+Plant = Rational | StateSpace
 
 
 def band_gain(
@@ -68,11 +72,22 @@ def band_filter(
 
 
 def inputs_between_samples(
-    record: Record, hold: str | None
+    record: Record, hold: str | None, plant: Plant | None = None
 ) -> tuple[Float[np.ndarray, "samples inputs"], str]:
     """The inputs, and how they run between samples: "zero" (held) or "first" (straight, unless the
-    record says otherwise). What is held for less is straight, half its hold late."""
+    record says otherwise). What is held for less is straight, half its hold late. A discrete plant
+    takes the samples as they are."""
     u = np.asarray(record.inputs)
+    if isinstance(plant, DiscreteTransferFunction):
+        require_sampled(plant.dt, samples=record.dt)
+        if hold is not None:
+            raise ValueError(
+                Message(
+                    f"hold is {hold!r}, but the model is discrete and has its hold in it: leave "
+                    "«hold=» out, or give the continuous model, model.to_continuous()"
+                )
+            )
+        return u, "zero"
     if hold not in ("first", "zero", None):
         raise ValueError(
             f'hold is {hold!r}: give "first" (straight between samples), "zero" (held), or None '
@@ -118,12 +133,12 @@ class HasStateSpace(Protocol):
 
 @runtime_checkable
 class HasTransferFunction(Protocol):
-    """A model that can be written as a transfer function."""
+    """A model that can be written as a transfer function, a discrete one of its own static `dt`."""
 
-    def transfer_function(self) -> TransferFunction: ...
+    def transfer_function(self) -> Rational: ...
 
 
-Linear = TransferFunction | StateSpace | HasStateSpace | HasTransferFunction
+Linear = Plant | HasStateSpace | HasTransferFunction
 
 
 def count_states(plant: DifferentialModel) -> int:
@@ -179,6 +194,7 @@ def integrate_plant(
 
 
 _SLOW = 15.0  # a fifth of a record over which a motion decays by e^-15 leaves 5 % of it
+_SUDDEN = 1e-12  # size of a pole in z below which its motion ends at once
 _OUTGROWN = 1e10  # growth over a record that leaves too few digits for what is measured
 
 
@@ -197,13 +213,19 @@ class Motions(NamedTuple):
 
 def linear_model(model: PyTree) -> Plant:
     """The model as one that `simulate_linear` takes."""
-    if isinstance(model, TransferFunction | StateSpace):
+    if isinstance(model, Plant):
         return model
     if isinstance(model, HasStateSpace):
         return model.state_space()
-    if isinstance(model, HasTransferFunction):
-        return model.transfer_function()
     kind = type(model).__name__
+    if isinstance(model, HasTransferFunction):
+        plant = model.transfer_function()
+        if isinstance(plant, DiscreteTransferFunction) and getattr(model, "dt", None) != plant.dt:
+            raise ValueError(
+                f"{kind}.transfer_function() is discrete, dt = {plant.dt:.6g} s, and {kind} does "
+                "not say so: give it the field dt: float = eqx.field(static=True)"
+            )
+        return plant
     if hasattr(model, "model"):
         raise ValueError(f"a {kind} is no model: give the one that it holds, {kind.lower()}.model")
     raise ValueError(
@@ -212,8 +234,15 @@ def linear_model(model: PyTree) -> Plant:
     )
 
 
-def check_plant(plant: Plant, record: Record) -> None:
-    """Raise ValueError for a model of other channels than the record's, or one too unstable."""
+def sample_interval(model: PyTree) -> float | None:
+    """Of a discrete model, in s, whose hold is a part of it; None of a continuous one."""
+    if isinstance(model, HasTransferFunction) and isinstance(getattr(model, "dt", None), float):
+        model = eqx.filter_eval_shape(lambda model: model.transfer_function(), model)
+    return model.dt if isinstance(model, DiscreteTransferFunction) else None
+
+
+def check_channels(plant: Plant, record: Record) -> None:
+    """Raise ValueError for a model of other channels than the record's."""
     inputs, outputs = 1, 1
     if isinstance(plant, StateSpace):
         inputs, outputs = plant.G.shape[1], len(plant.H0)
@@ -226,13 +255,26 @@ def check_plant(plant: Plant, record: Record) -> None:
                 "«pick channels with jq.records.select»"
             )
         )
-    poles = np.asarray(plant.poles)
-    fastest = np.max(np.real(poles), initial=0.0) * record.duration
-    if not fastest < np.log(_OUTGROWN):
+
+
+def growth_rate(plant: Plant) -> float:
+    """Of the fastest unstable motion, in 1/s; 0 without one."""
+    return float(np.max(np.real(np.asarray(plant.poles)), initial=0.0))
+
+
+def diverges(plant: Plant, duration: float) -> bool:
+    """Whether motions grow so much that a simulation has no digits left for what is measured."""
+    return not growth_rate(plant) * duration < np.log(_OUTGROWN)
+
+
+def check_growth(plant: Plant, duration: float, remedy: str) -> None:
+    """Raise ValueError where a simulation of `duration` s diverges."""
+    if diverges(plant, duration):
         raise ValueError(
-            f"the model is unstable (poles {poles} rad/s) and its response grows by "
-            f"e^{fastest:.3g} within {record.duration:.4g} s: cut the record with jq.records.trim, "
-            "or fit frequency responses, which need no simulation"
+            Message(
+                f"the model is unstable (poles {np.asarray(plant.poles)} rad/s) and its response "
+                f"grows by e^{growth_rate(plant) * duration:.3g} within {duration:.4g} s: {remedy}"
+            )
         )
 
 
@@ -246,9 +288,9 @@ def forced_response(
     """The outputs under inputs that stood at their first values before the record, from rest."""
     u = u - u[:1]
     options = {"hold": hold, "direct_samples": direct_samples}
-    if isinstance(plant, TransferFunction):
-        return simulate_linear(plant, u[:, 0], dt, **options)[:, None]
-    return simulate_linear(plant, u, dt, **options)
+    if isinstance(plant, StateSpace):
+        return simulate_linear(plant, u, dt, **options)
+    return simulate_linear(plant, u[:, 0], dt, **options)[:, None]
 
 
 def unknown_motions(plant: Plant, duration: float) -> Motions:
@@ -256,7 +298,16 @@ def unknown_motions(plant: Plant, duration: float) -> Motions:
     A = np.asarray((explicit(plant) if isinstance(plant, StateSpace) else realise(plant))[0])
     if not len(A):
         return Motions(np.zeros((0, 0)), np.zeros((0, 0)), ())
-    speeds, A = -np.real(np.linalg.eigvals(A)) * duration / _SLOW, A * duration / _SLOW
+    samples = duration / plant.dt if isinstance(plant, DiscreteTransferFunction) else None
+
+    def speed_of(re: np.ndarray | float, im: np.ndarray | float) -> np.ndarray | float:
+        """In decays by e over the record, of which slow motions have less than 15."""
+        if samples is None:
+            return -re * duration / _SLOW
+        return -samples / _SLOW * np.log(np.hypot(re, im) + _SUDDEN)
+
+    poles = np.linalg.eigvals(A)
+    speeds = np.asarray(speed_of(np.real(poles), np.imag(poles)))
     # One speed ends and the next begins between poles, from the end of the slow ones at 1 on.
     # Equal poles scatter by a root of the rounding, and have to stay together.
     ordered = np.sort(np.maximum(speeds, 0.2))
@@ -272,7 +323,7 @@ def unknown_motions(plant: Plant, duration: float) -> Motions:
             return np.eye(len(A), int(np.sum(inside)))
         from scipy.linalg import schur
 
-        parts = schur(A, output="real", sort=lambda re, im: low < -re <= high)
+        parts = schur(A, output="real", sort=lambda re, im: low < speed_of(re, im) <= high)
         return parts[1][:, : int(parts[-1])]
 
     slow = basis(-np.inf, edges[0])
@@ -291,7 +342,7 @@ def free_response(
     if not len(motions.slow):
         return shifts
     start, bias = free_responses(plant, samples, dt)
-    if isinstance(plant, TransferFunction):
+    if not isinstance(plant, StateSpace):
         start, bias = start[:, None], bias[:, None]
     dot = lambda x, way: jnp.einsum("toi,ik->tok", x, jnp.asarray(way), precision="highest")
     return jnp.concatenate([shifts, dot(bias, motions.slow), dot(start, motions.fast)], axis=2)

@@ -8,9 +8,10 @@ import numpy as np
 from jaxtyping import Float, PyTree
 
 from jaxquad._core import as_messages, Message
-from jaxquad.models import LaggedIntegrator, StateSpace, TransferFunction
+from jaxquad.models import LaggedIntegrator
+from jaxquad.spectra import FrequencyResponse
 
-from ..frequency_domain._cost import widen_band
+from ..frequency_domain._cost import Mask, widen_band
 from ..frequency_domain._feedthrough import DirectDelay
 from ..frequency_domain._parameters import Parameters
 from ..frequency_domain._problem import on_device, Problem
@@ -25,18 +26,12 @@ from ..frequency_domain._solve import (
     solution_at,
 )
 from ..output_error._noise import NoiseModel
-from ..output_error._simulated import HasStateSpace, HasTransferFunction, linear_model
-from ._error_budget import (
-    Discrepancy,
-    error_budget,
-    ErrorBudget,
-    Matrix,
-    scaled_inverse,
-    Units,
-    units_of,
-    Weighting,
-)
+from ..output_error._simulated import Linear, linear_model
+from ._discrepancy import Discrepancy
+from ._error_budget import error_budget, ErrorBudget, Matrix, scaled_inverse, Weighting
+from ._log_density import Evidence, evidence_of
 from ._misfit import DOUBT, find_drift, local_misfits, MISFIT, with_resonance
+from ._response_term import Units, units_of
 from ._verdict import (
     identifiability_of,
     Information,
@@ -49,8 +44,8 @@ from ._verdict import (
 from ._zero_bounds import bounds_among, near_zeros, one_sided, Profile, profiles, without_bounds
 
 
-_NO_MINIMUM = 1e-2  # Newton decrement over cost, above which no number counts as determined
-_NO_MODEL = 0.5  # discrepancy in rad, above which nothing counts as determined
+UNFINISHED = 1e-2  # Newton decrement over cost, above which no number counts as determined
+NO_MODEL = 0.5  # discrepancy in rad, above which nothing counts as determined
 _STILL = 0.25  # standard errors: a bias of that size leaves a 95 % interval at 94.3 %
 _ROUNDING = 1e-4  # relative change that nobody looks for, where there is no noise
 _LARGE = 0.3  # discrepancy in neper, above which intervals by small changes are rough
@@ -109,7 +104,7 @@ def assess(
     alone = budget
     if weighting.by_noise is not None:
         alone = error_budget(weighting.by_noise, weighting.points, solution, units)
-    cost, misfit = alone.cost, alone.misfit_ratio
+    cost, misfit = float(alone.cost), float(alone.misfit_ratio)
     # A misfit beyond the noise is in no covariance of the noise.
     inflation = misfit if misfit > MISFIT**2 else 1.0
     zeros = [names.index(bound.name) for bound in bounds if not bound.value]
@@ -126,7 +121,7 @@ def assess(
     controller = [mine & frf.of_controller for frf, mine in zip(frfs, used, strict=True)]
     dominated, points = (int(sum(map(np.count_nonzero, masks))) for masks in (controller, used))
     amplitude = budget.discrepancy.amplitude
-    unfinished = decrement > _NO_MINIMUM * max(cost, 1e-9)
+    unfinished = decrement > UNFINISHED * max(cost, 1e-9)
     fed_back = 2 * dominated > points
     if fed_back:
         reason = Message(
@@ -142,7 +137,7 @@ def assess(
     elif unfinished or is_unfinished(solution, step, budget.by_noise):
         remedies = ("«start from other values»", "try many starts at once (starts=20)")
         verdict = by_data = no_minimum(names, decrement, cost, *remedies, message=solution.message)
-    elif amplitude > _NO_MODEL:
+    elif amplitude > NO_MODEL:
         verdict = by_data = no_model(names, amplitude)
     else:
         without = covariance
@@ -165,7 +160,7 @@ def assess(
     # Those of the responses' remarks that concern the points in use, each once.
     parts = [frf.remarks_about(mine) for frf, mine in zip(frfs, used, strict=True) if frf.remarks]
     remarks = list(dict.fromkeys(remark for part in parts for remark in part))
-    remarks += remarks_on_hold(frfs, used)
+    remarks += remarks_on_hold(problem.model, frfs, used)
     # Few points of independent noise reach a large misfit by chance: the discrepancy, or the search
     # for a local misfit, has to say so, too.
     doubted = misfit if local or budget.discrepancy.none < DOUBT else min(misfit, 1.0)
@@ -213,8 +208,8 @@ def assess(
                 f"other sign, or let the sign change with {real}; where that cannot be, the model» "
                 "lacks something, or the time stamps of input and output are shifted",
             )
-        remarks += _remarks_on_model(solution.model, budget)
-        if solution.converged and is_saddle(problem, solution, budget.cost, bread):
+        remarks += _remarks_on_model(solution.model, frfs, used)
+        if solution.converged and is_saddle(problem, solution, float(budget.cost), bread):
             remark(
                 "saddle",
                 "stationary, but no minimum: the cost falls to one side; «start from other values»"
@@ -234,7 +229,7 @@ def assess(
         if by_user:
             pulls = budget.prior.misfit[:by_user]
             remarks += remarks_on_priors(pulls, verdict, by_data, chi_squared=doubted)
-        if _LARGE < amplitude <= _NO_MODEL:
+        if _LARGE < amplitude <= NO_MODEL:
             remark(
                 "discrepancy",
                 f"the model leaves {100 * amplitude:.0f} % of the response unexplained: the "
@@ -252,7 +247,7 @@ def assess(
         decrement=decrement,
         cost=cost,
         average_cost=cost / sum(len(record.pairs) for record in budget.records),
-        information=cost + 2 * inflation * alone.fitted_noise,
+        information=cost + 2 * inflation * float(alone.fitted_noise),
         chi_squared=misfit,
         points=points,
         freedom=budget.degrees_of_freedom,
@@ -261,6 +256,7 @@ def assess(
         discrepancy=budget.discrepancy,
         origin=origin,
         profiles=followed if verdict.fitted else (),
+        evidence=evidence_of(problem, budget),
     )
 
 
@@ -324,15 +320,17 @@ def _is_opposite(problem: Problem, solution: Solution) -> bool:
     return False
 
 
-def _remarks_on_model(model: PyTree, budget: ErrorBudget) -> list[Message]:
+def _remarks_on_model(
+    model: PyTree, frfs: Sequence[FrequencyResponse], used: Sequence[Mask]
+) -> list[Message]:
     """Remark on a model that grows within the band of a direct estimate: no open loop does."""
     lags = isinstance(model, LaggedIntegrator) and not np.asarray(model.lag) < 0
-    if lags or not any(record.frf.method == "direct" for record in budget.records):
+    if lags or not any(frf.method == "direct" for frf in frfs):
         return []
-    if not isinstance(model, StateSpace | TransferFunction | HasStateSpace | HasTransferFunction):
+    if not isinstance(model, Linear):
         return []
-    pairs = ((np.asarray(record.frf.omega), record.used) for record in budget.records)
-    omega = np.concatenate([omega[np.any(used, axis=(1, 2))] for omega, used in pairs])
+    pairs = zip(frfs, used, strict=True)
+    omega = np.concatenate([np.asarray(f.omega)[np.any(mine, axis=(1, 2))] for f, mine in pairs])
     lowest, highest = float(np.min(omega)), float(np.max(omega))
     poles = linear_model(on_device(model)).poles
     growth = float(np.max(np.real(poles[np.abs(poles) < highest]), initial=0.0))
@@ -397,6 +395,7 @@ def make_fit(
     noise_models: tuple[tuple[NoiseModel, ...], ...] = (),
     origin: Origin | None = None,
     profiles: tuple[Profile, ...] = (),
+    evidence: Evidence | None = None,
 ) -> Fit:
     """A result in physical units; both covariances are those of changes relative to `units`.
     `freedom` is that of the noise estimate, infinite without."""
@@ -460,6 +459,7 @@ def make_fit(
         noise_models=noise_models,
         origin=origin,
         profiles=profiles,
+        evidence=evidence,
     )
 
 

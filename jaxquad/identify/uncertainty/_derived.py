@@ -12,10 +12,16 @@ from jaxtyping import Array, ArrayLike, Bool, Complex, Float, Inexact, PyTree
 
 from jaxquad._compile import hasty_options, Jit
 from jaxquad._core import as_array, concrete_values
-from jaxquad.models import evaluate_response, simulate_linear, TransferFunction
+from jaxquad.models import (
+    evaluate_response,
+    require_sampled,
+    simulate_linear,
+    StateSpace,
+    TransferFunction,
+)
 
 from ..frequency_domain._parameters import Parameters
-from ..output_error._simulated import linear_model
+from ..output_error._simulated import linear_model, sample_interval
 from ._error_budget import Matrix
 from ._verdict import Combination, LIMIT, NO_MINIMUM, reach_of_interval, UndeterminedError, USUAL
 
@@ -304,8 +310,8 @@ def step_response(
 ) -> Float[np.ndarray, "samples outputs inputs"]:
     """The answer of a linear model at rest to a unit step of each input at time 0.
 
-    The model is a `jq.TransferFunction`, a `jq.StateSpace`, or has `transfer_function()` or
-    `state_space()`.
+    The model is a `jq.TransferFunction`, a `jq.StateSpace`, a `jq.models.DiscreteTransferFunction`,
+    whose sample interval is that of `time`, or has `transfer_function()` or `state_space()`.
 
     **Raises:** ValueError for other models, and where `time` is not equally spaced from 0, in s.
     """
@@ -318,7 +324,7 @@ def step_response(
             "time is not equally spaced from 0: give two or more, as np.linspace(0, 2, 401)"
         )
     dt = float(t[-1] / (t.size - 1))
-    if isinstance(plant, TransferFunction):
+    if not isinstance(plant, StateSpace):
         return np.asarray(simulate_linear(plant, np.ones(t.size), dt))[:, None, None]
     inputs = np.eye(plant.G.shape[1])
     steps = (np.broadcast_to(unit, (t.size, len(inputs))) for unit in inputs)
@@ -334,6 +340,8 @@ def model_response(
     model: PyTree, omega: Float[np.ndarray, " frequencies"]
 ) -> Complex[np.ndarray, "frequencies outputs inputs"]:
     """The response of a model at frequencies in rad/s, by one program whatever their number."""
+    if (dt := sample_interval(model)) is not None:
+        require_sampled(dt, omega=omega)
     padded = np.pad(omega, (0, -omega.size % _AT_ONCE), mode="edge").reshape(-1, _AT_ONCE)
     parts = [np.asarray(_response(model, part)) for part in padded]
     return np.concatenate(parts)[: omega.size]

@@ -20,12 +20,14 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 
 from jaxquad.spectra import in_hertz
 
 from ..frequency_domain._cost import mix, Points
-from ._error_budget import ErrorBudget, PriorRows, scaled_inverse, SHARES
+from ._discrepancy import SHARES
+from ._error_budget import ErrorBudget, Matrix, scaled_inverse
+from ._response_term import PriorRows, ResponseTerm
 
 
 DRIFT, CLOCK = "drift", "clock"  # kinds of remarks
@@ -67,24 +69,14 @@ def find_local_misfit(
     tried, candidates, inverse = 0, [], scaled_inverse(budget.bread)
     for number, (record, counted) in enumerate(zip(budget.records, points, strict=True)):
         omega = np.asarray(record.frf.omega)
-        for _, o, i in record.pairs:
+        for o, i in record.pairs:
             some = np.flatnonzero(record.used[:, o, i])
             some = some[np.argsort(omega[some], kind="stable")]
             independent = 1 / np.asarray(counted.shared)[some, o, i]
-            errors = record.error[some, o, i, None] ** 2 + (floor * SHARES) ** 2
-            squares = independent * np.sum(
-                np.asarray(record.misfit)[some, o, i] ** 2 / errors, axis=1
-            )
-            rows = record.rows[some, o, i, :, : budget.count]
-            taken = np.sum((rows @ inverse) * rows, axis=(1, 2))
+            sums = _sums(record, independent, some, (o, i), inverse, floor)
             starts, ends = _windows(np.log2(omega[some]))
-            sums = [np.append(0.0, np.cumsum(x)) for x in (squares, independent, taken)]
-            total, count, taken = (x[ends] - x[starts] for x in sums)
-            freedom = np.maximum(2 * count - taken, count)
-            wide = 2 * count >= _FEWEST
-            wide[0] = True
+            total, count, freedom, wide, clear = _in_windows(sums, starts, ends, least)
             tried += int(np.sum(wide))
-            clear = wide & (total > least**2 * freedom)
             if not np.any(clear):
                 continue
             covariance = record.frf.log_noise_covariance
@@ -110,6 +102,66 @@ def find_local_misfit(
     return clearest if tried * chance < _CHANCE else None
 
 
+def _sums(
+    record: ResponseTerm,
+    independent: Float[np.ndarray, "*members some"],
+    some: Int[np.ndarray, " some"],
+    pair: tuple[int, int],
+    inverse: Matrix,
+    floor: float,
+) -> Float[np.ndarray, "3 *members ends"]:
+    """Up to each of `some` points: squares over their errors, independent points, and what the
+    parameters take off."""
+    errors = record.error[..., some, *pair][..., None] ** 2 + (floor * SHARES) ** 2
+    squares = np.sum(record.misfit[..., some, *pair, :] ** 2 / errors, axis=-1)
+    squares = np.where(independent > 0, independent * squares, 0.0)
+    rows = record.rows[..., some, *pair, :, : record.count]
+    taken = np.sum((rows @ inverse[..., None, :, :]) * rows, axis=(-2, -1))
+    sums = np.cumsum([squares, independent, taken], axis=-1)
+    return np.concatenate([np.zeros((*sums.shape[:-1], 1)), sums], axis=-1)
+
+
+def _in_windows(
+    sums: Float[np.ndarray, "3 *members ends"],
+    starts: Int[np.ndarray, " windows"],
+    ends: Int[np.ndarray, " windows"],
+    least: float,
+) -> tuple[np.ndarray, ...]:
+    """Squares, independent points and degrees of freedom in windows, which of them are wide enough,
+    and in which the misfit is more than `least` random errors."""
+    total, count, taken = sums[..., ends] - sums[..., starts]
+    freedom, wide = np.maximum(2 * count - taken, count), 2 * count >= _FEWEST
+    wide[..., 0] = True
+    return total, count, freedom, wide, wide & (total > least**2 * freedom)
+
+
+def may_have_local_misfits(
+    budget: ErrorBudget, shared: Float[np.ndarray, "members frequencies outputs inputs"]
+) -> Bool[np.ndarray, " members"]:
+    """Which of many fits have a local misfit, if their noise were known: with that of an estimate,
+    `find_local_misfit` finds as many or fewer."""
+    from scipy.special import chdtrc
+
+    [record], inverse = budget.records, scaled_inverse(budget.bread)
+    omega, tried, chance = np.asarray(record.frf.omega), np.zeros(len(shared)), np.ones(len(shared))
+    order = np.argsort(omega, kind="stable")
+    place = np.log2(omega[order])
+    for pair in record.pairs:
+        used = record.used[:, order, *pair]
+        independent = np.where(used, 1 / shared[:, order, *pair], 0.0)
+        sums = _sums(record, independent, order, pair, inverse, 0.0)
+        limits = np.stack([np.argmax(used, axis=1), np.argmax(np.cumsum(used, axis=1), axis=1)])
+        for first, last in np.unique(limits[:, np.any(used, axis=1)], axis=1).T:
+            mine = (limits[0] == first) & (limits[1] == last)
+            starts, ends = _windows(place[first : last + 1])
+            numbers = _in_windows(sums[:, mine], first + starts, first + ends, MISFIT)
+            total, _, freedom, wide, clear = numbers
+            tried[mine] += np.sum(wide, axis=-1)
+            chances = chdtrc(freedom, total, out=np.ones(total.shape), where=clear)
+            chance[mine] = np.minimum(chance[mine], np.min(chances, axis=-1))
+    return tried * chance < _CHANCE
+
+
 def _windows(place: Float[np.ndarray, " points"]) -> tuple[np.ndarray, np.ndarray]:
     """First points of windows, and those behind their last; the whole band is the first."""
     low, high = place[0], place[-1]
@@ -131,7 +183,7 @@ def local_misfits(
     local = find_local_misfit(budget, points, 0.0, MISFIT)
     if local is None or budget.discrepancy.none >= DOUBT:
         return local, local
-    floor = budget.mixtures[0].amplitude
+    floor = float(budget.mixtures[0].amplitude)
     return local, find_local_misfit(budget, points, floor, MISFIT**2)
 
 
@@ -239,6 +291,6 @@ def _score_drift(budget: ErrorBudget, kind: str) -> Drift | None:
     error = float(np.sqrt(more.by_noise[-1, -1]))
     chance = float(stdtr(more.degrees_of_freedom[-1], -abs(step[-1]) / error))
     left = more.data_cost - float(more.gradient @ step)
-    ratio = left / max(more.noise.cost - more.fitted_noise, 1e-300)
+    ratio = float(left / max(more.noise.cost - more.fitted_noise, 1e-300))
     seconds = max(float(np.ptp(time)) for time in times)
     return Drift(kind, -float(step[-1]) * seconds, error * seconds, seconds, chance, ratio)

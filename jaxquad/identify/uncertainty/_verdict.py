@@ -12,7 +12,8 @@ from jaxtyping import Float
 from jaxquad._core import as_messages, Message, pytree_node
 
 from ..frequency_domain._parameters import Place
-from ._error_budget import Matrix, PriorRows
+from ._error_budget import Matrix
+from ._response_term import PriorRows
 
 
 if TYPE_CHECKING:

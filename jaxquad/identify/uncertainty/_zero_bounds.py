@@ -18,7 +18,8 @@ from jaxtyping import Bool, Float
 from ..frequency_domain._cost import mix
 from ..frequency_domain._problem import Problem
 from ..frequency_domain._solve import Solution, solution_at, solve
-from ._error_budget import ErrorBudget, Matrix, scaled_inverse, Units, units_of
+from ._error_budget import ErrorBudget, Matrix, scaled_inverse
+from ._response_term import Units, units_of
 from ._verdict import Bound, LIMIT, REACH
 
 
@@ -39,7 +40,7 @@ _FAR = 50.0  # standard deviations, beyond which the hazard's digits cancel
 _SLIGHT = 0.1
 _FEW = 0.1  # of the limit: below it the slopes at a value say little about the way to the limit
 _ONE_SIDED = 1.645  # standard errors that reach from the middle of a one-sided 95 % interval
-_WEAK = 6.0  # standard errors to zero, within which the cost is followed there
+WEAK = 6.0  # standard errors to zero, within which the cost is followed there
 _FINE = 10  # places between two points of a profile
 _FAR_OUT = 2.5  # standard errors, where a profile ends
 _MOST = 12  # places to either side of it
@@ -397,7 +398,7 @@ def profiles(
     """Of the parameters that keep their sign and lie within a few standard errors of zero, and of
     one in each direction in which all run to infinity."""
     variances, by_noise = np.diagonal(budget.covariance), np.diagonal(budget.by_noise)
-    weak = variances > 1 / _WEAK**2
+    weak = variances > 1 / WEAK**2
     weak[[one.k for one in near]] = True
     weak[_of_null_directions(budget.bread)] = True
     weak &= np.array(problem.parameters.logarithmic[: budget.count])
