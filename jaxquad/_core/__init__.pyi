@@ -11,6 +11,7 @@ from ._arrays import (
     is_zero as is_zero,
     mark_members as mark_members,
     match_reference as match_reference,
+    member_rank as member_rank,
     multiply_gains as multiply_gains,
     of_one_rank as of_one_rank,
     on_host as on_host,
@@ -30,6 +31,8 @@ from ._host import (
     announce as announce,
     as_messages as as_messages,
     available_cores as available_cores,
+    default_device as default_device,
+    free_memory as free_memory,
     is_concrete as is_concrete,
     is_ours as is_ours,
     map_in_threads as map_in_threads,
@@ -58,6 +61,7 @@ from ._levenberg_marquardt import (
     CONVERGED as CONVERGED,
     decrement as decrement,
     Descent as Descent,
+    invert_definite as invert_definite,
     minimise as minimise,
     minimise_on_host as minimise_on_host,
     Normal as Normal,
@@ -68,3 +72,5 @@ from ._levenberg_marquardt import (
     STALLED as STALLED,
     TOLERANCE as TOLERANCE,
 )
+from ._signatures import require_signature as require_signature
+from ._version import __version__ as __version__

@@ -181,6 +181,12 @@ else:
         return eqx.field(metadata=metadata, **options)
 
 
+def member_rank(module: object, name: str) -> int | None:
+    """The rank that a module declares for a field by `per_member`; None if it declares none."""
+    field = getattr(module, "__dataclass_fields__", {}).get(name)
+    return None if field is None else field.metadata.get(_KEY)
+
+
 def ensemble_shape(*trees: PyTree, rank: int | None = None) -> tuple[int, ...]:
     """The shape of the ensemble that all declared arrays in `trees` serve together.
 

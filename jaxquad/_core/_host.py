@@ -277,6 +277,30 @@ def available_cores() -> int:
         return os.cpu_count() or 1
 
 
+def default_device() -> Any:
+    """The `jax.Device` on which programs run of which nobody says where."""
+    import jax
+
+    chosen = getattr(jax.config, "jax_default_device", None)
+    return chosen if isinstance(chosen, jax.Device) else jax.local_devices()[0]
+
+
+def free_memory(device: Any) -> float | None:
+    """Of a `jax.Device` in bytes; of the host for a CPU, and of what a container may use of it."""
+    if device.platform != "cpu":
+        stats = device.memory_stats() or {}
+        limit = stats.get("bytes_limit")
+        return None if limit is None else float(limit - stats.get("bytes_in_use", 0))
+    free: list[float] = []
+    with contextlib.suppress(OSError, StopIteration, ValueError):
+        lines = Path("/proc/meminfo").read_text().splitlines()
+        free.append(next(1024.0 * int(x.split()[1]) for x in lines if x.startswith("MemAvailable")))
+    # Of all that the container may use ("max" without a limit) the page cache can be freed.
+    with contextlib.suppress(OSError, ValueError):
+        free.append(float(Path("/sys/fs/cgroup/memory.max").read_text()))
+    return min(free, default=None)
+
+
 def thread_settings() -> tuple[object, ...]:
     """Of JAX, those that change numbers or raise, and that a `with` can set for one thread."""
     import jax  # Batches and usage errors ask for cores without it.

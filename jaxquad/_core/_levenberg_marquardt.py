@@ -1,6 +1,6 @@
 """Levenberg-Marquardt on the normal equations, one problem or a batch on trailing axes.
 
-Built without LAPACK: `vmap` over LAPACK calls inside a loop can hang on few cores.
+Built without LAPACK: `vmap` over LAPACK calls can hang on few cores.
 """
 
 from collections.abc import Callable
@@ -241,6 +241,27 @@ def solve_definite(
     start = (system, jnp.ones(vector.shape[1:], bool))
     system, definite = jax.lax.fori_loop(0, count, eliminate, start)
     return system[:, count], definite
+
+
+def invert_definite(
+    matrix: Float[Array, "*batch rows rows"],
+) -> tuple[Float[Array, "*batch rows rows"], Float[Array, " *batch"]]:
+    """Inverse of a symmetric positive definite matrix by Gauss-Jordan elimination, and the
+    logarithm of its determinant."""
+    count = matrix.shape[-1]
+    identity = jnp.broadcast_to(jnp.eye(count, dtype=matrix.dtype), matrix.shape)
+
+    def eliminate(state, k):
+        system, volume = state
+        pivot = system[..., k, k]
+        row = system[..., k, :] / pivot[..., None]
+        others = system - system[..., k][..., None] * row[..., None, :]
+        system = jnp.where((np.arange(count) == k)[:, None], row[..., None, :], others)
+        return (system, volume + jnp.log(jnp.abs(pivot))), None
+
+    start = jnp.concatenate([matrix, identity], axis=-1), jnp.zeros_like(matrix[..., 0, 0])
+    (system, volume), _ = jax.lax.scan(eliminate, start, np.arange(count))
+    return system[..., count:], volume
 
 
 def _size(hessian: Float[Array, "parameters parameters *batch"]) -> Float[Array, " *batch"]:

@@ -1,5 +1,6 @@
 """Controllers (LADRC, PID, adaptive LADRC), observers and estimators of the inertia."""
 
+from ._fourier import FourierInertia as FourierInertia, Parameters as FourierParameters
 from ._ladrc import LADRC as LADRC, LADRCLaw as LADRCLaw
 from ._lock_in import LockInInertia as LockInInertia, NoProbe as NoProbe, ProbeTones as ProbeTones
 from ._pid import (

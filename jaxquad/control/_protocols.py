@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
-from jaxquad._core import multiply_gains
+from jaxquad._core import multiply_gains, require_signature
 
 
 Signal = Float[Array, " axes *ensemble"]  # of each axis and each member
@@ -133,6 +133,7 @@ def schedule_for_analysis(controller: object, inertia: Float[ArrayLike, "..."]) 
     An adaptive controller becomes the one that it is once its estimate has reached `inertia`.
     """
     if isinstance(controller, ScheduledController):
+        require_signature(controller, ScheduledController, "scheduled_at", 1)
         return controller.scheduled_at(inertia)
     return controller
 

@@ -25,6 +25,7 @@ from jaxquad._core import (
     require_common_shape,
     require_finite,
     require_positive,
+    require_signature,
     signal_shape,
 )
 
@@ -401,6 +402,11 @@ class AdaptiveLADRC(_ScheduledByMap, eqx.Module):
                 f"estimator is {self.estimator!r}: give an object with the methods init, update "
                 "and estimate, as jq.control.InertiaEstimator describes them."
             )
+        for method, count in (("init", 1), ("update", 3), ("estimate", 1)):
+            require_signature(self.estimator, InertiaEstimator, method, count)
+        if isinstance(self.estimator, ProbingEstimator):
+            require_signature(self.estimator, ProbingEstimator, "probe", 1)
+            require_signature(self.estimator, ProbingEstimator, "excite", 1)
         if self.ladrc.order != 2:
             raise ValueError(
                 f"The ladrc is of order {self.ladrc.order}, but b0 = KT/J is the gain to an angle: "

@@ -6,6 +6,7 @@ from typing import Any
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Key
 
@@ -77,6 +78,16 @@ class Distribution(eqx.Module):
     def about(self, nominal: Numbers | None, name: str) -> "Distribution":
         """The distribution in SI units, given the `nominal` value of the quantity `name`."""
         return self
+
+    def log_density(self, x: Float[Array, "..."]) -> Float[Array, "..."]:
+        """The natural logarithm of the density at `x`, -inf outside the `support`; by JAX.
+
+        **Raises:** ValueError for a distribution without a density.
+        """
+        raise ValueError(
+            f"a jq.ensembles.{type(self).__name__} has no density: give Uniform, LogUniform, "
+            "Normal or LogNormal"
+        )
 
     @property
     @abc.abstractmethod
@@ -195,6 +206,10 @@ class Uniform(Distribution):
     def support(self) -> tuple[Numbers, Numbers]:
         return self.low, self.high
 
+    def log_density(self, x: Float[Array, "..."]) -> Float[Array, "..."]:
+        inside = (x >= self.low) & (x <= self.high)
+        return jnp.where(inside, -jnp.log(self.high - self.low), -np.inf)
+
     def grid_levels(self, count: int) -> Float[np.ndarray, " count"]:
         return np.linspace(0.0, 1.0, count) if count > 1 else np.array([0.5])  # with both ends
 
@@ -217,6 +232,11 @@ class LogUniform(Uniform):
     def quantile(self, u: Shares) -> Values:
         low, high = row(self.low), row(self.high)
         return np.clip(low * (high / low) ** u, low, high)
+
+    def log_density(self, x: Float[Array, "..."]) -> Float[Array, "..."]:
+        inside = (x >= self.low) & (x <= self.high)
+        density = -jnp.log(jnp.where(inside, x, 1.0)) - jnp.log(jnp.log(self.high / self.low))
+        return jnp.where(inside, density, -np.inf)
 
     @property
     def text(self) -> str:
@@ -253,6 +273,13 @@ class Normal(Distribution):
 
     def quantile(self, u: Shares) -> Values:
         return row(self._mean) + row(self.deviation) * normal_scores(u)
+
+    def log_density(self, x: Float[Array, "..."]) -> Float[Array, "..."]:
+        if self.mean is None:
+            raise ValueError(
+                "a relative jq.ensembles.Normal has no density: give Normal(deviation, mean=...)"
+            )
+        return _log_normal((x - self.mean) / self.deviation) - jnp.log(self.deviation)
 
     @property
     def support(self) -> tuple[Numbers, Numbers]:
@@ -304,6 +331,11 @@ class LogNormal(Distribution):
     def quantile(self, u: Shares) -> Values:
         return row(self.median) * np.exp(row(self.deviation) * normal_scores(u))
 
+    def log_density(self, x: Float[Array, "..."]) -> Float[Array, "..."]:
+        logarithm = jnp.log(jnp.where(x > 0, x, 1.0))
+        density = _log_normal((logarithm - jnp.log(self.median)) / self.deviation)
+        return jnp.where(x > 0, density - jnp.log(self.deviation) - logarithm, -np.inf)
+
     @property
     def support(self) -> tuple[Numbers, Numbers]:
         factor = np.exp(REACH * self.deviation)
@@ -312,6 +344,12 @@ class LogNormal(Distribution):
     @property
     def text(self) -> str:
         return f"log-normal {number(self.median)} */ exp({number(self.deviation)})"
+
+
+def _log_normal(score: Float[Array, "..."]) -> Float[Array, "..."]:
+    """Of the standard normal distribution without its tails."""
+    density = -0.5 * score**2 - 0.5 * np.log(2 * np.pi) - np.log1p(-2 * _TAIL)
+    return jnp.where(jnp.abs(score) <= REACH, density, -np.inf)
 
 
 def normal_scores(u: Shares) -> Shares:

@@ -6,9 +6,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Key
 
-from jaxquad._core import as_float, multiply_gains, require_all_positive
-from jaxquad.loops import Loop
-from jaxquad.models import DecoupledAxes, Multirotor
+from jaxquad._core import as_float, ensemble_shape, multiply_gains, require_all_positive
+from jaxquad.loops import Loop, Plant
+from jaxquad.models import Multirotor
 
 from ._distributions import (
     as_distribution,
@@ -27,10 +27,11 @@ from ._members import (
     MemberPayload,
     Members,
     nominal_value,
+    OF_PLANTS,
     Payload,
     plant_inertia,
+    require_variable,
     UNCERTAIN,
-    VariablePlant,
     vary_plant,
 )
 from ._posterior import Posterior
@@ -225,7 +226,7 @@ class Ensemble(eqx.Module):
         names = ("lag", "delay", "damping", "stiffness", "coulomb")
         return tuple(name for name in names if name in self.distributions)
 
-    def resolve(self, loop: Loop) -> tuple[VariablePlant, dict[str, Distribution]]:
+    def resolve(self, loop: Loop) -> tuple[Plant, dict[str, Distribution]]:
         """The nominal plant, and the distributions in SI units or as factors of nominal values.
 
         Raise ValueError for a loop that they do not fit.
@@ -235,16 +236,13 @@ class Ensemble(eqx.Module):
                 f"loop is a {type(loop).__name__}: give jq.Loop(plant, controller, ...)"
             )
         plant = loop.plant
-        if not isinstance(plant, DecoupledAxes | Multirotor):
+        if not isinstance(plant, Plant):
             raise ValueError(
-                f"the loop's plant is a {type(plant).__name__}, but an ensemble needs a "
-                "jq.DecoupledAxes or jq.models.Multirotor. For an identified model use "
-                "jq.Ensemble(jq.ensembles.Posterior(fit, ...)), with plant= for one of your own. "
-                "To fly any other plant, draw its arrays yourself, with the members on the last "
-                "axis and fields made by jq.loops.per_member, and fly them with "
-                "jq.evaluate(jq.Loop(plant, ...), scenario)"
+                f"the loop's plant is a {type(plant).__name__}, which lacks one of the methods "
+                "init, derivative and measure: add it, see jq.loops.Plant. For an identified model "
+                "use jq.Ensemble(jq.ensembles.Posterior(fit, ...))"
             )
-        shape = plant.shape[1:] if isinstance(plant, DecoupledAxes) else plant.ensemble
+        shape = ensemble_shape(plant)
         if shape or loop.delay.ndim:
             raise ValueError(
                 f"the loop already is an ensemble of {shape or loop.delay.shape}: give one plant "
@@ -267,13 +265,16 @@ class Ensemble(eqx.Module):
                 )
             if name in self.independent and rotors:
                 raise ValueError(f"{name} is the same for all axes: leave it out of independent=")
+            varies = one.varies or name not in FACTORS or np.any(one.support[0] != 1)
+            if varies and name in OF_PLANTS:
+                require_variable(plant, name)
             resolved[name] = (
                 one if name in FACTORS else one.about(self._nominal(loop, plant, name), name)
             )
             _check_support(name, resolved[name])
         return plant, resolved
 
-    def _nominal(self, loop: Loop, plant: VariablePlant, name: str) -> np.ndarray | None:
+    def _nominal(self, loop: Loop, plant: Plant, name: str) -> np.ndarray | None:
         if self.plants is not None:
             return None
         if name == "delay":

@@ -10,9 +10,16 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Int, Key, PyTree
 
 from jaxquad._compile import brief_options, Jit
-from jaxquad._core import as_float, is_concrete, mark_members, multiply_gains, per_member
+from jaxquad._core import (
+    as_float,
+    is_concrete,
+    mark_members,
+    member_rank,
+    multiply_gains,
+    per_member,
+)
 from jaxquad.control import schedule_for_flight
-from jaxquad.loops import Drive, Loop, Sensor
+from jaxquad.loops import Drive, Loop, Plant, Sensor
 from jaxquad.models import Attitude, DecoupledAxes, MotorLag, Multirotor
 from jaxquad.simulation import gauss_markov, Scenario
 
@@ -21,25 +28,27 @@ from ._distributions import as_distribution, Distribution, distribution_or_none
 
 # Factors of nominal values; the other quantities replace these.
 FACTORS = ("inertia", "torque_gain", "assumed_inertia")
+OF_PLANTS = ("inertia", "torque_gain", "lag", "damping", "stiffness", "coulomb")
 UNCERTAIN = (*FACTORS, "lag", "delay", "damping", "stiffness", "coulomb", "noise", "gust")
-VariablePlant = DecoupledAxes | Multirotor
 Numbers = Float[np.ndarray, "..."]
 Drawn = Mapping[str, Numbers]  # [axes] or [axes, members] of each quantity
 
 
-def nominal_value(plant: VariablePlant, name: str) -> Numbers | None:
+def nominal_value(plant: Plant, name: str) -> Numbers | None:
     """The value of a quantity in a plant without members; None if the plant does not have it."""
     if name == "lag" and isinstance(plant, Multirotor):
         return None if plant.motor is None else np.asarray(plant.motor.time_constant)
-    value = vars(plant.attitude if isinstance(plant, Multirotor) else plant).get(name)
+    value = getattr(plant.attitude if isinstance(plant, Multirotor) else plant, name, None)
     return None if value is None else np.asarray(value)
 
 
-def vary_plant(plant: VariablePlant, drawn: Drawn) -> VariablePlant:
+def vary_plant(plant: Plant, drawn: Drawn) -> Plant:
     """The plant with drawn factors of inertia and torque gain, and the other quantities replaced.
 
     Quantities that were not drawn keep the plant's value.
     """
+    if not isinstance(plant, DecoupledAxes | Multirotor):
+        return _vary_fields(plant, drawn)
     names = ("damping", "stiffness", "coulomb")
     values = {name: drawn.get(name, nominal_value(plant, name)) for name in names}
     changed = {name: value for name, value in values.items() if value is not None}
@@ -57,14 +66,47 @@ def vary_plant(plant: VariablePlant, drawn: Drawn) -> VariablePlant:
     return Multirotor(attitude, eqx.tree_at(where, plant.allocation, scaled), motor)
 
 
-def plant_inertia(plant: VariablePlant) -> Numbers:
+def _vary_fields(plant: Plant, drawn: Drawn) -> Plant:
+    """Of a class of the user's own: the fields with the names of what was drawn."""
+    names = [name for name in OF_PLANTS if name in drawn and member_rank(plant, name) == 1]
+
+    def varied(name: str) -> Array:
+        if name not in FACTORS:
+            return as_float(drawn[name])
+        return as_float(multiply_gains(np.asarray(getattr(plant, name)), drawn[name]))
+
+    where = lambda p: [getattr(p, name) for name in names]
+    return eqx.tree_at(where, plant, [varied(name) for name in names], is_leaf=lambda x: x is None)
+
+
+def require_variable(plant: Plant, name: str) -> None:
+    """Raise ValueError for a class of the user's own without the field that is to vary."""
+    if isinstance(plant, DecoupledAxes | Multirotor) or member_rank(plant, name) == 1:
+        return
+    raise ValueError(
+        f"{name} varies, but {type(plant).__name__} has no field of this name that is declared by "
+        f"jq.loops.per_member(rank=1), [axes, *ensemble]: add it. To vary a field of another name, "
+        "draw the members without it and give them its values, "
+        "eqx.tree_at(lambda members: members.plant.FIELD, members, values)"
+    )
+
+
+def plant_inertia(plant: Plant) -> Numbers:
     """[axes] or [axes, members], kg m^2."""
-    return np.asarray(plant.attitude.inertia if isinstance(plant, Multirotor) else plant.inertia)
+    inertia = nominal_value(plant, "inertia")
+    if inertia is None:
+        raise ValueError(
+            f"{type(plant).__name__} has no inertia [axes] in kg m^2, which an ensemble tells to "
+            "scheduled controllers: add a field inertia"
+        )
+    return inertia
 
 
-def count_axes(plant: VariablePlant) -> int:
+def count_axes(plant: Plant) -> int:
     """How many angles a plant turns by."""
-    return 3 if isinstance(plant, Multirotor) else plant.shape[0]
+    if isinstance(plant, DecoupledAxes | Multirotor):
+        return 3 if isinstance(plant, Multirotor) else plant.shape[0]
+    return len(eqx.filter_eval_shape(lambda p: p.measure(p.init()), plant))
 
 
 class Payload(eqx.Module):
@@ -131,7 +173,7 @@ class Members(eqx.Module):
     - `gust_corner`: rad/s.
     """
 
-    plant: VariablePlant
+    plant: Plant
     delay: Float[Array, " members"] = per_member(rank=0)
     assumed_inertia: Float[Array, "axes members"] = per_member(rank=1)
     keys: Key[Array, " members"] = per_member(rank=0)

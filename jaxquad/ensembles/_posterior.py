@@ -18,11 +18,12 @@ from jaxquad.identify import (
     known_covariance,
     UndeterminedError,
 )
+from jaxquad.loops import Plant
 from jaxquad.models import (
     AttitudeAxis,
     DecoupledAxes,
+    DiscreteTransferFunction,
     LaggedIntegrator,
-    Multirotor,
     TransferFunction,
 )
 
@@ -130,7 +131,11 @@ def _of_integrator(model: LaggedIntegrator, believed: Number) -> Build:
     return build
 
 
-def _of_transfer_function(model: TransferFunction, believed: Number) -> Build:
+def _of_transfer_function(
+    model: TransferFunction | DiscreteTransferFunction, believed: Number
+) -> Build:
+    if not isinstance(model, TransferFunction):
+        raise ValueError("the model is discrete: give plant=, or convert it, model.to_continuous()")
     denominator = np.asarray(model.denominator)
     integrators = int(np.argmax(denominator[::-1] != 0))
     order = denominator.size - 1 - integrators
@@ -281,7 +286,7 @@ class Posterior(eqx.Module):
                 )
         return plant, np.maximum(delay - self.held_back, 0.0)
 
-    def require_nominal(self, plant: DecoupledAxes | Multirotor) -> None:
+    def require_nominal(self, plant: Plant) -> None:
         """Raise ValueError unless `plant` is what the draws are around."""
         center = self.plant
         if not (

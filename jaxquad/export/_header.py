@@ -2,7 +2,6 @@
 
 import re
 from collections.abc import Iterable, Mapping
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from string import Template
 from typing import Literal, NamedTuple, Protocol, runtime_checkable
@@ -10,7 +9,7 @@ from typing import Literal, NamedTuple, Protocol, runtime_checkable
 import jax
 import numpy as np
 
-from jaxquad._core import write_file
+from jaxquad._core import __version__, write_file
 
 
 Precision = Literal["float", "double"]
@@ -92,7 +91,9 @@ def c_header(
     **Arguments:**
 
     - `controller`: a `LADRC`, `PID`, `ScheduledLADRC` or `ScheduledPID`, or one of your own with a
-        method `c_source`, an `ExportableController`.
+        method `c_source`, an `ExportableController`; or a `jq.control.FourierInertia`, whose
+        functions are `_init`, `_update(state, command, measurement)` and `_estimate(state, inertia,
+        deviation, trusted)`.
     - `name`: begins all identifiers.
     - `precision`: "float" or "double".
     - `axes`: how many; needed where all gains are scalars.
@@ -117,12 +118,8 @@ def c_header(
         source = controller.c_source(axes, precision)
     else:
         source = source_of(controller, axes, precision)
-    try:
-        release = version("jaxquad")
-    except PackageNotFoundError:
-        release = "from a source tree"
     comment = [
-        source.what, "", f"Written by jaxquad {release}; do not edit it, export it again.",
+        source.what, "", f"Written by jaxquad {__version__}; do not edit it, export it again.",
         f"Sample interval {source.dt!r} s, numbers in {precision}. SI units and radians.",
         *(f"{name}: {text}" for name, text in source.settings.items()),
     ]  # fmt: skip

@@ -15,6 +15,7 @@ from jaxquad.control import (
     Clamping,
     CurrentObserver,
     EulerObserver,
+    FourierInertia,
     InertiaMap,
     LADRC,
     PID,
@@ -23,6 +24,7 @@ from jaxquad.control import (
     ScheduledPID,
 )
 
+from ._estimator import estimator_source
 from ._header import braced, Gain, number, per_axis, Precision, require_precision, Source, type_of
 
 
@@ -46,11 +48,14 @@ class _Law(NamedTuple):
 
 
 def source_of(controller: object, axes: int | None, precision: Precision) -> Source:
-    """The C of a controller of jaxquad; ValueError for what cannot be written."""
+    """The C of a controller or estimator of jaxquad; ValueError for what cannot be written."""
+    if isinstance(controller, FourierInertia):
+        return estimator_source(controller, axes, precision)
     if isinstance(controller, AdaptiveLADRC):
         raise ValueError(
-            "The controller is an AdaptiveLADRC, whose estimator cannot be written in C: write a "
-            "jq.control.ScheduledLADRC, and call its _schedule with your estimate of the inertia."
+            "The controller is an AdaptiveLADRC, which is two headers in C: write a "
+            "jq.control.ScheduledLADRC and a jq.control.FourierInertia, and call the _schedule of "
+            "the first with your estimate of the inertia, such as the second's."
         )
     if type(controller) not in (LADRC, ScheduledLADRC, PID, ScheduledPID):
         raise ValueError(

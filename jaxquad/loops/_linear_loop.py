@@ -14,7 +14,7 @@ from jax.typing import DTypeLike
 from jaxtyping import Array, Complex, Float, Int
 
 from jaxquad._compile import brief_options, Jit
-from jaxquad._core import ensemble_shape
+from jaxquad._core import ensemble_shape, require_signature
 from jaxquad.control import LinearController, LinearisableController
 from jaxquad.models import imaginary, LinearAxis, matrix_exponential, split_delay
 
@@ -223,6 +223,8 @@ def linear_parts(
             f"{type(controller).__name__} has no method linear(axis, member) that returns a "
             "jq.control.LinearController: give it one, or pass the LinearController itself."
         )
+    require_signature(plant, LinearisablePlant, "linearise", 1)
+    require_signature(controller, LinearisableController, "linear", 2)
     ensemble = ensemble_shape(loop)
     if member is not None:
         member = member if isinstance(member, tuple) else (member,)

@@ -8,7 +8,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Bool, Float, PyTree
 
-from jaxquad._core import as_float, per_member, require_sample_interval
+from jaxquad._core import as_float, per_member, require_sample_interval, require_signature
 from jaxquad.control import LinearController, LinearisableController, Reference, ScheduledController
 from jaxquad.models import LinearAxis, Multirotor
 
@@ -71,14 +71,10 @@ class Sensor(Protocol):
 
 @runtime_checkable
 class LinearisablePlant(Protocol):
-    """A plant that `jq.analyse` can analyse as a linear loop.
-
-    Members of an ensemble, and so `jq.tune` and `jq.certify`, need more than that: a
-    `jq.DecoupledAxes` or a `jq.models.Multirotor`.
-    """
+    """A plant that `jq.analyse`, `jq.tune` and `jq.certify` can analyse as a linear loop."""
 
     def linearise(self, axis: int) -> LinearAxis:
-        """One axis about rest."""
+        """One axis about rest; all axes have as many states."""
         ...
 
 
@@ -97,6 +93,16 @@ class ChecksState(Protocol):
 
 
 _DEFAULT_DT = 0.002  # s
+_CALLS = (  # of a simulation: arguments by position, and by name
+    ("plant", Plant, "init", 0, "ensemble"),
+    ("plant", Plant, "derivative", 3),
+    ("plant", Plant, "measure", 1),
+    ("controller", Controller, "init", 1),
+    ("controller", Controller, "step", 3),
+    ("drive", Drive, "inputs", 1),
+    ("drive", Drive, "achieved", 1),
+    ("encoder", Sensor, "__call__", 1),
+)
 # A scheduled controller is tuned and certified: its members fly it at the inertia they are given.
 AnyController = Controller | LinearisableController | ScheduledController | LinearController
 
@@ -160,8 +166,9 @@ class Loop(eqx.Module):
     - `bound`: rad; a loop whose angle exceeds it has diverged.
     - `longest_delay`: s, the most that a `delay` traced by jit, vmap or grad can become.
 
-    **Raises:** ValueError for a value out of range, for a controller made for another `dt`, and for
-    a `jq.models.Multirotor` without a drive.
+    **Raises:** ValueError for a value out of range, for a controller made for another `dt`, for a
+    method with other arguments than its protocol's, and for a `jq.models.Multirotor` without a
+    drive.
     """
 
     plant: Plant
@@ -199,6 +206,8 @@ class Loop(eqx.Module):
                 f"the controller is a {type(self.controller).__name__}, which is a plant: give "
                 "jq.Loop(plant, controller, ...)"
             )
+        for part, protocol, method, count, *names in _CALLS:
+            require_signature(getattr(self, part), protocol, method, count, *names)
         made_for = getattr(self.controller, "dt", None)
         if made_for is not None and not math.isclose(made_for, self.dt, rel_tol=1e-6):
             raise ValueError(

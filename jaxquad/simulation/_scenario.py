@@ -1,11 +1,8 @@
 """What happens to a loop: scenarios from signals of single axes, and experiments."""
 
-import contextlib
 import functools as ft
 import math
 from collections.abc import Mapping, Sequence
-from pathlib import Path
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -16,7 +13,9 @@ from jaxtyping import Array, ArrayLike, Float, Key, PyTree
 from jaxquad._compile import brief_options, Jit
 from jaxquad._core import (
     as_float,
+    default_device,
     ensemble_shape,
+    free_memory,
     per_member,
     require_all_nonnegative,
     require_all_positive,
@@ -260,25 +259,8 @@ def require_memory(what: str, needed: float | int, remedy: str) -> None:
 
     Where a machine does not tell what that is, nothing is refused.
     """
-    chosen = getattr(jax.config, "jax_default_device", None)
-    free = free_memory(chosen if isinstance(chosen, jax.Device) else jax.local_devices()[0])
+    free = free_memory(default_device())
     if free is not None and needed > free:
         raise ValueError(
             f"{what} needs about {needed / _GB:.3g} GB, but {free / _GB:.3g} GB are free: {remedy}"
         )
-
-
-def free_memory(device: Any) -> float | None:
-    """Of a `jax.Device` in bytes; of the host for a CPU, and of what a container may use of it."""
-    if device.platform != "cpu":
-        stats = device.memory_stats() or {}
-        limit = stats.get("bytes_limit")
-        return None if limit is None else limit - stats.get("bytes_in_use", 0)
-    free: list[float] = []
-    with contextlib.suppress(OSError, StopIteration, ValueError):
-        lines = Path("/proc/meminfo").read_text().splitlines()
-        free.append(next(1024.0 * int(x.split()[1]) for x in lines if x.startswith("MemAvailable")))
-    # Of all that the container may use ("max" without a limit) the page cache can be freed.
-    with contextlib.suppress(OSError, ValueError):
-        free.append(float(Path("/sys/fs/cgroup/memory.max").read_text()))
-    return min(free, default=None)

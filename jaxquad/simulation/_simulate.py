@@ -11,7 +11,14 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, PyTree
 
 from jaxquad._compile import in_chunks, Jit, most_at_once, scan_members
-from jaxquad._core import align, ensemble_shape, is_concrete, mark_members, pytree_node
+from jaxquad._core import (
+    align,
+    ensemble_shape,
+    is_concrete,
+    mark_members,
+    pytree_node,
+    require_signature,
+)
 from jaxquad.loops import CarriesPayload, Loop, Plant
 from jaxquad.records import AXES, Record
 
@@ -199,6 +206,7 @@ def check_run(loop: Loop, scenario: Scenario) -> None:
                 "with_added_inertia(inertia) to carry it: add that method, or leave the payload "
                 "None"
             )
+        require_signature(plant, CarriesPayload, "with_added_inertia", 1)
         if is_concrete(payload):  # the plant refuses one that leaves it without inertia
             plant.with_added_inertia(np.min(np.asarray(payload), axis=0))
     for name, part in scenario.parts.items():

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key, PyTree
 
-from jaxquad._core import as_array
+from jaxquad._core import __version__, as_array
 from jaxquad.control import (
     certainty_equivalence,
     LADRC,
@@ -20,7 +20,7 @@ from jaxquad.control import (
     ScheduledLADRC,
 )
 from jaxquad.ensembles import Ensemble, Members, Posterior
-from jaxquad.loops import Loop
+from jaxquad.loops import Loop, Plant
 from jaxquad.models import DecoupledAxes, Multirotor, QUANSER_HOVER
 from jaxquad.simulation import (
     Authority,
@@ -34,7 +34,7 @@ from jaxquad.simulation import (
 from ._certificate import Certificate, find_ladrc, lag_remark, Provenance
 from ._design_result import analyse_further, evaluate_design, member_facts
 from ._objective import Limit, QUANTITIES
-from ._problem import decouple, DeviceChoice, Plant, require_ensemble, require_same_rate, TimeSpan
+from ._problem import decouple, DeviceChoice, require_ensemble, require_same_rate, TimeSpan
 from ._verdict import evaluate_attainable, measure_distances
 
 
@@ -129,7 +129,8 @@ def certify(
         "precision": str(drawn.assumed_inertia.dtype),
         "ensemble": None if given_members else str(ensemble).splitlines(),
         "device": jax.devices()[0].device_kind,
-        "versions": {name: version(name) for name in ("jaxquad", "jax", "jaxlib", "numpy")},
+        "versions": {"jaxquad": __version__}
+        | {name: version(name) for name in ("jax", "jaxlib", "numpy")},
         "controller": describe_controller(loop.controller),
     }
     alike = drawn.loop(loop.controller)
@@ -167,6 +168,11 @@ def _remarks(
     lag = lag_remark(controller, drawn.delay, decouple(drawn.plant).lag)
     if lag and (missed or not certificate.stable):
         yield lag
+    if not isinstance(drawn.plant, DecoupledAxes | Multirotor):
+        yield (
+            f"the plant is a {type(drawn.plant).__name__}: what its linear loop, its drive and a "
+            "disturbance do by themselves is computed from its linearise(axis)"
+        )
     if not certificate.independent:
         yield "the members were given: whether the tuner saw them is not known"
     counts = {n: x.unstable_count for n, x in certificate.designs.items() if x.unstable_count}
@@ -229,7 +235,7 @@ def paper_designs(plant: Plant, *, dt: float = 0.002) -> dict[str, LADRC]:
 
     **Arguments:**
 
-    - `plant`: the nominal `jq.DecoupledAxes` or `jq.models.Multirotor`, without an ensemble.
+    - `plant`: the nominal one, such as `loop.plant`, without an ensemble.
     - `dt`: the sample interval in s.
 
     **Returns:**
@@ -238,7 +244,7 @@ def paper_designs(plant: Plant, *, dt: float = 0.002) -> dict[str, LADRC]:
 
     **Raises:**
 
-    - `ValueError`: the plant is an ensemble, or of another kind.
+    - `ValueError`: the plant is an ensemble, or has no linear form.
     """
     KT, J = _nominal_numbers(plant)
     b = KT / J
@@ -279,12 +285,7 @@ def peers(plant: Plant, *, pid: PyTree | None = None, dt: float = 0.002) -> dict
 
 
 def _nominal_numbers(plant: Plant) -> tuple[Float[np.ndarray, " axes"], ...]:
-    """KT in N m per unit of command and J in kg m^2, in NumPy: nothing is compiled."""
-    if not isinstance(plant, DecoupledAxes | Multirotor):
-        raise ValueError(
-            f"the plant is a {type(plant).__name__}: give the nominal jq.DecoupledAxes or "
-            "jq.models.Multirotor, such as loop.plant"
-        )
+    """KT in N m per unit of command and J in kg m^2, in NumPy."""
     axes = decouple(plant)
     if len(axes.shape) > 1:
         raise ValueError(

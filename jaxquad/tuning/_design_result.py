@@ -21,7 +21,7 @@ from jaxquad.control import (
     schedule_for_analysis,
 )
 from jaxquad.ensembles import Ensemble, Members
-from jaxquad.loops import Loop, loop_numbers, LoopNumbers
+from jaxquad.loops import CarriesPayload, Loop, loop_numbers, LoopNumbers
 from jaxquad.simulation import (
     check_run,
     Devices,
@@ -320,7 +320,8 @@ def _linear(controller: PyTree, members: Members, flight: Scenario) -> LoopNumbe
     axes = flight.reference.shape[1]
     loop = members.loop(controller).with_controller(_widen(scheduled, axes, members.size))
     plants = [members.plant]
-    if flight.payload is not None:  # with the most and the least that the flight makes it carry
+    if flight.payload is not None and isinstance(members.plant, CarriesPayload):
+        # With the most and the least that the flight makes it carry.
         extremes = [np.max(flight.payload, axis=0), np.min(flight.payload, axis=0)]
         plants += [members.plant.with_added_inertia(x) for x in extremes if np.any(x != 0)]
     # Of the same members as different plants: stable where all are, else NaN as one of them.

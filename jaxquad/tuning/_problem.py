@@ -8,9 +8,16 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, PyTree
+from jaxtyping import Array, ArrayLike, Float, Int, PyTree
 
-from jaxquad._core import as_array, ensemble_shape, mark_members
+from jaxquad._core import (
+    align,
+    as_array,
+    ensemble_shape,
+    mark_members,
+    multiply_gains,
+    require_signature,
+)
 from jaxquad.control import (
     find_transform,
     ObserverController,
@@ -21,8 +28,8 @@ from jaxquad.control import (
 )
 from jaxquad.ensembles import Ensemble, Members
 from jaxquad.identify import Free, name_places, Parameters, Place, select_parameters, with_values
-from jaxquad.loops import linear_numbers, Loop
-from jaxquad.models import DecoupledAxes, Multirotor
+from jaxquad.loops import linear_numbers, LinearisablePlant, Loop, Plant
+from jaxquad.models import DecoupledAxes, LinearAxis, Multirotor
 from jaxquad.simulation import (
     check_run,
     Devices,
@@ -112,6 +119,7 @@ def select_coordinates(controller: PyTree, free: Free = None) -> Coordinates:
             f"a {type(controller).__name__} does not say which of its numbers are tuned: name "
             'them, free=["kp", "kd"], or give it a method tunable()'
         )
+    require_signature(controller, Tunable, "tunable", 0)
     free = list(controller.tunable()) if free is None else free
     places = name_places(controller)
     blocks: list[Block] = []
@@ -183,7 +191,6 @@ def _iter_modules(tree: PyTree) -> Iterator[eqx.Module]:
 
 
 DeviceChoice = int | Sequence[jax.Device] | None  # see `jq.evaluate`
-Plant = DecoupledAxes | Multirotor
 
 
 class TimeSpan(NamedTuple):
@@ -207,7 +214,7 @@ _SMOOTHING = 1e-6  # 1/s, of the abscissa: its derivative is off by as much, rel
 
 
 class LinearLoops(eqx.Module):
-    axes: DecoupledAxes  # the plant near level flight
+    axes: Plant  # near level flight, with a linear form
     delay: Float[Array, " members"]  # s
     assumed_inertia: Float[Array, "axes members"]  # kg m^2
     longest_delay: float = eqx.field(static=True)  # s
@@ -254,11 +261,11 @@ class LinearLoops(eqx.Module):
 
         if len(self.devices) < 2:
             return run((self.axes, self.delay, self.assumed_inertia), controller)
-        full = lambda x: jnp.broadcast_to(
-            x if x.ndim > 1 else x[:, None], (x.shape[0], self.members)
-        )
-        loops = (jax.tree.map(full, self.axes), self.delay, self.assumed_inertia)
-        return over_devices(run, loops, controller, devices=self.devices)
+        varies = mark_members(self.axes, (self.members,))
+        theirs, common = eqx.partition(self.axes, varies)
+        split = lambda loops, shared: run((eqx.combine(loops[0], shared[0]), *loops[1:]), shared[1])
+        loops = (theirs, self.delay, self.assumed_inertia)
+        return over_devices(split, loops, (common, controller), devices=self.devices)
 
 
 class Problem(eqx.Module):
@@ -331,23 +338,81 @@ def make_problem(
 
 
 def linear_loops(members: Members, devices: DeviceChoice) -> LinearLoops:
-    axes = decouple(members.plant)
+    axes = decouple(members.plant)  # refuses a plant that has no linear form
+    if not isinstance(members.plant, Multirotor):
+        axes = members.plant
     places = devices_for(members.size, devices)
     longest = float(members.longest_delay)
     return LinearLoops(axes, members.delay, members.assumed_inertia, longest, members.dt, places)
 
 
 def decouple(plant: object) -> DecoupledAxes:
-    """The plant near level flight, one axis at a time."""
-    axes = plant.decoupled() if isinstance(plant, Multirotor) else plant
-    if not isinstance(axes, DecoupledAxes):
+    """The plant near level flight, one axis at a time.
+
+    Of a class of the user's own it is what the linear forms tell; motors of more than one state
+    count as motors without a lag.
+    """
+    if isinstance(plant, DecoupledAxes | Multirotor):
+        return plant.decoupled() if isinstance(plant, Multirotor) else plant
+    if not isinstance(plant, LinearisablePlant):
         raise ValueError(
-            f"a {type(plant).__name__} cannot be tuned: its members are a jq.DecoupledAxes or a "
-            "jq.Multirotor, whose linear loops a tune needs. Of a fitted model of your own "
-            "jq.ensembles.Posterior(fit, plant=...) makes them; jq.simulate, jq.evaluate, their "
-            "derivatives and jq.analyse take any plant"
+            f"a {type(plant).__name__} has no method linearise(axis) that returns a "
+            "jq.models.LinearAxis, which jq.tune and jq.certify need of a plant: add it, see "
+            "jq.loops.LinearisablePlant"
         )
-    return axes
+    require_signature(plant, LinearisablePlant, "linearise", 1)
+    forms = _linear_forms(plant)
+    row = lambda pick: np.stack([np.asarray(pick(x)) for x in forms])
+    inertia = 1 / row(lambda x: x.torque[1])
+    times_inertia = lambda pick: multiply_gains(inertia, row(pick))
+    friction = getattr(plant, "coulomb", None)
+    return DecoupledAxes(
+        times_inertia(lambda x: x.gain), inertia,
+        lag=-1 / row(lambda x: x.A[2, 2]) if len(forms[0].A) == 3 else None,
+        damping=times_inertia(lambda x: -x.A[1, 1]), stiffness=times_inertia(lambda x: -x.A[1, 0]),
+        coulomb=None if friction is None else np.asarray(friction),
+    )  # fmt: skip
+
+
+@eqx.filter_jit
+def _linear_forms(plant: PyTree) -> list[LinearAxis]:
+    return [plant.linearise(axis) for axis in range(len(plant.measure(plant.init())))]
+
+
+class LinearisedPlant(eqx.Module):
+    """A plant of the user's own that moves as its linear forms say; states are [states, axes]."""
+
+    plant: PyTree
+    axes: int = eqx.field(static=True)
+
+    def init(
+        self, euler: ArrayLike | None = None, *, ensemble: tuple[int, ...] = ()
+    ) -> Float[Array, " states axes *ensemble"]:
+        form = self.plant.linearise(0)
+        angle = jnp.zeros(self.axes, form.A.dtype) if euler is None else jnp.asarray(euler)
+        wide = jnp.broadcast_shapes(ensemble_shape(self.plant), ensemble, angle.shape[1:])
+        state = jnp.zeros((len(form.A), self.axes, *wide), form.A.dtype)
+        return state.at[0].set(align(angle, state[0]))
+
+    def derivative(
+        self,
+        state: Float[Array, " states axes *ensemble"],
+        inputs: Float[Array, " axes *ensemble"],
+        disturbance: Float[Array, " axes *ensemble"],
+    ) -> Float[Array, " states axes *ensemble"]:
+        def of_axis(axis: int) -> Array:
+            form, x = self.plant.linearise(axis), state[:, axis]
+            pushes = align(form.command, x) * inputs[axis][None]
+            pushes += align(form.torque, x) * disturbance[axis][None]
+            return jnp.sum(align(form.A, state) * x[None], axis=1) + pushes
+
+        return jnp.stack([of_axis(axis) for axis in range(self.axes)], axis=1)
+
+    def measure(self, state: Float[Array, " states axes *ensemble"]) -> Array:
+        return state[0]
+
+    def with_added_inertia(self, inertia: ArrayLike) -> "LinearisedPlant":
+        return LinearisedPlant(self.plant.with_added_inertia(inertia), self.axes)
 
 
 def require_ensemble(ensemble: object) -> None:

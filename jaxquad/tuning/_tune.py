@@ -28,7 +28,7 @@ from ._cost import (
 )
 from ._design_result import certified_members
 from ._objective import Limit, Objective, QUANTITIES
-from ._problem import Bound, build_design, DeviceChoice
+from ._problem import Bound, build_design, decouple, DeviceChoice
 from ._tuner import ADDED, GUARDS, Method, Tuner
 from ._verdict import covers, Verdict, with_further
 
@@ -375,7 +375,7 @@ def _remarks(
         yield f"the slowest pole of a member decays at only {-slowest.max():.3g} 1/s"
     if not all(one.met for one in limits) or not tuner.stable[index]:
         linear = tuner.problem.linear
-        if remark := lag_remark(controller, linear.delay, linear.axes.lag):
+        if remark := lag_remark(controller, linear.delay, decouple(linear.axes).lag):
             yield remark
 
 

@@ -4,13 +4,15 @@ import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple, TYPE_CHECKING
 
+import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import Array, Bool, Float, PyTree
 
-from jaxquad._core import as_array
+from jaxquad._core import as_array, mark_members
 from jaxquad.control import LADRC, PID
 from jaxquad.ensembles import Members
+from jaxquad.models import DecoupledAxes, Multirotor
 from jaxquad.simulation import Authority, Encoder, Saturation, Scenario, window
 
 from ._design_result import (
@@ -22,7 +24,7 @@ from ._design_result import (
     with_further,
 )
 from ._objective import Limit, QUANTITIES, Risk, risk_text
-from ._problem import decouple, DeviceChoice, TimeSpan
+from ._problem import decouple, DeviceChoice, LinearisedPlant, TimeSpan
 
 
 if TYPE_CHECKING:
@@ -177,9 +179,11 @@ def evaluate_attainable(
     still = None if plant.coulomb is None else as_array(np.zeros(plant.coulomb.shape))
     free = lambda x: dataclasses.replace(x, limit=as_array(np.full(x.limit.shape, np.inf)))
     drive = free(drawn.drive) if isinstance(drawn.drive, Saturation) else None
-    ideal = dataclasses.replace(
-        drawn, plant=dataclasses.replace(plant, coulomb=still), drive=drive, encoder=None
-    )
+    if isinstance(drawn.plant, DecoupledAxes | Multirotor):
+        without_friction = dataclasses.replace(plant, coulomb=still)
+    else:
+        without_friction = LinearisedPlant(drawn.plant, axes)
+    ideal = dataclasses.replace(drawn, plant=without_friction, drive=drive, encoder=None)
     is_limited = lambda x: isinstance(x, LADRC | PID)
     unlimited = jax.tree.map(
         lambda x: free(x) if is_limited(x) else x, controller, is_leaf=is_limited
@@ -228,8 +232,9 @@ def evaluate_attainable(
             carried = np.maximum(carried, np.abs(angle) - reach)
         rows.append((least, nothing, carried))
         seconds.append(count * h)
+    theirs = jax.tree.leaves(eqx.filter(drawn.plant, mark_members(drawn.plant, (drawn.size,))))
     different = (inertia, gain, lag, damping, stiffness, friction, delay[None], payload,
-                 np.asarray(drawn.assumed_inertia))  # fmt: skip
+                 np.asarray(drawn.assumed_inertia), *map(np.asarray, theirs))  # fmt: skip
     varies = any(np.any(np.ptp(x, axis=-1) > 0) for x in different)
     drive_bound, nothing, carried = (np.stack(x) for x in zip(*rows, strict=True))
     half_squares = 0.5 * np.reshape(seconds, (-1, 1, 1)) ** 2

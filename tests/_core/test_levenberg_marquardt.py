@@ -9,6 +9,7 @@ from scipy.optimize import least_squares
 from jaxquad._core import (
     CONVERGED,
     decrement,
+    invert_definite,
     minimise,
     Normal,
     normal_equations,
@@ -60,6 +61,17 @@ def test_a_definite_matrix_is_told_from_others():
     solution, definite = solve_definite(jnp.asarray(matrix), jnp.ones((2, 2)))
     np.testing.assert_array_equal(definite, [True, False])
     np.testing.assert_allclose(solution[:, 0], np.linalg.solve(matrix[..., 0], np.ones(2)))
+
+
+def test_inverse_and_determinant_of_definite_matrices_are_those_of_numpy():
+    root = np.random.default_rng(0).standard_normal((3, 2, 5, 8))
+    matrix = jnp.asarray(root @ np.swapaxes(root, -1, -2))
+    inverse, volume = invert_definite(matrix)
+    np.testing.assert_allclose(inverse, np.linalg.inv(matrix), rtol=1e-9)
+    np.testing.assert_allclose(volume, np.linalg.slogdet(matrix)[1], rtol=1e-12)
+    # d ln det A / dA = A^-1
+    slopes = jax.grad(lambda x: jnp.sum(invert_definite(x)[1]))(matrix)
+    np.testing.assert_allclose(slopes, inverse, rtol=1e-9)
 
 
 def test_a_start_close_to_the_minimum_along_a_weak_direction_is_not_taken_for_it():

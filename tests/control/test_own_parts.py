@@ -186,6 +186,47 @@ def test_a_controller_flies_as_its_linear_form_says():
     assert not bool(jq.analyse(unstable).stable)
 
 
+class TwoSlopes(eqx.Module):
+    """u = kp f(e) - kd y', where f has half the slope beyond 0.03 rad."""
+
+    kp: jax.Array
+    branches: bool = eqx.field(static=True, default=True)
+
+    def init(self, like):
+        return jnp.zeros_like(like)
+
+    def step(self, state, reference, measurement):
+        error, rate = reference - measurement, (measurement - state) / DT
+        far = lambda e: 0.5 * e + 0.015 * jnp.sign(e)
+        if self.branches:
+            near = jnp.vectorize(lambda e: jax.lax.cond(jnp.abs(e) > 0.03, far, lambda e: e, e))
+            return measurement, self.kp * near(error) - 4.0 * rate
+        slopes = jnp.where(jnp.abs(error) > 0.03, far(error), error)
+        return measurement, self.kp * slopes - 4.0 * rate
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("members", [3, 70])  # computed as a few, and as many
+def test_a_controller_may_branch_otherwise_for_each_member(members):
+    loop = jq.Loop(PLANT, TwoSlopes(jnp.asarray(20.0)), drive=jq.simulation.Saturation(10.0))
+    spread = jq.Ensemble(inertia=jq.ensembles.LogUniform(0.5, 3.0))
+    drawn = spread.draw(loop, members, jax.random.key(0))
+    brief = jq.scenario(duration=0.6, axes=1, reference=jq.Step(0.1))
+    angle = np.asarray(jq.simulate(drawn.loop(loop.controller), drawn.flight(brief)).angle)
+    far = np.abs(0.1 - angle) > 0.03
+    assert np.any(far.any(axis=-1) & ~far.all(axis=-1))  # at the same sample
+
+    def cost(kp, branches):
+        controller = TwoSlopes(kp, branches)
+        flown = jq.evaluate(drawn.loop(controller), drawn.flight(brief))
+        return jnp.mean(flown.itae), flown.itae
+
+    gradient = lambda branches: jax.value_and_grad(cost, has_aux=True)(jnp.asarray(20.0), branches)
+    mine, same = gradient(True), gradient(False)
+    for one, other in zip(jax.tree.leaves(mine), jax.tree.leaves(same), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-9)
+
+
 @pytest.mark.slow
 def test_an_observer_of_the_same_matrices_flies_and_is_linearised_as_the_librarys():
     own, same = (
