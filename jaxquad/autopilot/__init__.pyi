@@ -1,3 +1,10 @@
+from ._comparison import (
+    AxisComparison as AxisComparison,
+    ChangedSetting as ChangedSetting,
+    compare_axes as compare_axes,
+    ComparedQuantity as ComparedQuantity,
+    FlightComparison as FlightComparison,
+)
 from ._filter_bank import filter_choices as filter_choices
 from ._filters import (
     ardupilot_notch as ardupilot_notch,
@@ -24,6 +31,9 @@ from ._firmware import (
     Numbers as Numbers,
     OuterLoop as OuterLoop,
     Parameter as Parameter,
+    Recipe as Recipe,
+    RecipeOption as RecipeOption,
+    RecipeSteps as RecipeSteps,
     register as register,
     rows_of_axes as rows_of_axes,
 )
@@ -34,6 +44,11 @@ from ._flight_channels import (
     read_channels_if_any as read_channels_if_any,
     read_flown as read_flown,
     settings_of as settings_of,
+)
+from ._flight_qualities import (
+    Estimate as Estimate,
+    FlownAxis as FlownAxis,
+    measured_step as measured_step,
 )
 from ._gains import (
     Cascade as Cascade,
@@ -67,6 +82,7 @@ from ._law_check import check_law as check_law, check_loop as check_loop
 from ._page import (
     B0Section as B0Section,
     PilotPage as PilotPage,
+    proposed_steps as proposed_steps,
     write_pilot_page as write_pilot_page,
 )
 from ._parameters import (
@@ -88,7 +104,6 @@ from ._parameters import (
 from ._proposal import (
     AutopilotProposal as AutopilotProposal,
     AxesProposal as AxesProposal,
-    judge as judge,
 )
 from ._rate_design import design_gains as design_gains
 from ._rate_loops import (
@@ -104,6 +119,7 @@ from ._replay import (
     reproduce_flight as reproduce_flight,
     Reproduction as Reproduction,
 )
+from ._verdict import judge as judge
 from .firmwares._ardupilot import (
     ardupilot_harmonic_notch as ardupilot_harmonic_notch,
     ardupilot_loop as ardupilot_loop,

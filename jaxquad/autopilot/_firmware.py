@@ -6,7 +6,9 @@ A firmware is one file: `firmwares/_px4.py` is a short one, and CONTRIBUTING.md 
 import abc
 import dataclasses
 import importlib
+import textwrap
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Any, cast, Literal, NamedTuple
 
 import numpy as np
@@ -22,8 +24,8 @@ from ._law import FlownLoop
 
 
 Stage = Literal["gyro", "derivative"]
-Values = Sequence[tuple["Parameter", float, float]]  # parameter, the value to set, the other one
-Words = Sequence[tuple[str, str, str]]  # name, the word to set, the other one
+Values = Sequence[tuple["Parameter", float, float]]  # parameter, the value to set, what flew
+Words = Sequence[tuple[str, str, str]]  # name, the word to set, what flew
 Span = tuple[float | None, float | None]  # s; None: from the beginning, to the end
 HOVER = 0.3  # of the throttle, where a log does not hold it
 
@@ -143,6 +145,104 @@ class Channels(NamedTuple):
     resolution: tuple[float, float] = (0.0, 0.0)  # steps of rates (rad/s) and terms; 0 is none
 
 
+# Of all recipes.
+_DEFAULTS = "The lines to go back set the firmware's defaults: what you saved holds your own."
+_HOVER = "Hover 10 m high or more over open ground, away from people, in little wind"
+_OTHER_THROTTLES = (
+    "For gains that hold over the throttle, fly it again with 0.1 of throttle less and more, in "
+    "turns of about 8 s, as the vehicle sinks or climbs."
+)
+
+
+_ENDINGS = (".param", ".params")  # of files that ground stations load
+
+
+class RecipeSteps(NamedTuple):
+    """What a pilot does, in sentences."""
+
+    before: str
+    flight: str
+    abort: str
+    after: str
+
+
+@dataclasses.dataclass(frozen=True)
+class Recipe:
+    """What to set and to fly, so that `jaxquad autopilot` can tune from the log.
+
+    **Arguments:**
+
+    - `firmware`: its name; `axes`: which of roll, pitch and yaw are excited.
+    - `paste`: the text to paste; `back`: that of the settings afterwards, the firmware's defaults.
+    - `load`: both, as files that the firmware's ground station loads, whose names end in `suffix`.
+    - `steps`: what to do before, in flight, to abort, and after.
+    - `command`: what to run with the log.
+    """
+
+    firmware: str
+    axes: tuple[str, ...]
+    paste: str
+    back: str
+    load: tuple[str, str]
+    suffix: str
+    steps: RecipeSteps
+    command: str
+
+    def files(self, path: str | Path) -> dict[Path, str]:
+        """What to write: to `path` what to set, and to another one with `_back` what goes back.
+
+        A path that ends in `suffix` gets a file to load, another one the text to paste.
+
+        **Raises:** `ValueError`: the path has the ending of another firmware's files.
+        """
+        path = Path(path)
+        ending = path.suffix.lower()
+        if ending in _ENDINGS and ending != f".{self.suffix}":
+            raise ValueError(
+                f"{path.name} has the ending of another firmware: what {self.firmware} loads ends "
+                f"in .{self.suffix}, so name it {path.with_suffix(f'.{self.suffix}').name}."
+            )
+        texts = self.load if ending == f".{self.suffix}" else (self.paste, self.back)
+        paths = path, path.with_name(f"{path.stem}_back{path.suffix}")
+        return dict(zip(paths, texts, strict=True))
+
+    def content(self) -> dict[str, object]:
+        """All of it for JSON."""
+        return {**vars(self), "steps": self.steps._asdict()}
+
+    def __str__(self) -> str:
+        text = lambda words: textwrap.fill(words, 78, break_on_hyphens=False)
+        lines = lambda words: textwrap.indent(words.rstrip(), "  ")
+        parts = {
+            "Before": text(self.steps.before), "Paste": lines(self.paste),
+            "In flight": text(self.steps.flight), "Abort": text(self.steps.abort),
+            "After": text(self.steps.after), "Paste to go back": lines(self.back),
+            "Then": lines(self.command),
+        }  # fmt: skip
+        head = f"{self.firmware}: what to fly for the gains of {', '.join(self.axes)}"
+        return "\n\n".join([head, *(f"{title}:\n{part}" for title, part in parts.items())])
+
+
+class RecipeOption(NamedTuple):
+    """A number of a recipe that a pilot may choose."""
+
+    name: str
+    usual: Number
+    low: Number
+    high: Number
+    meaning: str
+
+    def choose(self, value: Number | None) -> float:
+        """The value, or the usual one for None. Raises ValueError where it is out of range."""
+        value = self.usual if value is None else value
+        if not self.low <= value <= self.high:
+            raise ValueError(
+                f"`{self.name}` is {value:g}, {self.meaning}: give {self.low:g} to {self.high:g}, "
+                f"or leave it out for {self.usual:g}."
+            )
+        return float(value)
+
+
 class Firmware(abc.ABC):
     """A firmware: what flies, its parameters and files, and what its logs hold.
 
@@ -155,6 +255,7 @@ class Firmware(abc.ABC):
     fields: tuple[str, str, str] = ("p", "i", "d")  # of the rate law, which are tuned
     unit: str = "command"  # of the law's command
     suffix: str = "param"  # of parameter files
+    file_head: tuple[str, ...] = ()  # comments that begin them
     # Relative thrust of a motor of a quad X per unit of output, of three axes.
     motor_shares: tuple[float, float, float] = (1.0, 1.0, 1.0)
     follows_throttle: bool = False  # whether the law changes with the throttle
@@ -178,9 +279,51 @@ class Firmware(abc.ABC):
     def channels(self, prefix: str, axis: int, values: Mapping[str, str]) -> Channels:
         """Of a log with these parameters whose channels begin with `prefix`."""
 
-    @abc.abstractmethod
+    # What to fly
+
+    def recipe(
+        self, axes: Sequence[str], *, amplitude: Number | None = None, switch: int | None = None
+    ) -> Recipe | None:
+        """What to set and fly to excite the axes; None where there is none.
+
+        `amplitude` is that of the excitation in the firmware's unit, `switch` what starts it; None
+        are usual ones. Raises ValueError for those that are not flyable.
+        """
+        return None
+
+    def make_recipe(
+        self, axes: Sequence[str], paste: Sequence[str], back: Sequence[str], *, before: str,
+        flight: str, abort: str, after: str, log: str,
+        load: tuple[Mapping[str, Number | str], Mapping[str, Number | str]] | None = None,
+    ) -> Recipe:  # fmt: skip
+        """Of lines, sentences (`flight` begins with the mode), and the name of a log.
+
+        `load` are the parameters of both texts, where a ground station loads them as files.
+        """
+        steps = RecipeSteps(
+            f"{before} {_DEFAULTS}", f"{_HOVER}, {flight}", abort, f"{after} {_OTHER_THROTTLES}"
+        )
+        command = f"jaxquad autopilot {log}" + (f" --axis {axes[0]}" if len(axes) == 1 else "")
+        texts = joined_lines(paste), joined_lines(back)
+        files = texts if load is None else (
+            self._recipe_file(f"what to set, to excite {', '.join(axes)}", load[0]),
+            self._recipe_file("the firmware's defaults, to go back", load[1]),
+        )  # fmt: skip
+        return Recipe(self.log.name, tuple(axes), *texts, files, self.suffix, steps, command)
+
+    def _recipe_file(self, title: str, values: Mapping[str, Number | str]) -> str:
+        line = lambda name, value: self.file_line(name, str(value), isinstance(value, int))
+        rows = [line(name, value) for name, value in values.items()]
+        return joined_lines([f"# {title}", *self.file_head, *rows])
+
     def what_to_fly(self, axis: str) -> str:
-        """A flight that excites the axis: what to set, what to fly, how to end it."""
+        """A flight that excites the axis: that of the recipe, and how to get all of it."""
+        recipe = self.recipe([axis])
+        if recipe is None:
+            return f"Fly this: strong and quick {axis} stick for 20 s"
+        flight = recipe.steps.flight[0].lower() + recipe.steps.flight[1:]
+        command = f"jaxquad recipe {self.log.name} --axis {axis}"
+        return f"Fly this: {flight} What to set before, and how to abort, says {command}"
 
     # What a log holds beside its channels
 
@@ -270,12 +413,16 @@ class Firmware(abc.ABC):
         self, values: Values, title: str, *, version: tuple[int, ...], profile: int | None,
         raised: Sequence[str], words: Words,
     ) -> str:  # fmt: skip
-        """The text to load, see `jq.autopilot.parameter_file`; by default lines `NAME,value`."""
-        rows = [f"# {title}"] if title else []
-        for row, value, other in values:
-            rows.append(f"# {row.name} was {number_text(other, row.integer)}")
-            rows.append(f"{row.name},{number_text(value, row.integer)}")
+        """The text to load, see `jq.autopilot.parameter_file`; by default of `file_line`s."""
+        rows = [f"# {title}", *self.file_head] if title else list(self.file_head)
+        for row, value, flown in values:
+            rows.append(f"# the flight had {row.name} {number_text(flown, row.integer)}")
+            rows.append(self.file_line(row.name, number_text(value, row.integer), row.integer))
         return joined_lines(rows)
+
+    def file_line(self, name: str, text: str, is_whole: bool) -> str:
+        """What sets a parameter in a file, by default `NAME,value`."""
+        return f"{name},{text}"
 
 
 def number_text(value: Number, is_whole: bool) -> str:

@@ -32,6 +32,7 @@ from ._parameters import flown_loop, gains_of, parameters_of
 
 Samples = Float[np.ndarray, " samples"]
 _AT_END = 0.002  # of a motor's range
+_RESTS = np.radians(5.0)  # rad/s, of the set-point: less identifies nothing
 
 
 @runtime_checkable
@@ -109,6 +110,18 @@ class FlightChannels:
         if self.stick is not None:
             return self.stick
         return np.full(len(self.setpoint), HOVER) if self.throttle is None else self.throttle
+
+    @property
+    def rests(self) -> bool:
+        """Whether nothing excites the axis: its set-point is still, and nothing is injected."""
+        injected = self.injected is not None and np.any(self.injected)
+        return bool(not injected and np.std(self.setpoint) <= _RESTS)
+
+    @property
+    def rest_text(self) -> str:
+        """In words, that the axis `rests`, and when: other parts of the log may have moved it."""
+        stop = self.start + (len(self.setpoint) - 1) * self.dt
+        return f"you did not move {AXES[self.axis]} from {self.start:.3g} to {stop:.3g} s"
 
     @property
     def limited(self) -> Samples:

@@ -48,6 +48,7 @@ from ._parameters import find_parameter, ParameterChange, propose_changes
 
 
 Frequencies = Float[np.ndarray, " frequencies"]
+Steps = Float[np.ndarray, "plants samples"]
 _SAME = 1e-3  # of the response of filters, by which those of several logs may differ
 _AT = np.array([3.0, 10.0, 30.0])  # Hz
 
@@ -176,15 +177,21 @@ class StepGrid(NamedTuple):
         fade = np.cos(np.linspace(0, np.pi / 2, omega.size)) ** 2
         return cls(coarse, omega, fade if coarse > dt else np.ones(omega.size))
 
-    def band(self, closed: Complex[np.ndarray, "plants frequencies"]) -> StepBand:
-        """Of the responses from set-point to rate: median and 95 % of the plants."""
+    def steps(self, closed: Complex[np.ndarray, "plants frequencies"]) -> Steps:
+        """Of the responses from set-point to rate."""
         response = np.pad(self.fade * closed, ((0, 0), (1, 1)))
         response[:, 0] = 1.0
         impulse = np.fft.irfft(response, 2 * (self.omega.size + 1), axis=1)
-        shown = int(_SHOWN / self.dt)
-        steps = np.cumsum(impulse, axis=1)[:, :shown]
+        return np.cumsum(impulse, axis=1)[:, : int(_SHOWN / self.dt)]
+
+    def band(self, closed: Complex[np.ndarray, "plants frequencies"]) -> StepBand:
+        """Likewise, their median and 95 % of the plants."""
+        return self.band_of(self.steps(closed))
+
+    def band_of(self, steps: Steps) -> StepBand:
+        """Of computed steps."""
         low, middle, high = np.percentile(steps, [2.5, 50.0, 97.5], axis=0)
-        return StepBand(np.arange(shown) * self.dt, middle, low, high)
+        return StepBand(np.arange(steps.shape[1]) * self.dt, middle, low, high)
 
 
 Response = Complex[np.ndarray, " frequencies"]

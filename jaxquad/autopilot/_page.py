@@ -19,10 +19,11 @@ from ._filter_bank import gyro_noise, GyroNoise, hann_spectra, NoNoise, SLOWEST
 from ._filters import FilterChain
 from ._firmware import firmware_named
 from ._flight_channels import FlightChannels
+from ._flight_qualities import measured_step
 from ._identified_log import StepGrid
 from ._law import RateLoop
-from ._parameters import gains_in, gains_of, ParameterChange, WordChange
-from ._rate_loops import DesignSettings, draw_loops, gyro_chain_response, law_paths, Stage, WAYS
+from ._parameters import gains_in, gains_of, list_reasons, ParameterChange, WordChange
+from ._rate_loops import draw_loops, gyro_chain_response, law_paths, Limits, Stage, WAYS
 
 
 if TYPE_CHECKING:
@@ -52,6 +53,7 @@ class PilotPage:
     derivative: Mapping[str, Spectrum] = dataclasses.field(default_factory=dict)
     noise: str = ""  # what the spectra are of
     steps: Mapping[str, StepBand] = dataclasses.field(default_factory=dict)
+    measured: StepBand | None = None  # the step of the log itself
     b0: B0Section | None = None  # over the throttle, of an ADRC
     terms: Mapping[str, float] = dataclasses.field(default_factory=dict)  # rms of P, I, D and F
     terms_are: str = ""  # logged, or computed
@@ -69,12 +71,15 @@ class PilotPage:
     failures: Mapping[str, str] = dataclasses.field(default_factory=dict)
 
 
-def write_pilot_page(path: str | Path, *pages: PilotPage) -> Path:
+def write_pilot_page(
+    path: str | Path, *pages: PilotPage, files: Mapping[str, str] | None = None
+) -> Path:
     """Write one self-contained HTML page on proposals for an autopilot, whole or not at all.
 
     It is made as `jaxquad.report.write_report` makes its page: figures inside it, nothing fetched,
     texts from a log escaped, and a section or a figure that cannot be computed says why. There is a
-    page for each axis; the provenance is that of the first. Returns the path.
+    page for each axis; the provenance is that of the first. `files` are texts to load by the names
+    of the files beside the page, to which it links. Returns the path.
     """
     first, origin = pages[0], pages[0].provenance
     axes = []
@@ -93,6 +98,7 @@ def write_pilot_page(path: str | Path, *pages: PilotPage) -> Path:
         "pilot.html",
         title=f"{first.headlines[0].word}: {first.title}" if len(pages) == 1 else first.overview,
         axes=axes,
+        files=files or {},
         origin=None if origin is None else report.attempt(report.provenance_section, origin),
     )
     return write_file(path, text)
@@ -148,19 +154,28 @@ def noise_section(page: PilotPage) -> PageSection:
 
 
 def steps_section(page: PilotPage) -> PageSection:
-    if not page.steps:
+    steps = dict(page.steps) if page.measured is None else {**page.steps, "measured": page.measured}
+    if not steps:
         return None
+    caption = (
+        "The logged rate after a step of 1 of the set-point, without feed-forward: median and 95 % "
+        "of the plants that the log leaves possible."
+    )
+    if page.measured is not None:
+        caption += (
+            " Measured: the log's own response, with feed-forward and all else that flew; where it "
+            "differs, these do it."
+        )
     image = report.embed_figure(
-        lambda: plot.steps_figure(page.steps),
-        alt=f"Rate after a step of the set-point: {', '.join(page.steps)}; 95 % of the plants.",
-        caption="The logged rate after a step of 1 of the set-point, without feed-forward: median "
-        "and 95 % of the plants that the log leaves possible.",
+        lambda: plot.steps_figure(page.steps, measured=page.measured),
+        alt=f"Rate after a step of the set-point: {', '.join(steps)}; bands of 95 %.",
+        caption=caption,
     )
     rows: Rows = []
-    for name, band in page.steps.items():
-        half = 1e3 * float(band.time[(band.middle >= 0.5).argmax()])
-        over = [100 * max(float(x.max()) - 1, 0.0) for x in (band.middle, band.high)]
-        rows.append([Cell(name), f"{over[0]:.0f}", f"{over[1]:.0f}", f"{half:.0f}"])
+    for name, band in steps.items():
+        middle, worst = band.overshoot
+        times = f"{1e3 * band.half_way:.0f}"
+        rows.append([Cell(name), f"{100 * middle:.0f}", f"{100 * worst:.0f}", times])
     heads = ("gains", "overshoot, %", "worst, %", "half way after, ms")
     return {"image": image, "table": Table("Step responses", heads, rows)}
 
@@ -229,7 +244,7 @@ _WINDOW = 4.0  # s, of computed terms
 _NEAR = 0.005  # of a motor's range, from its ends
 VERDICTS = {
     "proposed": ("good", "PROPOSED"), "kept": ("good", "WHAT FLEW IS KEPT"),
-    "cannot tell": ("bad", "THIS LOG CANNOT TELL"), "not to be flown": ("bad", "NOT TO BE FLOWN"),
+    "cannot tell": ("warn", "THIS LOG CANNOT TELL"), "not to be flown": ("bad", "NOT TO BE FLOWN"),
 }  # fmt: skip
 Designs = Mapping[str, tuple[RateLoop, Float[np.ndarray, " gains"]]]
 Spectra = dict[str, Spectrum]
@@ -258,14 +273,10 @@ def pilot_page(proposal: "AutopilotProposal", origin: Provenance, overview: str)
                 pass
         return noise, *(({}, {}) if noise is None else noise_spectra(noise, axis, designs))
 
-    designs = {"flown": (law, gains_of(law, axis))}
-    if new:
-        changed = {} if filters is None else {name: new[name] for name in filters.flown}
-        after = flown.with_filters(changed) if changed else law
-        designs["proposed"] = (after, gains_in(law, axis, new))
+    designs = _designs_of(proposal)
     noise, gyro, derivative = computed("noise", spectra, (None, {}, {}))
-    fitted = proposal.identification.fit.identifiable
-    steps = computed("steps", lambda: step_bands(proposal, designs) if fitted else {}, {})
+    steps = computed("steps", lambda: proposed_steps(proposal), {})
+    measured = computed("steps", lambda: measured_step(flight), None)
     logged = flight is not None and {"P", "I"} <= set(flight.terms)
     compute_terms = lambda: (
         {} if flight is None else logged_terms(flight) if logged
@@ -289,7 +300,7 @@ def pilot_page(proposal: "AutopilotProposal", origin: Provenance, overview: str)
         remarks=[
             *(f"not modelled: {text}" for text in flown.loop.unmodelled),
             *([flown.filters_text] if flown.filters_text else []),
-            *([limits_text(proposal.settings)] if new else []),
+            *([limits_text(proposal.settings), FORWARD_STAYS] if new else []),
         ],
         filters={
             name: chains_of(other, axis)
@@ -302,6 +313,7 @@ def pilot_page(proposal: "AutopilotProposal", origin: Provenance, overview: str)
             f"{noise.least_hz:.0f} Hz motion is taken for noise, so the level above is used."
         ),
         steps=steps,
+        measured=None if measured is None else measured.step,
         terms=computed("balance", compute_terms, {}),
         terms_are="as logged" if logged else "computed by the law from set-point and rate",
         motors=[] if flight is None else motor_rows(flight),
@@ -348,8 +360,26 @@ def noise_spectra(noise: GyroNoise, axis: int, designs: Designs) -> tuple[Spectr
     return gyro, derivative
 
 
-def step_bands(proposal: "AutopilotProposal", designs: Designs) -> dict[str, StepBand]:
-    """From set-point to rate, of plants drawn from the fit: by their responses."""
+def _designs_of(proposal: "AutopilotProposal") -> Designs:
+    """Law and gains of what flew, and of the proposal where there is one."""
+    law, axis = proposal.flown.law, proposal.flown.axis
+    designs = {"flown": (law, gains_of(law, axis))}
+    if new := proposal.new:
+        filters = proposal.filters
+        changed = {} if filters is None else {name: new[name] for name in filters.flown}
+        after = proposal.flown.with_filters(changed) if changed else law
+        designs["proposed"] = (after, gains_in(law, axis, new))
+    return designs
+
+
+def proposed_steps(proposal: "AutopilotProposal") -> dict[str, StepBand]:
+    """Flown and proposed, from set-point to rate, of plants drawn from the fit: by their responses.
+
+    Empty where the log does not determine the plant.
+    """
+    designs = _designs_of(proposal)
+    if not proposal.identification.fit.identifiable:
+        return {}
     flown, seed = proposal.flown, proposal.settings.seed + _SEED
     grid, steps = StepGrid.of(flown.law.dt), {}
     loops = draw_loops(
@@ -420,18 +450,24 @@ def stage_rows(proposal: "AutopilotProposal") -> Table:
 
 def change_rows(changes: Sequence[ParameterChange], words: Sequence[WordChange] = ()) -> Table:
     rows: Rows = [
-        [Cell(row.name), f"{old:.5g}", f"{new:.5g}", row.unit, row.range_text, reason]
-        for row, old, new, reason in changes
+        [Cell(row.name), f"{old:.5g}", f"{new:.5g}", row.unit, row.range_text]
+        for row, old, new, _ in changes
     ]
-    rows += [[Cell(word.name), word.old, word.new, "", "", word.reason] for word in words]
-    heads = ("parameter", "old", "new", "unit", "range", "reason")
-    return Table("From what flew to the proposal", heads, rows)
+    rows += [[Cell(word.name), word.old, word.new, "", ""] for word in words]
+    heads = ("parameter", "old", "new", "unit", "range")
+    notes = list_reasons(changes, words)
+    return Table("From what flew to the proposal", heads, rows, notes=notes)
 
 
-def limits_text(limits: DesignSettings) -> str:
-    """Of what the limits are relative to, and when to stop."""
+FORWARD_STAYS = "feed-forward stays as it flew"
+
+
+def limits_text(limits: Limits) -> str:
+    """What the search was allowed, relative to what, and when to stop."""
     return (
-        f"limits: noise {limits.noise:g} times and gains {limits.change:g} times those of this "
-        "flight at most. They compound from log to log: stop where a log keeps what flew, or the "
-        "motors get warm"
+        f"limits: the response to the set-point may peak at {limits.resonance:g} (`resonance`), "
+        f"which is an overshoot of up to about {100 * (limits.resonance - 1):.0f} % after a quick "
+        f"stick; the command's noise, which heats the motors, may grow {limits.noise:g} times "
+        f"(`noise`), each gain {limits.change:g} times (`change`) of this flight. They compound "
+        "from log to log: stop where a log keeps what flew, or the motors get warm"
     )

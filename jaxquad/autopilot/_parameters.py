@@ -239,7 +239,7 @@ class ParameterChange(NamedTuple):
     parameter: Parameter
     old: float
     new: float
-    reason: str = ""  # why it changes
+    reason: str = ""  # why it changes; several are lines
 
 
 Changes = Sequence[ParameterChange]
@@ -305,7 +305,7 @@ def parameter_file(
 ) -> str:  # fmt: skip
     """The text to load: Betaflight's CLI, PX4's .params, ArduPilot's .param, Crazyflie's YAML.
 
-    The other value of each parameter is in a comment where the format allows it.
+    What flew of each parameter is in a comment where the format allows it.
 
     **Arguments:**
 
@@ -324,21 +324,32 @@ def parameter_file(
     kind = firmware_named(firmware)
     if words and not kind.words:
         raise ValueError(f"{words[0].name} is a word, and {firmware} stores numbers alone.")
-    values = [(x.parameter, *((x.old, x.new) if revert else (x.new, x.old))) for x in changes]
-    pairs = [(x.name, *((x.old, x.new) if revert else (x.new, x.old))) for x in words]
+    values = [(x.parameter, x.old if revert else x.new, x.old) for x in changes]
+    pairs = [(x.name, x.old if revert else x.new, x.old) for x in words]
     return kind.parameter_file(
         values, title, version=version, profile=profile, raised=raised, words=pairs
     )
 
 
 def change_table(changes: Sequence[ParameterChange], words: Sequence[WordChange] = ()) -> str:
-    """The changes as a table in Markdown: old, new, unit, documented range and reason."""
-    rows = ["| parameter | old | new | unit | range | reason |", "|---|---|---|---|---|---|"]
-    for row, old, new, reason in changes:
+    """The changes in Markdown: a table of old, new, unit and documented range, then the reasons."""
+    rows = ["| parameter | old | new | unit | range |", "|---|---|---|---|---|"]
+    for row, old, new, _ in changes:
         numbers = f"{number_text(old, row.integer)} | {number_text(new, row.integer)}"
-        rows.append(f"| {row.name} | {numbers} | {row.unit} | {row.range_text} | {reason} |")
-    rows += [f"| {name} | {old} | {new} |  |  | {reason} |" for name, old, new, reason in words]
-    return joined_lines(rows)
+        rows.append(f"| {row.name} | {numbers} | {row.unit} | {row.range_text} |")
+    rows += [f"| {name} | {old} | {new} |  |  |" for name, old, new, _ in words]
+    reasons = [f"- {reason}" for reason in list_reasons(changes, words)]
+    return joined_lines([*rows, *([""] if reasons else []), *reasons])
+
+
+def list_reasons(changes: Sequence[ParameterChange], words: Sequence[WordChange] = ()) -> list[str]:
+    """Each reason once, behind the names of the parameters that it is of."""
+    names: dict[str, list[str]] = {}
+    pairs = [(x.parameter.name, x.reason) for x in changes] + [(x.name, x.reason) for x in words]
+    for name, reasons in pairs:
+        for reason in reasons.splitlines():
+            names.setdefault(reason, []).append(name)
+    return [f"{', '.join(of)}: {reason}" for reason, of in names.items()]
 
 
 class ParameterFiles(NamedTuple):
@@ -354,6 +365,7 @@ def write_parameter_files(
     stem: str = "proposal", shares: Sequence[Number] = (1 / 3, 1.0),
     reasons: Mapping[str, str] | None = None, beyond: Sequence[str] = (),
     at_once: Sequence[str] = (), version: tuple[int, ...] = (2025, 12), profile: int | None = 0,
+    log: str = "",
 ) -> ParameterFiles:  # fmt: skip
     """Write a staged proposal, a file that reverts it, and a table of what changes.
 
@@ -361,6 +373,7 @@ def write_parameter_files(
 
     - `stem`: begins the files' names; the share in percent follows.
     - `shares`: of the way, each in a file of its own.
+    - `log`: the name of the log that they come from, for a comment in each.
     - the others: as in `propose_changes` and `parameter_file`.
 
     **Raises:**
@@ -385,18 +398,25 @@ def write_parameter_files(
             "Nothing changes: what is proposed is stored as the values that flew. Propose more, or "
             "leave the files out."
         )
-    texts = stage_texts(stem, firmware_named(firmware).suffix, stages, text)
+    texts = stage_texts(stem, firmware_named(firmware).suffix, stages, text, log=log)
     *written, back, table = (write_file(Path(folder) / name, x) for name, x in texts.items())
     return ParameterFiles(tuple(written), back, table)
 
 
 def stage_texts(
     stem: str, suffix: str, stages: Mapping[int, Changes],
-    text: Callable[[Changes, str, bool], str], words: Sequence[WordChange] = (),
+    text: Callable[[Changes, str, bool], str], words: Sequence[WordChange] = (), log: str = "",
 ) -> dict[str, str]:  # fmt: skip
     """Files of changes by their percent of the way, what reverts them, and a table, by name."""
-    titles = {k: f"{k} % of the way from what flew to the proposal" for k in stages}
+    flew = what_flew(log)
+    titles = {k: f"{k} % of the way from {flew} to the proposal" for k in stages}
     texts = {f"{stem}_{k:03d}.{suffix}": text(stages[k], titles[k], False) for k in stages}
-    texts[f"{stem}_revert.{suffix}"] = text(stages[max(stages)], "what flew", True)
+    texts[f"{stem}_revert.{suffix}"] = text(stages[max(stages)], flew, True)
     table = (f"## {titles[k]}\n\n{change_table(stages[k], words)}" for k in stages)
     return texts | {f"{stem}.md": "\n".join(table)}
+
+
+def what_flew(log: str) -> str:
+    """In words, with the name of the log in one line, whatever the name holds."""
+    name = "".join(x if x.isprintable() else "?" for x in log)
+    return f"what flew in {name}" if name else "what flew"

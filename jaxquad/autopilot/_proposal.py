@@ -5,11 +5,10 @@ import shlex
 from collections import ChainMap
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from jaxquad._core import announce, Message, plain_content, staged_files, write_file
+from jaxquad._core import announce, Message, Number, plain_content, staged_files, write_file
 from jaxquad.records import AXES
 from jaxquad.records.firmware import firmware_names
 from jaxquad.report import Provenance, provenance, write_json
@@ -19,16 +18,18 @@ from ._firmware import firmware_named
 from ._flight_channels import FlownAutopilot, IdentifiedPlant
 from ._identified_log import ThrottleVerdict
 from ._law_check import LoopCheck
-from ._page import limits_text, pilot_page, PilotPage, write_pilot_page
+from ._page import FORWARD_STAYS, limits_text, pilot_page, PilotPage, write_pilot_page
 from ._parameters import (
     change_table,
     find_parameter,
     parameter_file,
     ParameterChange,
     propose_changes,
+    what_flew,
     write_parameter_files,
 )
-from ._rate_loops import DesignSettings, Kind, Limits, OuterStage, Stage, WAYS
+from ._rate_loops import DesignSettings, Kind, Stage, WAYS
+from ._verdict import is_bounded
 
 
 @dataclasses.dataclass(frozen=True)
@@ -51,8 +52,21 @@ class FilterVerdict:
         }
 
 
+Search = Callable[["AutopilotProposal", Mapping[str, float]], "AutopilotProposal"]
+_LIMITS = ("sensitivity", "resonance", "noise", "change")  # which no drawn plant depends on
 _CURVE = "thrust_curve"
 _FAR = 0.98  # of the factor by which a gain may change
+
+
+def at_limit(old: Mapping[str, float], new: Mapping[str, float], change: float) -> dict[str, str]:
+    """In words, which gains are at the factor within which they may `change`, or beyond it."""
+    words = {}
+    for name in [x for x in old if old[x] > 0 and new.get(x, 0.0) > 0]:
+        factor = max(new[name] / old[name], old[name] / new[name])
+        place = "at" if factor * _FAR <= change else "beyond"
+        if factor >= _FAR * change:
+            words[name] = f"{place} the limit of a factor of {change:g} (`change`)"
+    return words
 
 
 @dataclasses.dataclass(frozen=True)
@@ -73,6 +87,44 @@ class AutopilotProposal:
     filters: FilterVerdict | None = None  # what freeing them brings; None without a search
     noise: GyroNoise | None = None  # of the gyros, where the log shows it
     throttle: ThrottleVerdict | None = None  # where gains hold, and the thrust curve, apart
+    search: "Search | None" = dataclasses.field(default=None, repr=False, compare=False)
+
+    def retuned(
+        self, filters: Mapping[str, float] | None = None, /, **limits: Number
+    ) -> "AutopilotProposal":
+        """The search and the certificate again, within other limits, on the plants that are drawn.
+
+        **Arguments:**
+
+        - `filters`: new ones that another axis has changed.
+        - `limits`: any of `sensitivity`, `resonance`, `noise` and `change`.
+
+        **Raises:** ValueError where the log tells no plant to search on, and for other settings,
+        which need `jq.workflows.autopilot` again.
+        """
+        if self.search is None:
+            raise ValueError(f"there is nothing to tune again: {self.verdict}")
+        if others := [name for name in limits if name not in _LIMITS]:
+            raise ValueError(
+                f"`{others[0]}` is no limit of the search: give one of {', '.join(_LIMITS)}, or "
+                "run autopilot again"
+            )
+        settings = dataclasses.replace(self.settings, **limits)  # pyright: ignore[reportArgumentType]
+        return self.search(dataclasses.replace(self, settings=settings), filters or {})
+
+    @property
+    def in_short(self) -> str:
+        """What a pilot feels of the new gains, or did not fly; else empty."""
+        if not self.new:
+            flight = self.flown.flight
+            if self.kind == "cannot tell" and flight is not None and flight.rests:
+                return flight.rest_text.capitalize()
+            return ""
+        after = self.stages[-1]
+        return (
+            f"A gust turns it {after.rejection:.2f} times as far as with what flew; the motors get "
+            f"{after.noise:.2f} times the noise"
+        )
 
     @property
     def title(self) -> str:
@@ -91,7 +143,9 @@ class AutopilotProposal:
     @property
     def at_once(self) -> tuple[str, ...]:
         """Those of the new parameters that have no third of the way."""
-        if self.stages and self.stages[1].stable < 1:
+        flight = self.flown.flight
+        swings = 0.0 if flight is None else float(np.mean(flight.limited))
+        if self.stages and (self.stages[1].stable < 1 or is_bounded(self.stages[0], swings)):
             return tuple(self.new)
         return () if self.filters is None else self.filters.at_once
 
@@ -121,13 +175,8 @@ class AutopilotProposal:
             f"what flew; Ms {before.peak:.2f} -> {after.peak:.2f}"
         )
         reasons = dict.fromkeys(self.new, why)
-        far = _FAR * self.settings.change
-        for name, old in self.flown.old.items():
-            factor = self.new[name] / old if name in self.new else 1.0
-            if max(factor, 1 / factor) >= far:
-                reasons[name] += (
-                    f"; at the limit of a factor of {self.settings.change:g} (`change`)"
-                )
+        for name, text in at_limit(self.flown.old, self.new, self.settings.change).items():
+            reasons[name] += f"\n{text}"
         if self.filters is not None:
             reasons |= dict.fromkeys(self.filters.flown, self.filters.reason)
         if before.angle is not None and after.angle is not None:
@@ -218,7 +267,8 @@ class AutopilotProposal:
         if self.filters is not None:
             lines += ["", f"filters: {self.filters.text}"]
         if self.kind == "proposed":
-            lines += ["", change_table(self.changes).rstrip(), "", limits_text(self.settings)]
+            lines += ["", change_table(self.changes).rstrip(), ""]
+            lines.append(f"{limits_text(self.settings)}; {FORWARD_STAYS}")
         if curve is not None:
             lines += ["", f"thrust curve: {curve.text}"]
             if curve.change is not None:
@@ -244,6 +294,25 @@ class AxesProposal:
     settings: DesignSettings
     axes: Mapping[str, AutopilotProposal]  # by the axis' name
     unread: Mapping[str, str] = dataclasses.field(default_factory=dict)  # why one is not there
+
+    def retuned(
+        self, listener: Callable[[str, AutopilotProposal], None] = lambda axis, one: None, /,
+        **limits: Number,
+    ) -> "AxesProposal":  # fmt: skip
+        """`AutopilotProposal.retuned` of each axis that a search was made for.
+
+        `listener` hears each of them as soon as it is there.
+        """
+        axes: dict[str, AutopilotProposal] = {}
+        filters: Mapping[str, float] = {}
+        for axis, one in self.axes.items():
+            if one.search is not None:
+                one = one.retuned(filters, **limits)
+                listener(axis, one)
+            axes[axis] = one
+            filters = filters or axes[axis].shared_filters
+        settings = dataclasses.replace(self.settings, **limits)  # pyright: ignore[reportArgumentType]
+        return dataclasses.replace(self, settings=settings, axes=axes)
 
     @property
     def kind(self) -> Kind:
@@ -305,6 +374,8 @@ def _write_axes(
     flown, old, new = axes[0].flown, result.old, result.new
     firmware, version = flown.firmware, flown.version or (2025, 12)
     overview = f"{firmware} {'.'.join(map(str, flown.version))}, rate loops".strip()
+    log, settings = axes[0].identification.paths[0], result.settings
+    flew = what_flew(log.name)
 
     def write(stem: Path, changes: Sequence[ParameterChange], title: str, revert: bool) -> Path:
         text = parameter_file(
@@ -318,26 +389,24 @@ def _write_axes(
         written, curve = [], next((x for x in curves if x is not None and x.change), None)
         if curve is not None and curve.change is not None:  # never in a file with gains
             title = f"{curve.name} alone: all loops and the throttle at hover change with it"
-            back = f"the {curve.name} that flew"
             written = [
-                write(folder / _CURVE, [curve.change], title, False),
-                write(folder / f"{_CURVE}_revert", [curve.change], back, True),
+                write(folder / _CURVE, [curve.change], f"{title}; from {flew}", False),
+                write(folder / f"{_CURVE}_revert", [curve.change], flew, True),
             ]
         if not new:
             rows = [(find_parameter(firmware, name), x) for name, x in old.items()]
             same = [ParameterChange(row, x, x) for row, x in rows]
-            return [*written, write(folder / "proposal_revert", same, "what flew", True)]
+            return [write(folder / "proposal_revert", same, flew, True), *written]
         parts = [one for one in axes if one.new]
         files = write_parameter_files(
             folder, firmware, old, new, beyond=list(new),
             reasons={name: x for one in reversed(parts) for name, x in one._reasons.items()},
             at_once=[name for one in parts for name in one.at_once],
-            version=version, profile=None,
+            version=version, profile=None, log=log.name,
         )  # fmt: skip
-        return [*written, *files.stages, files.revert, files.table]
+        return [*files.stages, files.revert, files.table, *written]
 
     pages = lambda origin: [pilot_page(one, origin, overview) for one in axes]
-    log, settings = axes[0].identification.paths[0], result.settings
     return write_result(folder, log, settings, result.content(), files, pages)
 
 
@@ -354,120 +423,6 @@ def write_result(
     with staged_files(folder) as draft:
         stored, written = write_json(draft / "autopilot.json", with_origin), files(draft)
         announce("the page")
-        paths = [write_pilot_page(draft / "autopilot.html", *pages(origin)), stored, *written]
-    return [folder / path.name for path in paths]
-
-
-def beyond_limits(
-    flown: Any, third: Any, proposed: Any, limits: Limits, edge: float, *, loud: float = 1.0
-) -> list[str]:
-    """In words, what of a `Stage` or `ADRCStage` is beyond a limit, or `edge`, in rad/s."""
-    share, hertz, limit = 100 * min(third.stable, proposed.stable), 2 * np.pi, limits.sensitivity
-    most, loudest = max(limit, flown.peak), loud * limits.noise
-    above = lambda text, value, highest: [text] if value > highest else []
-    peak, resonance, noise = proposed.peak, proposed.resonance, proposed.noise
-    return [
-        *above(f"only {share:.1f} % of the loops are stable", 100, share),
-        *above(f"the worst Ms is {peak:.2f}, above {limit:g}", peak, limit),
-        *above(
-            f"the worst peak from set-point to rate is {resonance:.2f}, above "
-            f"{limits.resonance:g}",
-            resonance, limits.resonance,
-        ),
-        *above(
-            f"a third of the way the worst Ms is {third.peak:.2f}, above {most:.3g}",
-            third.peak, most,
-        ),
-        *above(
-            f"the command's noise is {noise:.2f} of what flew, above {limits.noise:g}",
-            noise, loudest,
-        ),
-        *above(
-            f"the crossover of {proposed.crossover / hertz:.1f} Hz is beyond the identified "
-            f"{edge / hertz:.1f} Hz",
-            proposed.crossover, edge,
-        ),
-    ]  # fmt: skip
-
-
-def beyond_angle(angle: OuterStage, limits: Limits) -> list[str]:
-    """In words, which limits an angle loop does not keep."""
-    around = f"of the angle loop ({angle.parameter} {angle.value:.3g})"
-    above = lambda what, value, most: (
-        [f"the worst {what} {around} is {value:.2f}, above {most:g}"] if value > most else []
-    )
-    unstable = [f"only {100 * angle.stable:.1f} % {around} are stable"] if angle.stable < 1 else []
-    peaks = above("Ms", angle.peak, limits.sensitivity)
-    return unstable + peaks + above("peak", angle.resonance, limits.resonance)
-
-
-_WORTH = 0.95  # of the flown effect of torque, above which gains are not worth a change
-_ALLOWED = 1.03  # of a limit that the search kept on the ratio of filters, for the law itself
-_NEARLY = 1.05  # of the limit of the resonance, which a third of the way may reach without a word
-SWINGING = 0.1  # of a flight with a motor at its limit, from which the motors bound a swing
-BELIEVED = 0.5  # share of plants on which the loop that flew has to be stable
-
-
-def judge(
-    stages: Sequence[Stage], settings: DesignSettings, edge: float, shared: SharedChange | None,
-    throttles: Sequence[float], swings: float = 0.0,
-) -> tuple[Kind, str]:  # fmt: skip
-    """The verdict; `swings` is the share of the flight with a motor at its limit."""
-    flown, third, new = stages
-    bounded = flown.stable < BELIEVED and swings > SWINGING  # by the motors alone
-    third = new if bounded else third
-    beyond = beyond_limits(flown, third, new, settings, edge, loud=_ALLOWED)
-    if shared is not None and shared.noise > _ALLOWED * settings.noise:
-        beyond.append(
-            f"the command's noise on another axis is {shared.noise:.2f} of what flew, above "
-            f"{settings.noise:g}"
-        )
-    if new.angle is not None and new.angle.closed:
-        beyond += beyond_angle(new.angle, settings)
-    if beyond and flown.stable < BELIEVED and not bounded:
-        return "cannot tell", (
-            "this log cannot tell: the loop flew, but with the gains that flew it is stable on "
-            f"{100 * flown.stable:.1f} % only of the plants within the error bars, so most of "
-            "these are not the vehicle. Fly more excitation on this axis (a chirp of the rate "
-            "set-point, or strong and quick stick)"
-        )
-    if beyond:
-        return "not to be flown", (
-            f"no gains are proposed: {'; '.join(beyond)}. Allow more (`sensitivity`, `resonance`, "
-            "`noise`, `change`), or fly more excitation"
-        )
-    limit, plants = settings.sensitivity, f"{settings.fresh} fresh plants"
-    if throttles:
-        at = ", ".join(f"{level:.2f}" for level in throttles)
-        plants += f" at each of the throttles {at}"
-    better = f"{new.rejection:.2f} of the flown effect of a step of torque"
-    within = flown.peak <= limit and flown.resonance <= settings.resonance
-    if flown.angle is not None and flown.angle.closed:
-        within = within and not beyond_angle(flown.angle, settings)
-    if flown.stable == 1 and within and new.rejection > _WORTH:
-        return "kept", (
-            f"what flew is kept: within the limits the best gains leave {better}. Its worst Ms on "
-            f"{plants} is {flown.peak:.2f}"
-        )
-    around, before, after = "", flown.angle, new.angle
-    if before is not None and after is not None and after.closed:
-        moved = f"{after.parameter} {before.value:.3g}"
-        moved += f" -> {after.value:.3g}" if after.value != before.value else " as it flew"
-        around = f"; with the angle loop around it ({moved}) worst Ms {after.peak:.2f}"
-    proposed = f"proposed: stable on all {plants}, worst Ms {new.peak:.2f} of at most {limit:g}"
-    if bounded:
-        return "proposed", (
-            f"{proposed}{around}. What flew is stable on {100 * flown.stable:.0f} % of them: "
-            f"it swung between the motors' limits ({100 * swings:.0f} % of the flight). A third of "
-            "the way would swing, too, so both files hold all of it, and gains may be further from "
-            f"what flew than {settings.change:g} times (`change`): hover low with it first"
-        )
-    # A third of the way from a bad loop may be beyond the limits, too.
-    first = "Load the file for a third of the way first"
-    if not (third.peak <= limit and third.resonance <= _NEARLY * settings.resonance):
-        first = (
-            f"The file for a third of the way is beyond the limits (worst Ms {third.peak:.2f}, "
-            f"peak from set-point to rate {third.resonance:.2f}), but better than what flew "
-            f"({flown.peak:.2f}, {flown.resonance:.2f}): hover with it alone, then load all of it"
-        )
-    return "proposed", f"{proposed}, {better}{around}. {first}"
+        loaded = {x.name: x.read_text(encoding="utf-8") for x in written if x.suffix != ".md"}
+        page = write_pilot_page(draft / "autopilot.html", *pages(origin), files=loaded)
+    return [folder / path.name for path in (page, stored, *written)]

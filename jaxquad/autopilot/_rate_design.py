@@ -1,5 +1,6 @@
 """The design of a rate loop: gains and filters searched, rounded, and certified on fresh plants."""
 
+import copy
 import dataclasses
 import functools as ft
 import itertools
@@ -32,10 +33,11 @@ from ._parameters import (
     parameters_of,
     propose_changes,
 )
-from ._proposal import AutopilotProposal, BELIEVED, FilterVerdict, judge, SWINGING
+from ._proposal import AutopilotProposal, FilterVerdict
 from ._rate_loops import (
     certify_angle,
     certify_gains,
+    DesignSettings,
     draw_loops,
     Gains,
     OneGains,
@@ -46,6 +48,7 @@ from ._rate_loops import (
     with_plants,
     worst_plants,
 )
+from ._verdict import BELIEVED, judge, SWINGING
 
 
 _THIRD = 1 / 3
@@ -59,17 +62,22 @@ _ANGLES, _ANGLE_RESERVE = 25, 0.98  # gains of the angle loop that are tried; of
 def design_gains(proposal: AutopilotProposal, filters: Mapping[str, float]) -> AutopilotProposal:
     """Search gains, and filters where the log shows the gyro's noise; certify the rounded ones.
 
-    With `filters` that another axis has changed, these stay, and gains alone are searched.
+    With `filters` that another axis has changed, these stay, and gains alone are searched. The
+    plants stay drawn: `retuned` of what comes out searches again for other limits.
     """
-    design, settings, flown = _Design(proposal), proposal.settings, proposal.flown
+    return _searched(_Design(proposal), proposal, filters)
+
+
+def _searched(
+    design: "_Design", proposal: AutopilotProposal, filters: Mapping[str, float]
+) -> AutopilotProposal:
+    settings, flown = proposal.settings, proposal.flown
     law, axis, noise = flown.law, flown.axis, design.noise
     loops, gains = design.loops(settings.members, 0), None
     # Gains that made a loop swing may be left further than others.
     stable = float(np.mean(together(x.qualities(design.before[None]) for x in loops).stable))
     change = settings.change ** (2 if stable < BELIEVED and design.swings > SWINGING else 1)
-    bank = None
-    if noise is not None and design.choices and not filters:
-        bank = FilterBank(design.choices, law, noise, loops[0].omega)
+    bank = None if filters else design.bank
     why = design.no_noise or "the firmware's filters are off, so there is none to change"
     verdict = FilterVerdict(f"as they flew: {why}")
     if filters:
@@ -101,8 +109,14 @@ def design_gains(proposal: AutopilotProposal, filters: Mapping[str, float]) -> A
         loops = with_more_plants(loops, more)
     return dataclasses.replace(
         proposal, kind=kind, verdict=text, stages=best.stages, filters=verdict, noise=noise,
-        new=best.new if kind == "proposed" else {},
+        new=best.new if kind == "proposed" else {}, search=ft.partial(_search_again, design),
     )  # fmt: skip
+
+
+def _search_again(
+    design: "_Design", proposal: AutopilotProposal, filters: Mapping[str, float]
+) -> AutopilotProposal:
+    return _searched(design.within(proposal.settings), proposal, filters)
 
 
 class _Certified(NamedTuple):
@@ -124,6 +138,7 @@ class _Design:
         self.settings, self.flown, self.throttle = proposal.settings, proposal.flown, throttle
         self.plant, self.edge = proposal.identification, proposal.identification.band[1]  # rad/s
         self.before = gains_of(self.flown.law, self.flown.axis)
+        self.drawn: dict[tuple[int, int], list[RateLoops]] = {}
         self.swings = float(np.mean(flight.limited))  # of the flight, a motor at its limit
         # What flew, at each throttle that is certified.
         self.flown_there = [self.flown]
@@ -141,6 +156,15 @@ class _Design:
             except NoNoise as error:
                 self.no_noise = str(error)
 
+    def within(self, limits: DesignSettings) -> "_Design":
+        """The same plants and noise with other limits."""
+        other = copy.copy(self)
+        other.settings = limits
+        if limits.change != self.settings.change:
+            for name in ("choices", "bank"):
+                other.__dict__.pop(name, None)
+        return other
+
     def loops(self, count: int, seed: int) -> list[RateLoops]:
         """Of what flew, with the noise of the log where it shows it.
 
@@ -154,7 +178,12 @@ class _Design:
         return groups
 
     def groups(self, count: int, seed: int) -> list[RateLoops]:
-        """Likewise, with so many plants at each throttle that is certified."""
+        """Likewise, with so many plants at each throttle that is certified; drawn once."""
+        if (count, seed) not in self.drawn:
+            self.drawn[count, seed] = self._drawn_groups(count, seed)
+        return self.drawn[count, seed]
+
+    def _drawn_groups(self, count: int, seed: int) -> list[RateLoops]:
         places, seed = self.throttle.certified or (None,), self.settings.seed + seed
         groups = [
             draw_loops(self.plant, self.throttle, flown, count, seed, throttle=throttle)
@@ -178,6 +207,14 @@ class _Design:
             change=self.settings.change,
             line_hz=None if line is None else line.omega / (2 * np.pi),
         )  # fmt: skip
+
+    @ft.cached_property
+    def bank(self) -> FilterBank | None:
+        """None where no filter can change, or the log does not show the noise."""
+        if self.noise is None or not self.choices:
+            return None
+        omega = self.loops(self.settings.members, 0)[0].omega
+        return FilterBank(self.choices, self.flown.law, self.noise, omega)
 
     def flown_filters(self, names: Mapping[str, float]) -> dict[str, float]:
         """What flew of these filters; a notch may be for a line of another axis alone."""
@@ -332,7 +369,8 @@ class _Search:
         change: float, bank: FilterBank | None = None,
     ):  # fmt: skip
         """`before` are the loops of what flew, where `loops` are behind other filters."""
-        self.loops, self.bank, self.flown = loops, bank, design.before
+        self.loops = [x.in_single_precision() for x in loops]  # the certificate is in double
+        self.bank, self.flown = bank, design.before
         self.limits, self.edge = design.settings, design.edge
         self.noise = together(x.qualities(self.flown[None]) for x in before).noise
         self.through = loops[0].paths(self.flown[None])[0][0]

@@ -78,6 +78,10 @@ class RateLoops:
             None if angle is None else angle.path(omega),
         )  # fmt: skip
 
+    def in_single_precision(self) -> "RateLoops":
+        """The same plants, for a search: half the time, and qualities to about 1e-4."""
+        return dataclasses.replace(self, plants=self.plants.astype(np.complex64))
+
     def of_law(self, law: RateLoop, axis: int) -> "RateLoops":
         """The plants of this throttle under a law with other filters."""
         back, ahead = law_paths(law, axis, self.omega)
@@ -115,8 +119,9 @@ class RateLoops:
     def _qualities(self, feedback: Paths, ahead: Paths) -> LoopQualities:
         plants, cells, gain = _power(self.plants), cells_of(self.omega), _power(feedback)
         # Real and imaginary part of 1 + L, each in one piece of memory.
-        a, b = np.real(feedback)[:, None], np.imag(feedback)[:, None]
         c, d = (np.ascontiguousarray(x) for x in (np.real(self.plants), np.imag(self.plants)))
+        as_plants = lambda x: x.astype(c.dtype, copy=False)
+        a, b = (as_plants(x)[:, None] for x in (np.real(feedback), np.imag(feedback)))
         real, product = a * c, b * d
         real -= product
         real += 1
@@ -125,18 +130,18 @@ class RateLoops:
         stable = is_stable(real, imaginary)
         distance, product = real**2, imaginary**2
         distance += product
-        above = np.multiply(gain[:, None], plants, out=product) > 1  # |L|
+        above = np.multiply(as_plants(gain)[:, None], plants, out=product) > 1  # |L|
         last = above.shape[-1] - 1 - np.argmax(above[..., ::-1], axis=-1)
         inverse = np.divide(1.0, distance, out=real)
-        closed = np.multiply(_power(ahead)[:, None], plants, out=product)
+        closed = np.multiply(as_plants(_power(ahead))[:, None], plants, out=product)
         closed *= inverse
         return LoopQualities(
             stable,
             1 / np.sqrt(distance.min(axis=-1)),
             np.sqrt(closed.max(axis=-1)),
             np.where(above.any(axis=-1), self.omega[last], 0.0),
-            np.sqrt(np.einsum("dpf,pf->dp", inverse, plants / self.omega**2 * cells)),
-            np.sqrt(np.einsum("dpf,df->dp", inverse, gain * self.noise)),
+            np.sqrt(np.einsum("dpf,pf->dp", inverse, as_plants(plants / self.omega**2 * cells))),
+            np.sqrt(np.einsum("dpf,df->dp", inverse, as_plants(gain * self.noise))),
         )
 
 

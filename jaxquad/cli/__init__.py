@@ -1,26 +1,29 @@
 """The command line `jaxquad`: options in, messages out.
 
-Here are `main` and the commands that need no flight: a demonstration, and a signal to excite the
-vehicle with.
+Here are `main` and the commands that need no flight: a demonstration, what to fly, and a signal to
+excite the vehicle with.
 """
 
 import argparse
 import contextlib
 import difflib
+import gc
 import io
 import os
 import re
 import shlex
+import signal
 import sys
+import threading
 import warnings
-from collections.abc import Callable, Sequence
-from importlib.metadata import version
+from collections.abc import Callable, Iterator, Sequence
 from itertools import chain, count
 from pathlib import Path
+from types import FrameType
 
 import jaxquad.workflows as workflows
-from jaxquad._core import is_ours, readable
-from jaxquad.records import RecordWarning
+from jaxquad._core import __version__, is_ours, readable
+from jaxquad.records import AXES, RecordWarning, require_file
 from jaxquad.report import PageWarning
 from jaxquad.workflows import AutopilotSettings, in_options
 
@@ -29,6 +32,7 @@ from ._logs import (
     autopilot,
     batch,
     channels,
+    compare,
     finish_identification,
     identify,
     NOT_IDENTIFIABLE,
@@ -103,6 +107,83 @@ def demo(declared: argparse.ArgumentParser) -> Run:
             note = _NEXT.format(**truth, sum=truth["lag"] + truth["delay"])
         result = workflows.identify(log, settings)
         return finish_identification(options, result, options.out or folder, note)
+
+    return run
+
+
+@shell.command(
+    "say what to set and to fly, so that jaxquad autopilot can tune from the log",
+    """examples:
+  jaxquad recipe betaflight
+  jaxquad recipe ardupilot --axis pitch --amplitude 0.08 --out pitch.param
+
+exit codes: 0 done, 2 no recipe for this firmware, or a value that is not flyable
+""",
+)
+def recipe(declared: argparse.ArgumentParser) -> Run:
+    declared.add_argument("firmware", metavar="FIRMWARE", help="betaflight, ardupilot or px4")
+    axes, text = (*AXES, "all"), "the axis to excite; all by default"
+    declared.add_argument("--axis", type=str.lower, choices=axes, default="all", help=text)
+    text = "of the chirp, in the firmware's unit; by default one to begin with"
+    declared.add_argument("--amplitude", type=float, metavar="NUMBER", help=text)
+    text = "number of the channel, or of the position, of the switch that starts it"
+    declared.add_argument("--switch", type=int, metavar="N", help=text)
+    text = "write what to set, and to FILE_back what goes back: with the ending .param (ArduPilot) "
+    file = ("FILE", text + "or .params (PX4) files to load, else the text to paste")
+    shell.add_output(declared, "the recipe", file=file, force="", quiet=False)
+
+    def run(options: argparse.Namespace) -> int:
+        from jaxquad._core import write_file
+
+        answer = workflows.recipe(
+            options.firmware.lower(), options.axis, amplitude=options.amplitude,
+            switch=options.switch,
+        )  # fmt: skip
+        files = answer.files(options.out) if options.out else {}
+        with shell.stdout_for_json(options):
+            print(answer)
+            if files:
+                print("", *(write_file(path, text) for path, text in files.items()), sep="\n")
+        if options.json:
+            shell.print_json(answer.content())
+        return 0
+
+    return run
+
+
+@shell.command(
+    "open a page in the browser: drop a log, see it, tune it, take the parameters away",
+    """examples:
+  jaxquad app
+  jaxquad app flight.bbl
+
+The page is of this machine alone (127.0.0.1, behind a token); the log stays on it. It needs the
+extra: pip install "jaxquad[app]". It ends a minute after its last tab is closed, or with Ctrl-C.
+exit codes: 0 done, 2 the port is taken, or the extra is missing
+""",
+)
+def app(declared: argparse.ArgumentParser) -> Run:
+    declared.add_argument("file", type=Path, nargs="?", help="a log to open at once")
+    text = "of 127.0.0.1; by default a free one"
+    declared.add_argument("--port", type=int, default=0, metavar="N", help=text)
+    text = "print the address alone"
+    declared.add_argument("--no-browser", action="store_true", help=text)
+    text = "end so long after the last tab was closed; 60 by default"
+    declared.add_argument("--linger", type=float, default=60.0, metavar="S", help=text)
+
+    def run(options: argparse.Namespace) -> int:
+        if options.file is not None:
+            require_file(options.file)
+        try:
+            from jaxquad.app import serve
+        except ModuleNotFoundError as error:
+            text = f'jaxquad app needs {error.name}: pip install "jaxquad[app]"'
+            raise ValueError(text) from error
+        serve(
+            options.file, port=options.port, browser=not options.no_browser,
+            linger=options.linger,
+        )  # fmt: skip
+        return 0
 
     return run
 
@@ -196,19 +277,24 @@ def design(declared: argparse.ArgumentParser) -> Run:
 
 
 # In order of use.
-_COMMANDS = (demo, design, channels, identify, verify, tune, autopilot, report, batch)
+_COMMANDS = (
+    demo, app, recipe, design, channels, identify, verify, tune, autopilot, compare, report, batch,
+)  # fmt: skip
 _WAY = """jaxquad demo                   a simulated flight, identified: results/demo/report.html
 jaxquad identify YOUR.LOG      a model of your own flight, with error bars
 jaxquad tune results/YOUR ...  gains from it, with a certificate; jaxquad --help lists all commands
 """
 _PLACES = {  # what a command takes beside its options
     "demo": "",
+    "app": "[FILE] ",
+    "recipe": "FIRMWARE ",
     "design": "{sweep,multisine} --band LOW HIGH --rate HZ --amplitude AMPLITUDE ",
     "channels": "FILE ",
     "identify": "FILE [FILE ...] ",
     "verify": "RESULT FILE ",
     "tune": "RESULT --inertia J --limit NUMBER ",
     "autopilot": "FILE ",
+    "compare": "BEFORE AFTER ",
     "report": "RESULT ",
     "batch": "FOLDER ",
 }
@@ -220,6 +306,35 @@ _CODES = """exit codes:
   130  interrupted
 """
 _UNUSABLE, _INTERRUPTED, _CLOSED = 2, 130, 141
+_LATER = 0.05  # s
+
+
+def _collects_garbage(frame: FrameType | None) -> bool:
+    """Whether a callback of the collection runs there, as JAX has one: it loses what is raised."""
+    callbacks = {getattr(callback, "__code__", None) for callback in gc.callbacks}
+    while frame is not None and frame.f_code not in callbacks:
+        frame = frame.f_back
+    return frame is not None
+
+
+@contextlib.contextmanager
+def _interrupts_are_errors() -> Iterator[None]:
+    """Within it each interrupt ends the run, also one that comes while garbage is collected."""
+
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        if not _collects_garbage(frame):
+            raise KeyboardInterrupt
+        threading.Timer(_LATER, signal.raise_signal, (number,)).start()
+
+    usual = signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    if not usual or threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    signal.signal(signal.SIGINT, interrupt)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -235,10 +350,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     if isinstance(sys.stdout, io.TextIOWrapper):  # which may know fewer letters than names of files
         sys.stdout.reconfigure(errors="replace")
     try:
-        try:
-            return _run(words)
-        finally:
-            sys.stdout.flush()  # a full disk shows here, or never
+        with _interrupts_are_errors():
+            try:
+                return _run(words)
+            finally:
+                sys.stdout.flush()  # a full disk shows here, or never
     except OSError as error:  # what the system could not do: `out/a.png: no space left on device`
         place, why = error.filename or "what is printed", error.strerror
         if error.filename is None:  # else the end of the process tries once more
@@ -336,7 +452,7 @@ def make_parser() -> argparse.ArgumentParser:
         epilog="\n".join(("commands, in order of use:", *listed, "", _CODES)),
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("--version", action="version", version=f"%(prog)s {version('jaxquad')}")
+    parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
     commands = parser.add_subparsers(
         required=True, metavar="COMMAND", dest="command", help=argparse.SUPPRESS
     )

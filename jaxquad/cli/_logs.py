@@ -3,6 +3,7 @@
 import argparse
 import io
 import math
+import shlex
 import sys
 from collections import Counter
 from pathlib import Path
@@ -22,7 +23,7 @@ from jaxquad.workflows import (
 )
 
 from . import _options as shell
-from ._options import command, Run
+from ._options import command, print_text, Run
 
 
 if TYPE_CHECKING:
@@ -65,9 +66,11 @@ def channels(declared: argparse.ArgumentParser) -> Run:
             numbers = (f"{c.rate:.5g}", f"{c.start:.6g}", f"{c.stop:.6g}", f"{c.minimum:.4g}")
             rows.append((c.name, f"{c.samples}", *numbers, f"{c.maximum:.4g}", c.unit))
         first, *widths = (max(map(len, column)) for column in zip(*rows, strict=True))
+        lines = []
         for name, *cells in rows:
             padded = (f"{cell:>{width}}" for cell, width in zip(cells, widths, strict=True))
-            print("  ".join((f"{name:<{first}}", *padded)).rstrip())
+            lines.append("  ".join((f"{name:<{first}}", *padded)).rstrip())
+        print_text("\n".join(lines))
         if any(math.isnan(c.rate) for c in listed):
             print(
                 "\nnan: no time of that length is known, or its unit is not, or it goes back. Name "
@@ -88,7 +91,7 @@ def finish_identification(
     sources = [*result.paths, *([verified] if verified else [])]
     same = {"settings": result.settings.content()}
     with shell.stdout_for_json(options):
-        print(in_options(result.message()), flush=True)
+        print_text(in_options(result.message()))
         with shell.folder_to_write(options, folder, "result.json", same, sources) as free:
             path = result.write(free)
         drawn = [name for name in result.figure_names if path.with_name(name).exists()]
@@ -136,8 +139,8 @@ def identify(declared: argparse.ArgumentParser) -> Run:
             require_file(path)
             if path.is_dir() and not (path / "metadata.yaml").is_file():  # no ROS 2 bag
                 raise ValueError(
-                    f"{path} is a folder: jaxquad batch {path} identifies each log in it; for one "
-                    "log, name the file"
+                    f"{path} is a folder: jaxquad batch {shlex.quote(str(path))} identifies each "
+                    "log in it; for one log, name the file"
                 )
         texts = (settings.input, settings.output, settings.reference)
         used = [name for text in texts if text for name in parse_mix(text)]
@@ -231,7 +234,7 @@ def verify(declared: argparse.ArgumentParser) -> Run:
                 print("  a good agreement below does not make up for that")
             for doubt in stored.doubts[1:]:
                 print(f"! {doubt}")
-            print(f"{check}\n{check.verdict}")
+            print_text(f"{check}\n{check.verdict}")
             if options.out:
                 picture = options.out if options.out.suffix else options.out.with_suffix(".png")
                 image = io.BytesIO()
@@ -351,16 +354,16 @@ def tune(declared: argparse.ArgumentParser) -> Run:
     shell.add_output(declared, "gains and certificate", folder="tuned/ in the folder of the result")
 
     def run(options: argparse.Namespace) -> int:
-        settings = shell.settings_of(options, TuneSettings)
         stored = workflows.load_result(options.result)
-        stored.require_radians()  # before anything is imported that takes long
+        stored.require_radians()  # before options are asked for that would be of no use
+        settings = shell.settings_of(options, TuneSettings)
         shell.start_computing()
         tuning = workflows.tune(
             stored, settings, log=options.log, progress=False if options.quiet else None
         )
         content, logs = tuning.content(), tuning.identification.paths
         with shell.stdout_for_json(options):
-            print(tuning)
+            print_text(tuning)
             print(_WORDS)
             same = {key: content[key] for key in ("settings", "identified_with")}
             wanted = options.out or stored.folder / "tuned"
@@ -411,6 +414,48 @@ def autopilot(declared: argparse.ArgumentParser) -> Run:
     return run
 
 
+@command(
+    "compare two flights of one vehicle with other gains: better, worse, or cannot tell",
+    """examples:
+  jaxquad compare before.bbl after.bbl
+  jaxquad compare before.bbl after.bbl --axis roll
+  jaxquad compare day.bbl day.bbl --flight-before 1 --flight-after 3
+
+Logs of Betaflight, PX4 or ArduPilot. Each is identified, and its plant flown in the law that flew.
+Compared are the step from set-point to rate, the peak of |S|, the effect of a step of torque, and
+the noise of the command in steady hover, each with its errors.
+exit codes: 0 done, 2 unusable input, 3 these logs cannot tell
+""",
+)
+def compare(declared: argparse.ArgumentParser) -> Run:
+    for name, text in (("before", "the first log"), ("after", "the second log, of other gains")):
+        declared.add_argument(name, type=Path, help=f"{text}, of the same vehicle")
+    shell.add_paths(declared, "--config")
+    shell.add_settings(declared, workflows.CompareSettings)
+    folder = "compare_NAME/ of the second log in results/NAME of the first"
+    shell.add_output(declared, "compare.json", folder=folder)
+
+    def run(options: argparse.Namespace) -> int:
+        settings = shell.settings_of(options, workflows.CompareSettings)
+        before, after = logs = options.before, options.after
+        for path in logs:
+            require_file(path)
+        wanted = options.out or default_folder(logs[0]) / f"compare_{logs[1].stem}"
+        shell.start_computing()
+        comparison = workflows.compare(before, after, settings)
+        with shell.stdout_for_json(options):
+            print(in_options(str(comparison)))
+            same = {"settings": settings.content()}
+            with shell.folder_to_write(options, wanted, "compare.json", same, logs) as folder:
+                names = ", ".join(path.name for path in comparison.write(folder))
+            print(f"\n{folder}: {names}")
+        if options.json:
+            shell.print_json(comparison.content())
+        return NOT_IDENTIFIABLE if comparison.kind == "cannot tell" else 0
+
+    return run
+
+
 def run_autopilot(
     options: argparse.Namespace, log: Path, settings: AutopilotSettings, wanted: Path,
     note: str = "",
@@ -419,7 +464,7 @@ def run_autopilot(
     `note` is the page's path."""
     proposal = workflows.autopilot(log, settings)
     with shell.stdout_for_json(options):
-        print(in_options(str(proposal)))
+        print_text(in_options(str(proposal)))
         same = {"settings": settings.content()}
         with shell.folder_to_write(options, wanted, "autopilot.json", same, [log]) as folder:
             names = ", ".join(path.name for path in proposal.write(folder))

@@ -7,10 +7,13 @@ import gc
 import json
 import logging
 import os
+import re
 import shutil
+import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from itertools import groupby
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
@@ -171,11 +174,29 @@ def settings_of(options: argparse.Namespace, settings: type[S]) -> S:
     return settings.from_toml(options.config).changed(typed)
 
 
+@contextlib.contextmanager
+def _interrupts_wait() -> Iterator[None]:
+    """JAX's libraries abort the process where an interrupt comes while they load."""
+    usual = signal.getsignal(signal.SIGINT)
+    if not callable(usual) or threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    came: list[int] = []
+    signal.signal(signal.SIGINT, lambda number, _: came.append(number))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, usual)
+    if came:
+        raise KeyboardInterrupt
+
+
 def start_computing() -> None:
     """JAX in 64 bits, and programs that are kept; what can be said without JAX is said before."""
     atexit.register(gc.freeze)  # Python's last look for garbage takes half a second
-    from jaxquad._compile import enable_compile_cache
-    from jaxquad._core import enable_x64
+    with _interrupts_wait():
+        from jaxquad._compile import enable_compile_cache
+        from jaxquad._core import enable_x64
 
     enable_x64()
     enable_compile_cache()
@@ -226,3 +247,59 @@ class _Stages(logging.Handler):
     def forget(self) -> None:
         if self.waiting is not None:
             self.waiting.cancel()
+
+
+_MOST = 15  # rows of a table in parts; of longer ones each row has several lines
+_CELLS = re.compile(r"\S {2,}\S")  # of a line of a table; prose has single blanks
+
+
+def print_text(text: object) -> None:
+    """Print, and fold tables to the width of the terminal where stdout is one.
+
+    Prose stays as it is: the terminal wraps it, and a command in it can be copied.
+    """
+    shown = str(text)
+    width = shutil.get_terminal_size().columns
+    print(fold_tables(shown, width) if sys.stdout.isatty() else shown, flush=True)
+
+
+def fold_tables(text: str, width: int) -> str:
+    """The text with each table that is wider than `width` in parts of its columns."""
+    lines: list[str] = []
+    for is_table, group in groupby(text.split("\n"), lambda line: bool(_CELLS.search(line))):
+        rows = list(group)
+        lines += _folded(rows, width) if is_table and max(map(len, rows)) > width else rows
+    return "\n".join(lines)
+
+
+def _folded(rows: Sequence[str], width: int) -> Iterator[str]:
+    columns = _columns(rows)
+    if len(columns) < 2:
+        yield from rows
+        return
+    (_, first), *others = columns
+    parts: list[list[slice]] = []
+    for start, stop in others:
+        if not parts or first + stop - parts[-1][0].start > width:
+            parts.append([])
+        parts[-1].append(slice(start, stop))
+    places = [slice(part[0].start, part[-1].stop) for part in parts]
+    named = lambda row, inside, name: f"{name:<{first}}{row[inside]}".rstrip()
+    if len(rows) > _MOST:
+        for row in rows:
+            yield named(row, places[0], row[:first])
+            yield from (named(row, inside, "") for inside in places[1:])
+        return
+    for number, inside in enumerate(places):
+        if number:
+            yield ""
+        yield from (named(row, inside, row[:first]) for row in rows)
+
+
+def _columns(rows: Sequence[str]) -> list[tuple[int, int]]:
+    """Where columns begin and end, each with the blanks before it: two or more in every row."""
+    size = max(map(len, rows))
+    padded = [row.ljust(size) for row in rows]
+    blank = "".join(" " if all(row[k] == " " for row in padded) else "x" for k in range(size))
+    ends = [0, *(gap.start() for gap in re.finditer(r"(?<=x) {2,}(?=x)", blank)), size]
+    return list(zip(ends[:-1], ends[1:], strict=True))

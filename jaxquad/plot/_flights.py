@@ -239,10 +239,32 @@ class Spectrum(NamedTuple):
 class StepBand(NamedTuple):
     """Step responses of many plants: their median, and between which 95 % of them lie."""
 
-    time: Samples
+    time: Samples  # s
     middle: Samples
     low: Samples
     high: Samples
+
+    @property
+    def overshoot(self) -> tuple[float, float]:
+        """Of the median and of the worst, as shares of the step."""
+        middle, high = (max(float(x.max()) - 1, 0.0) for x in (self.middle, self.high))
+        return middle, high
+
+    @property
+    def half_way(self) -> float:
+        """When the median is half way, in s."""
+        return float(self.time[(self.middle >= 0.5).argmax()])
+
+    @property
+    def settled(self) -> float:
+        """When the median stays within 5 % and the band of its end, in s, and a third more."""
+        far = abs(self.middle - self.middle[-1]) > _SETTLED + (self.high - self.low) / 2
+        last = np.flatnonzero(far)
+        time = self.time[last[-1]] if last.size else self.time[-1]
+        return float(min(4 / 3 * time, self.time[-1]))
+
+
+_SETTLED = 0.05
 
 
 class ThrottleCurve(NamedTuple):
@@ -297,7 +319,7 @@ def filters_figure(
 
 def spectra_figure(
     gyro: Mapping[str, Spectrum], derivative: Mapping[str, Spectrum], *, unit: str = "",
-    ax: AxesLike = None, title: str = "",
+    below: str = "D term", ax: AxesLike = None, title: str = "",
 ) -> Panels:  # fmt: skip
     """Draw the gyro's noise and the D term's, before and behind filters.
 
@@ -306,11 +328,12 @@ def spectra_figure(
     - `gyro`: in (rad/s)^2/Hz, drawn in deg/s; `derivative`: in the command's unit squared per Hz.
       By the text of the legend; the same text has the same line in both.
     - `unit`: of the command.
+    - `below`: what the lower panel shows, the D term or another part of the command.
     - `ax`: two axes to draw into.
     """
     panels = lay.stacked(2, ax)
     per = f"dB re 1 {unit} /√Hz" if unit else "dB /√Hz"  # a line of its own: the panels are low
-    labels = ("gyro\ndB re 1 deg/s /√Hz", f"D term\n{per}")
+    labels = ("gyro\ndB re 1 deg/s /√Hz", f"{below}\n{per}")
     places = {name: k for k, name in enumerate(dict.fromkeys([*gyro, *derivative]))}
     for panel, spectra, label in zip(panels, (gyro, derivative), labels, strict=True):
         factor = np.degrees(1.0) ** 2 if panel is panels[0] else 1.0
@@ -330,19 +353,32 @@ def spectra_figure(
     return _finished(panels, (2.0, 2.0), title)
 
 
-def steps_figure(steps: Mapping[str, StepBand], *, ax: AxesLike = None, title: str = "") -> Panels:
-    """Draw the rate after a step of 1, by the text of the legend, with a band of 95 % of plants."""
+def steps_figure(
+    steps: Mapping[str, StepBand], *, bands: str = "95 % of plants",
+    measured: StepBand | None = None, ax: AxesLike = None, title: str = "",
+) -> Panels:  # fmt: skip
+    """Draw the rate after a step of 1, by the text of the legend, with what its `bands` are.
+
+    What was `measured` has the band of its random error.
+    """
     [panel] = panels = lay.stacked(1, ax)
+    if measured is not None:
+        panel.fill_between(
+            measured.time, measured.low, measured.high, facecolor="0.85", lw=0,
+            label="measured, 95 % random error",
+        )  # fmt: skip
+        panel.plot(measured.time, measured.middle, color="black", lw=1.0, ls=":", label="measured")
     for k, (name, band) in enumerate(steps.items()):
         look = look_of(k, name)
         panel.fill_between(
             band.time, band.low, band.high, facecolor=look["color"], alpha=0.22, lw=0,
-            hatch=_HATCHES[k], edgecolor=look["color"], label=f"{name}, 95 % of plants",
+            hatch=_HATCHES[k], edgecolor=look["color"], label=f"{name}, {bands}",
         )  # fmt: skip
         panel.plot(band.time, band.middle, **look)
     panel.axhline(1.0, color="0.4", lw=0.8, ls=":")
     panel.set(xlabel="time, s", ylabel="rate after a step of 1")
-    panel.margins(x=0)
+    shown = list(steps.values()) or ([] if measured is None else [measured])
+    panel.set_xlim(0, max(band.settled for band in shown))
     return _finished(panels, (2.8,), title)
 
 

@@ -44,7 +44,7 @@ def compare(
     **Raises:** what `jq.compare` raises; ValueError for models without a record.
     """
     if isinstance(models, Verification):
-        checks = {"simulated, open loop": models}
+        checks = {models.method: models}
     elif isinstance(models, Comparison):
         checks = models.checks
     elif record is None:

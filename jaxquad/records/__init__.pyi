@@ -1,5 +1,6 @@
 from ._channel import Channel as Channel, clock_start as clock_start, show_times as show_times
 from ._edit import resample as resample, select as select, trim as trim
+from ._interop import read_struct as read_struct
 from ._log import (
     ReadError as ReadError,
     RecordError as RecordError,
@@ -23,6 +24,7 @@ from ._read import (
 )
 from ._record import Record as Record
 from ._timebase import channels as channels, ChannelSummary as ChannelSummary
+from ._traces import envelope as envelope, traces as traces
 from .firmware import read_settings as read_settings, Settings as Settings
 from .formats import (
     channel_names as channel_names,

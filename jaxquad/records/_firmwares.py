@@ -51,3 +51,19 @@ def axis_of_rate(name: str) -> int | None:
                 if name == rate or name.endswith(f".{rate}"):
                     return axis
     return None
+
+
+def channel_limit(name: str) -> float | None:
+    """The most that a stick or a command of a firmware reaches, in the channel's unit; None where
+    it is not known."""
+    for log in map(firmware_log, firmware_names()):
+        for prefix, limit in {} if log is None else log.limits.items():
+            if name.startswith(prefix) or f".{prefix}" in name:
+                return limit
+    return None
+
+
+def is_setpoint(name: str) -> bool:
+    """Whether a channel is the rate set-point of a firmware."""
+    logs = (log for log in map(firmware_log, firmware_names()) if log is not None)
+    return any(name == x or name.endswith(f".{x}") for log in logs for x in log.setpoints)

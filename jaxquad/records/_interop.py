@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
@@ -79,8 +79,20 @@ _UNITS = {
 _SAVE = "s = get(z); save('z.mat', 's', '-v7')"
 
 
-def from_iddata(path: str | Path, variable: str | None, references: Names) -> Record:
-    """`Record.from_iddata`, from the variable of that name, the only struct, or the file itself."""
+def read_struct(
+    path: str | Path, *keys: frozenset[str], variable: str | None = None, save: str
+) -> Mapping[str, Any]:
+    """The fields of a struct in a MAT file, or the file's variables themselves.
+
+    **Arguments:**
+
+    - `path`: a MAT file of version 5 to 7.
+    - `keys`: sets of names; the struct has all of at least one of them.
+    - `variable`: the name of the struct, where several have them.
+    - `save`: the command in MATLAB that writes such a file, for messages.
+
+    **Raises:** ReadError for a damaged file, and for none or several such structs.
+    """
     load_log(path)  # which refuses what is damaged, before scipy reads it
     from scipy.io import loadmat
 
@@ -89,25 +101,28 @@ def from_iddata(path: str | Path, variable: str | None, references: Names) -> Re
     except Exception as error:  # of damaged and of HDF5 files scipy raises almost anything
         raise ReadError(
             f"{path}: cannot be read as a MAT file of version 5 to 7 ({type(error).__name__}): "
-            f"save it in MATLAB with {_SAVE}"
+            f"save it in MATLAB with {save}"
         ) from error
-    is_iddata = lambda value: (
-        isinstance(value, Mapping)
-        and any(names <= set(value) for names in ({"y", "u"}, {"OutputData", "InputData"}))
+    fits = lambda value: isinstance(value, Mapping) and any(names <= set(value) for names in keys)
+    structs = {name: value for name, value in content.items() if fits(value)}
+    if variable is None and fits(content):
+        return content
+    if variable is None and len(structs) == 1:
+        return next(iter(structs.values()))
+    if variable in structs:
+        return structs[variable]
+    which = "which of them (variable=) is not said" if variable is None else f"not {variable!r}"
+    raise ReadError(
+        f"{path}: structs with {' and '.join(sorted(keys[0], reverse=True))}: "
+        f"{', '.join(structs) or 'none'}; {which}. An object of MATLAB's toolbox cannot be read "
+        f"outside of it: make a struct of it, {save}"
     )
-    structs = {name: value for name, value in content.items() if is_iddata(value)}
-    if variable is None and is_iddata(content):
-        fields = content
-    elif variable is None and len(structs) == 1:
-        fields = next(iter(structs.values()))
-    elif variable in structs:
-        fields = structs[variable]
-    else:
-        which = "which of them (variable=) is not said" if variable is None else f"not {variable!r}"
-        raise ReadError(
-            f"{path}: structs with y and u: {', '.join(structs) or 'none'}; {which}. An iddata "
-            f"object cannot be read outside of MATLAB: make a struct of it, {_SAVE}"
-        )
+
+
+def from_iddata(path: str | Path, variable: str | None, references: Names) -> Record:
+    """`Record.from_iddata`, from the variable of that name, the only struct, or the file itself."""
+    names = frozenset(("y", "u")), frozenset(("OutputData", "InputData"))
+    fields = read_struct(path, *names, variable=variable, save=_SAVE)
     y = _matrix(path, fields, "y", "OutputData")
     u = _matrix(path, fields, "u", "InputData")
     unit = str(fields.get("TimeUnit", "seconds"))

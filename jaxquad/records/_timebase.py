@@ -85,11 +85,7 @@ def channels(
 
     - `ReadError`: where the file is missing, damaged or of an unknown format.
     """
-    signals = load_signals(path)
-    try:
-        timebases = Timebases(signals, time, time_unit, dt)
-    except ReadError as error:
-        raise located(error, path) from error
+    timebases = timebases_of(path, time, time_unit, dt)
     summaries = []
     for name in timebases.names:
         values = timebases.values(name)
@@ -103,6 +99,18 @@ def channels(
         unit = timebases.unit(name)
         summaries.append(ChannelSummary(name, len(values), *clock, low, high, unit))
     return summaries
+
+
+def timebases_of(
+    path: str | Path, time: str | None = None, time_unit: TimeUnit | None = None,
+    dt: Number | None = None,
+) -> "Timebases":  # fmt: skip
+    """Those of a file. Raises ReadError, which names it."""
+    signals = load_signals(path)
+    try:
+        return Timebases(signals, time, time_unit, dt)
+    except ReadError as error:
+        raise located(error, path) from error
 
 
 Place = tuple[str, int | None]  # an array, and its column

@@ -14,8 +14,10 @@ import numpy as np
 from ._channel import native_rate, Number
 from ._firmwares import (
     axis_of_rate as axis_of_rate,
+    channel_limit as channel_limit,
     firmware_log as firmware_log,
     firmware_names as firmware_names,
+    is_setpoint as is_setpoint,
     register_log as register_log,
 )
 from ._log import (
@@ -275,6 +277,8 @@ class FirmwareLog:
     rates: Sequence[str] = ()  # of roll, pitch and yaw: they show take-off, landing and crash
     setpoints: Sequence[str] = ()
     throttle: Sequence[tuple[str, float]] = ()  # factors to 0 .. 1; first what the motors had
+    # The most that sticks and commands reach, by how the names of their channels begin.
+    limits: Mapping[str, float] = dataclasses.field(default_factory=dict)
     hold: Callable[[Log], tuple[float | None, tuple[str, ...]]] = lambda log: (None, ())
     of_loop: tuple[str, ...] = ()  # how names of parameters begin whose change splits a log
     learned: tuple[str, ...] = ()  # those of them that the firmware itself changes

@@ -8,16 +8,18 @@ from jaxtyping import Bool, Float
 
 from jaxquad.excitation import three_two_one_one
 from jaxquad.identify import (
+    AGREES,
     as_sampled,
     Fit,
-    GOOD_TIC,
     MISFIT,
     model_response,
     Verification,
+    WEAK,
     with_values,
 )
 from jaxquad.plot import COHERENT
 from jaxquad.records import Record
+from jaxquad.records.firmware import channel_limit, is_setpoint
 from jaxquad.spectra import FrequencyResponse
 
 from ._page import Section
@@ -29,6 +31,7 @@ _AIM = 0.8  # coherence that a flight is planned for
 _FAINT = 0.2  # coherence below which its estimate says nothing
 _LOUDER = 2.0  # times the amplitude that is advised at most: linear ranges are not known
 _LONGER = 2.0  # times the duration
+_SAMPLES = 25  # in a period of the highest frequency: Tischler & Remple, ch. 5
 _CYCLES = 5  # of the lowest frequency: Tischler & Remple, sec. 5.4
 _SHORTEST = 20.0  # s, of a sweep
 _SHOWS = 0.3  # of the largest share, where a parameter has an effect that no other has
@@ -69,11 +72,11 @@ def answer_section(
         for k, (name, unit) in enumerate(zip(fit.names, units, strict=True)):
             if fit.determined[k] and _reach(fit, k) <= _LOOSE:
                 value = f"{fit.values[k]:.4g}{f' {unit}' if unit else ''}"
-                can.append(f"{name}: {value} \u00b1 {100 * _reach(fit, k):.2g} % (95 %).")
+                can.append(f"{name}: {value} \u00b1 {_two_digits(100 * _reach(fit, k))} % (95 %).")
         for one in fit.combinations:
             can.append(f"{one.name}: {one.value:.4g}{f' {one.unit}' if one.unit else ''}.")
         for k in _loose(fit):
-            reach = f"only to \u00b1 {100 * _reach(fit, k):.2g} % (95 %)"
+            reach = f"only to \u00b1 {_two_digits(100 * _reach(fit, k))} % (95 %)"
             cannot.append(f"{fit.names[k]}: {reach if fit.determined[k] else 'not by itself'}.")
     if _is_of_controller(frf):
         cannot.append(f"{answer}: the response is that of the controller, -1/C.")
@@ -85,7 +88,9 @@ def answer_section(
             "feedback: no reference was recorded."
         )
     for name, check in checks.items():
-        if check.tic < GOOD_TIC:
+        if check.prediction is not None and check.verdict.kind != AGREES:
+            cannot.append(f"What happens in {name}, {check.method}: {check.verdict}.")
+        elif check.verdict.kind == AGREES:
             can.append(f"What happens in {name}: predicted, TIC {check.tic:.3f}.")
         else:
             does_not = f"the model does not predict it, TIC {check.tic:.3f}"
@@ -158,6 +163,10 @@ def _ends(
     return float(omega[0]), float(omega[-1])
 
 
+def _two_digits(value: float) -> str:
+    return f"{float(f'{value:.2g}'):g}"
+
+
 def _reach(fit: Fit, k: int) -> float:
     """Half of the 95 % interval over the value."""
     low, high = fit.interval(fit.names[k])
@@ -200,13 +209,18 @@ def next_flight(
         low, high = _ends(frf)
         why = "the band of this record does not determine the model"
         needs = [_Need(low / 2, 2 * high, _LOUDER, why)]
+    highest = _highest(frf, record)
+    needs = [need for need in needs if need.low < highest or not fit.identifiable]
+    if needs and record is not None and _is_own_command(record):
+        return Flight(_EXCITE, {}, [*dict.fromkeys(_sentence(need.why) for need in needs)])
     if needs:
         return _sweep([*needs, *poor], frf, record)
     if not fit.identifiable and fit.verdict.remedies:
         what = "No further flight of the same kind helps. " + _sentence(fit.verdict.remedies[0])
         return Flight(what, {}, [*map(_sentence, fit.verdict.remedies[1:])])
     wished = [f"Only if you need it: {_sweep([need], frf, record).what}" for need in poor]
-    failed = [name for name, c in checks.items() if not c.tic < GOOD_TIC]
+    passed = lambda c: c.verdict.kind == AGREES or (c.prediction and c.verdict.kind == WEAK)
+    failed = [name for name, check in checks.items() if not passed(check)]
     if failed:
         what = (
             f"None before it is clear why the model does not predict {' and '.join(failed)}: "
@@ -222,7 +236,8 @@ def next_flight(
     low, high = _ends(frf, good) if good.any() else _ends(frf)
     unit = three_two_one_one(width=1.0, amplitude=1.0, sample_rate=20.0)
     width = float(np.sqrt(unit.omega_min * unit.omega_max / (low * high)))
-    source, text = _amplitude(frf, record, 1.0)
+    source, peak = _source(frf, record)
+    _, text = _amplitude(source, peak, record, 1.0)
     facts = {
         "axis": f"{', '.join(frf.output_names)}, by {source}",
         "pulses": f"3-2-1-1, the shortest pulse {width:.2g} s, so that it peaks at "
@@ -265,7 +280,7 @@ def _needs_of_parameters(fit: Fit, frf: FrequencyResponse) -> list[_Need]:
         by_noise = float(np.diff(fit.interval(fit.names[k], model_error=False))[0] / 2)
         by_noise /= max(abs(float(fit.values[k])), 1e-300)
         factor = by_noise / _LOOSE if np.isfinite(by_noise) else np.inf
-        reach = f"is known to \u00b1 {100 * _reach(fit, k):.2g} %"
+        reach = f"is known to \u00b1 {_two_digits(100 * _reach(fit, k))} %"
         if not fit.determined[k]:
             reach = "is not determined"
         text = f"the parameter {fit.names[k]} {reach}, and shows itself from {in_both(low, high)}"
@@ -314,37 +329,80 @@ def _unshared_effects(
 def _sweep(needs: Sequence[_Need], frf: FrequencyResponse, record: Record | None) -> Flight:
     measured = _ends(frf)
     low = min(need.low for need in needs)
-    high = max(need.high for need in needs)
-    low, high = min(low, measured[1] / 10), max(high, measured[0] * 10)  # at least a decade
+    high = min(max(need.high for need in needs), _highest(frf, record))
+    low, high = min(low, measured[1] / 10), max(high, measured[0] * 10)
+    high = float(f"{high / (2 * np.pi):.3g}")  # Hz, as it is printed
+    low = min(float(f"{low / (2 * np.pi):.3g}"), high / 10)  # at least a decade
     factor = max(need.factor for need in needs)
-    louder = float(np.clip(factor, 1.0, _LOUDER))
+    source, peak = _source(frf, record)
+    louder = float(np.clip(factor, 1.0, _loudest(source, peak)))
     longer = min(factor / louder, _LONGER**0.5) ** 2
     now = 0.0 if record is None else record.duration
-    seconds = max(now * longer, _CYCLES * 2 * np.pi / low, _SHORTEST)
+    seconds = max(now * longer, _CYCLES / low, _SHORTEST)
     seconds = float(np.ceil(seconds / 5) * 5)
-    source, text = _amplitude(frf, record, louder)
+    amplitude, text = _amplitude(source, peak, record, louder)
     facts = {
         "axis": f"{', '.join(frf.output_names)}, by {source}",
-        "frequencies": f"sweep from {in_both(low, high)}",
+        "frequencies": f"sweep from {in_both(2 * np.pi * low, 2 * np.pi * high)}",
         "amplitude": text,
         "seconds": f"{seconds:g}" + (f" (now {now:.3g})" if now else ""),
     }
-    what = (
-        f"Sweep the channel {source} from {low / (2 * np.pi):.2g} to {high / (2 * np.pi):.2g} Hz, "
-        f"{text.split(' (')[0]}, for {seconds:g} s."
-    )
-    return Flight(what, facts, [_sentence(need.why) for need in needs])
+    if record is not None:
+        rate = np.ceil(max(record.sample_rate, _SAMPLES * high))
+        facts["signal"] = (
+            f"jaxquad design sweep --band {low:.6g} {high:g} --rate {rate:.0f} "
+            f"--amplitude {amplitude} --duration {seconds:g}"
+        )
+    what = f"Sweep the channel {source} from {_two_digits(low)} to {_two_digits(high)} Hz, "
+    what += f"{text.split(' (')[0]}, for {seconds:g} s."
+    return Flight(what, facts, [*dict.fromkeys(_sentence(need.why) for need in needs)])
 
 
-def _amplitude(frf: FrequencyResponse, record: Record | None, louder: float) -> tuple[str, str]:
-    """The channel to excite, and its amplitude in words: that of the record, times `louder`."""
+def _highest(frf: FrequencyResponse, record: Record | None) -> float:
+    """In rad/s, to which a sweep can be flown and logged: that of the log's rate, or measured."""
     if record is None:
-        return frf.input_names[0], f"{louder:.2g} times the amplitude of this record"
+        return np.inf
+    good = _good(frf)
+    measured = _ends(frf, good)[1] if good.any() else 0.0
+    return max(2 * np.pi * record.sample_rate / _SAMPLES, measured)
+
+
+_EXCITE = (
+    "A chirp of the rate set-point on this axis, or strong and quick sticks in acro, for 20 s, "
+    "with the set-point logged: the command of an autopilot's loop cannot be swept itself. jaxquad "
+    "autopilot says how to fly it with this firmware."
+)
+
+
+def _is_own_command(record: Record) -> bool:
+    """Whether the loop of an autopilot alone moved the input."""
+    return not record.reference_names and channel_limit(record.input_names[0]) is not None
+
+
+def _source(frf: FrequencyResponse, record: Record | None) -> tuple[str, float]:
+    """The channel to excite, and its amplitude in this record: half of its range."""
+    if record is None:
+        return frf.input_names[0], np.nan
     name = record.reference_names[0] if record.reference_names else record.input_names[0]
-    values = record.channel(name)
-    peak = float(np.max(np.abs(values - np.median(values))))
-    unit = f" {record.unit(name)}" if record.unit(name) else ""
-    text = f"amplitude {louder * peak:.2g}{unit}"
+    return name, float(np.ptp(record.channel(name)) / 2)
+
+
+def _loudest(name: str, peak: float) -> float:
+    """By how much an amplitude may grow: to the end of a stick or a command; how far a rate
+    set-point can go depends on the pilot's rates, so that stays."""
+    limit = peak if is_setpoint(name) else channel_limit(name)
+    return _LOUDER if limit is None or not peak > 0 else float(np.clip(limit / peak, 1.0, _LOUDER))
+
+
+def _amplitude(name: str, peak: float, record: Record | None, louder: float) -> tuple[str, str]:
+    """As a number and in words: that of the record, times `louder`."""
+    if record is None:
+        return "", f"{louder:.2g} times the amplitude of this record"
+    number, unit = _two_digits(louder * peak), record.unit(name)
+    limit = channel_limit(name)
+    if limit is not None and float(number) > limit:  # a record may go beyond, as a sum of terms
+        number = f"{limit:g}"
+    text = f"amplitude {number}{f' {unit}' if unit else ''}"
     if louder > 1:
-        return name, f"{text} ({louder:.2g} times this record's; less if the motors saturate)"
-    return name, f"{text} (as in this record)"
+        return number, f"{text} ({louder:.2g} times this record's; less if the motors saturate)"
+    return number, f"{text} (as in this record)"

@@ -36,12 +36,13 @@ class Cell(NamedTuple):
 
 
 class Table(NamedTuple):
-    """A table of a page; the first `texts` columns hold words, the others numbers."""
+    """A table of a page, with notes below; the first `texts` columns hold words, others numbers."""
 
     title: str
     heads: Sequence[str | Cell]
     rows: Sequence[Sequence[str | Cell]]
     texts: int = 1
+    notes: Sequence[str] = ()
 
 
 class Headline(NamedTuple):

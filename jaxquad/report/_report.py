@@ -11,7 +11,16 @@ import numpy as np
 
 import jaxquad.plot as plot
 from jaxquad._core import write_file
-from jaxquad.identify import Combination, Fit, GOOD_TIC, KnownFilter, MISFIT, Verification
+from jaxquad.identify import (
+    AGREES,
+    Combination,
+    CONTRADICTS,
+    Fit,
+    GOOD_TIC,
+    KnownFilter,
+    MISFIT,
+    Verification,
+)
 from jaxquad.models import Model
 from jaxquad.plot import COHERENT, short_names, unit_label
 from jaxquad.records import clock_start, Record, show_times
@@ -161,6 +170,10 @@ def fit_headline(fit: Fit, remarks: int) -> Headline:
 def check_headline(name: str, check: Verification, fit: Fit) -> Headline:
     """Of the model simulated on a record."""
     numbers = f"{name}: fit {check.fit_percent:.1f} %, TIC {check.tic:.3f}"
+    if check.prediction is not None:  # one of which any smooth record has a low TIC
+        kinds = {AGREES: ("good", "VERIFIED"), CONTRADICTS: ("bad", "VERIFICATION FAILS")}
+        level, word = kinds.get(check.verdict.kind, ("warn", "WEAKLY VERIFIED"))
+        return Headline(level, word, f"{name}: {check.method}: {check.verdict}")
     if check.tic < GOOD_TIC and not fit.identifiable:
         lost = ", ".join(fit.verdict.undetermined)
         reason = f"{numbers}: right in what it does, but its record does not determine {lost}"
@@ -302,10 +315,10 @@ def check_section(checks: Mapping[str, Verification]) -> dict[str, object]:
         )
         image = embed_figure(
             lambda check=check, outputs=outputs: plot.compare(replace(check, outputs=outputs)),
-            alt=f"Measured and simulated {check.output_name} over time, {name}: fit "
+            alt=f"Measured and {check.method}: {check.output_name} over time, {name}: fit "
             f"{check.fit_percent:.1f} %, TIC {check.tic:.3f}.",
         )
-        measures = Table(f"Agreement, {within}", heads, rows, texts=2)
+        measures = Table(f"Agreement, {check.method}, {within}", heads, rows, texts=2)
         omitted = str(check.omitted) if check.omitted else ""
         sections.append({"name": name, "image": image, "measures": measures, "omitted": omitted})
     return {"good": GOOD_TIC, "checks": sections}

@@ -89,6 +89,7 @@ def verification_content(check: "Verification") -> dict[str, object]:
         "output": check.output_name,
         "unit": check.output_unit,
         "agreement": check.verdict.kind,
+        "method": check.method,
         "outputs": [{"name": x.name, "unit": x.unit} | measures(x) for x in check.outputs],
     }
 

@@ -1,6 +1,12 @@
-from ._autopilot import autopilot as autopilot
+from ._autopilot import autopilot as autopilot, recipe as recipe
+from ._autopilot_settings import (
+    AutopilotSettings as AutopilotSettings,
+    CompareSettings as CompareSettings,
+    limits_of as limits_of,
+)
 from ._batch import batch as batch, find_logs as find_logs
 from ._batch_workers import Job as Job
+from ._compare import compare as compare
 from ._identification import Identification as Identification
 from ._identify import (
     identify as identify,
@@ -17,6 +23,7 @@ from ._log import (
     propose_settings as propose_settings,
     write_demo_log as write_demo_log,
 )
+from ._look import AxisView as AxisView, LogView as LogView, look as look
 from ._options import Settings as Settings, SettingsError as SettingsError
 from ._result_file import (
     default_folder as default_folder,
@@ -27,7 +34,6 @@ from ._result_file import (
     StoredTuning as StoredTuning,
 )
 from ._settings import (
-    AutopilotSettings as AutopilotSettings,
     BatchSettings as BatchSettings,
     GROUPS as GROUPS,
     IdentifySettings as IdentifySettings,

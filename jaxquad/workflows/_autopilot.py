@@ -3,12 +3,12 @@
 import dataclasses
 import re
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
-from jaxquad._core import announce, marked_text, Message
+from jaxquad._core import announce, marked_text, Message, Number
 from jaxquad.autopilot import (
     ADRCAutopilot,
     AutopilotProposal,
@@ -26,6 +26,7 @@ from jaxquad.autopilot import (
     propose_adrc,
     read_channels_if_any,
     read_flown,
+    Recipe,
     reproduce_flight,
     Reproduction,
     settings_of,
@@ -33,17 +34,23 @@ from jaxquad.autopilot import (
 )
 from jaxquad.identify import gain_over_throttle, GainOverThrottle, UndeterminedError
 from jaxquad.records import AXES, Proposal, RecordError, RecordWarning
+from jaxquad.records.firmware import firmware_names
 from jaxquad.spectra import frequency_response, JointInputOutput, LocalPolynomial
 
+from ._autopilot_settings import AutopilotSettings
 from ._identify import identify_plant
 from ._log import propose_settings, read_records
 from ._options import SettingsError
-from ._settings import AutopilotSettings, IdentifySettings, in_options
+from ._settings import IdentifySettings, in_options
+
+
+Listener = Callable[[str, AutopilotProposal | str], None]
 
 
 def autopilot(
-    path: str | Path, settings: AutopilotSettings | None = None
-) -> AutopilotProposal | AxesProposal | ADRCAutopilot:
+    path: str | Path, settings: AutopilotSettings | None = None,
+    listener: Listener = lambda axis, one: None,
+) -> AutopilotProposal | AxesProposal | ADRCAutopilot:  # fmt: skip
     """Tune the gains of the autopilot that flew a log, as `jaxquad autopilot` does.
 
     Gains and filters are read from the log, and the law is replayed on its set-point and gyro to
@@ -61,6 +68,7 @@ def autopilot(
 
     - `path`: a log of Betaflight, PX4 or ArduPilot.
     - `settings`: the axis, and what is kept.
+    - `listener`: hears the proposal of each axis as soon as it is there, or why there is none.
 
     **Returns:** an `AxesProposal` of all axes that the log holds, an `AutopilotProposal` where
     `axis` names one, or an `ADRCAutopilot` where the ADRC flew or is asked for by `law`; nothing is
@@ -79,7 +87,7 @@ def autopilot(
         ```
     """
     path, settings = Path(path), settings or AutopilotSettings()
-    record, proposal = _channels_of(path, settings)
+    record, proposal = channels_of(path, settings)
     firmware = firmware_named(proposal.vehicle)
     adrc = firmware.has_adrc and firmware.flies_adrc(settings_of(path, proposal).values)
     if adrc and settings.law == "pid":
@@ -92,16 +100,45 @@ def autopilot(
             )
         return _tune_adrc(path, record, proposal, settings, adrc)
     if settings.axis != "all":
-        return _tune_axis(path, settings, {})
+        one = _tune_axis(path, settings, {})
+        listener(settings.axis, one)
+        return one
     number = re.match(r"log(\d+)\.", proposal.setup.rate)
     if (
         number is not None and settings.flight is None
     ):  # all axes are of the flight that is proposed
         settings = dataclasses.replace(settings, flight=int(number[1]))
-    return _tune_axes(path, settings)
+    return _tune_axes(path, settings, listener)
 
 
-def _tune_axes(path: Path, settings: AutopilotSettings) -> AxesProposal:
+def recipe(
+    firmware: str, axis: str = "all", *, amplitude: Number | None = None,
+    switch: int | None = None,
+) -> Recipe:  # fmt: skip
+    """What to set and to fly, so that `autopilot` can tune from the log.
+
+    **Arguments:**
+
+    - `firmware`: "betaflight", "ardupilot" or "px4".
+    - `axis`: roll, pitch, yaw or all.
+    - `amplitude`: of the chirp in the firmware's unit, by default one to begin with.
+    - `switch`: number of the channel or of the position of the switch that starts it.
+
+    **Raises:** `ValueError`: the firmware has no recipe, or a value is not flyable; it names what
+    is possible.
+    """
+    if axis not in (*AXES, "all"):
+        raise ValueError(f"axis is {axis!r}: give one of {', '.join(AXES)}, or all.")
+    axes, names = AXES if axis == "all" else (axis,), firmware_names()
+    if firmware in names:
+        answer = firmware_named(firmware).recipe(axes, amplitude=amplitude, switch=switch)
+        if answer is not None:
+            return answer
+    possible = [name for name in names if firmware_named(name).recipe(AXES) is not None]
+    raise ValueError(f"there is no recipe for {firmware!r}: give one of {', '.join(possible)}.")
+
+
+def _tune_axes(path: Path, settings: AutopilotSettings, listener: Listener) -> AxesProposal:
     """One axis after the other; filters that they share are those of the first that changes them.
 
     Raises the error of the first axis where none can be used.
@@ -115,7 +152,9 @@ def _tune_axes(path: Path, settings: AutopilotSettings) -> AxesProposal:
             axes[axis] = _tune_axis(path, dataclasses.replace(settings, axis=axis), filters)
         except ValueError as error:  # it costs no other axis
             errors[axis] = error
+            listener(axis, in_options(error))
             continue
+        listener(axis, axes[axis])
         filters = filters or axes[axis].shared_filters
     if not axes:
         raise next(iter(errors.values()))
@@ -127,20 +166,26 @@ def _tune_axis(
 ) -> AutopilotProposal:
     """The gains of one axis, with `filters` that are changed already."""
     announce("gains and filters that flew")
-    record, proposal = _channels_of(path, settings)
+    record, proposal = channels_of(path, settings)
     flown = read_flown(path, proposal, record, settings.throttle)
     plant = identify_plant(path, record, proposal, flown.filters)
     unsure = lambda why, again: AutopilotProposal("cannot tell", why, settings, plant, flown, again)
-    recipe = firmware_named(flown.firmware).what_to_fly(AXES[flown.axis])
+    advice = firmware_named(flown.firmware).what_to_fly(AXES[flown.axis])
+    if not plant.fit.identifiable and flown.flight is not None and flown.flight.rests:
+        moved = np.degrees(np.std(flown.flight.setpoint))
+        return unsure(Message(
+            f"this log cannot tell: {flown.flight.rest_text}, which is what is analysed of it "
+            f"(its set-point by {moved:.1f} deg/s rms, and nothing is injected). {advice}"
+        ), None)  # fmt: skip
     if not plant.fit.identifiable:
         summary = plant.fit.verdict.summary
-        return unsure(Message(f"this log cannot tell: «plant|{summary}». {recipe}"), None)
+        return unsure(Message(f"this log cannot tell: «plant|{summary}». {advice}"), None)
     if flown.flight is None:
         return unsure(_NO_SETPOINT, None)
     announce("the flown loop again")
     again = check_loop(plant, flown)
     if again.kind == "unknown":
-        return unsure(f"this log cannot tell: {again.verdict}. {recipe}", again)
+        return unsure(f"this log cannot tell: {again.verdict}. {advice}", again)
     if again.kind != "flown":
         return unsure(f"this log cannot tell: {again.verdict}", again)
     read = lambda inputs: read_records(path, plant.settings, further_inputs=inputs)
@@ -154,7 +199,7 @@ _NO_SETPOINT = (
 )
 
 
-def _channels_of(path: Path, settings: AutopilotSettings) -> tuple[IdentifySettings, Proposal]:
+def channels_of(path: Path, settings: AutopilotSettings) -> tuple[IdentifySettings, Proposal]:
     """What the log itself says is command, rate and reference."""
     record = IdentifySettings(
         axis=None if settings.axis == "all" else settings.axis, chirp=settings.chirp,

@@ -6,11 +6,10 @@ import io
 import json
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from importlib.metadata import version
 from pathlib import Path
 from urllib.parse import quote
 
-from jaxquad._core import available_cores, write_file
+from jaxquad._core import __version__, available_cores, write_file
 
 from ._batch_workers import (
     Content,
@@ -148,7 +147,7 @@ def _key_of(log: Path, settings: IdentifySettings) -> str:
     """By the log's content, its settings and the version of jaxquad, not by the log's name."""
     with log.open("rb") as file:
         digest = hashlib.file_digest(file, "sha256").hexdigest()
-    parts = json.dumps([digest, settings.content(), version("jaxquad")], sort_keys=True)
+    parts = json.dumps([digest, settings.content(), __version__], sort_keys=True)
     return hashlib.sha256(parts.encode()).hexdigest()[:32]
 
 

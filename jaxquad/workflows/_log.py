@@ -3,6 +3,7 @@
 import dataclasses
 import functools as ft
 import operator
+import shlex
 import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -52,8 +53,8 @@ def propose_settings(
         return settings, None
     if several:
         raise SettingsError(
-            f"several logs need `input` and `output`: run jaxquad identify {path} alone, and give "
-            "what it proposes"
+            "several logs need `input` and `output`: run jaxquad identify "
+            f"{shlex.quote(str(path))} alone, and give what it proposes"
         )
     ends, factor = (settings.start, settings.stop), settings.time_factor or 1.0
     if settings.segments:

@@ -281,6 +281,12 @@ def _band(value: object) -> Pair:
     return pair
 
 
+def _part(value: object) -> Pair:
+    if (pair := _rising(value)) is None:
+        raise ValueError("give two times in s, the first one first")
+    return pair
+
+
 def _segments(value: object) -> tuple[Pair, ...]:
     if not _is_list(value):
         raise ValueError("give a list of [start, stop], in s")
@@ -352,6 +358,7 @@ HOLD = Kind(_hold, lambda text: text if text == "dt" else float(text), str, meta
 COUNT, SIZE = Kind(_count, int, metavar="N"), Kind(_size, int, metavar="N")
 SWITCH = Kind(_require(lambda value: isinstance(value, bool), "give true or false"), words=0)
 BAND = Kind(_band, float, _plain, words=2, metavar=("LOW", "HIGH"))
+PART = Kind(_part, float, _plain, words=2, metavar=("START", "STOP"))
 MIXES = Kind(_mixes, repeated=True, metavar="CHANNEL")
 SEGMENTS = Kind(_segments, write=_joined, repeated=True, metavar="START:STOP")
 UNITS = Kind(_units, write="=".join, repeated=True, metavar="NAME=UNIT")

@@ -10,6 +10,8 @@ from typing import Any, NamedTuple, TYPE_CHECKING
 
 import numpy as np
 
+from jaxquad.records.firmware import axis_of_rate
+
 from ._settings import IdentifySettings, TuneSettings
 
 
@@ -212,10 +214,16 @@ def require_radians(name: str, unit: str) -> None:
     if unit in ("deg", "deg/s"):
         radians = unit.replace("deg", "rad")
         options = f"(--output angle=0.017453293*{name} --unit angle={radians})"
+    by_identification = f"identify with the output in rad/s or rad {options}"
+    if axis_of_rate(name) is not None:
+        advice = (
+            "for the gains of this firmware run jaxquad autopilot on the log; for a controller "
+        )
+        advice += f"of your own, {by_identification}"
+    else:
+        advice = f"{by_identification}; an autopilot's own gains come from jaxquad autopilot"
     raise ValueError(
-        f"the unit of {name} is {unit or 'not known'}, but gains are for an angle in rad: "
-        f"identify with the output in rad/s or rad {options}; an autopilot's own gains come from "
-        "jaxquad autopilot"
+        f"the unit of {name} is {unit or 'not known'}, but gains are for an angle in rad: {advice}"
     )
 
 

@@ -96,6 +96,23 @@ def test_the_angle_loop_is_stable_up_to_the_gain_at_which_a_simulated_one_is():
     assert np.min(np.abs(1 + late)) < 0.02
 
 
+def test_a_search_in_single_precision_sees_what_a_certificate_in_double_does():
+    random = np.random.default_rng(2)
+    law = ArduPilotRate(*GAINS, gyro=FilterChain((), 1 / DT), dt=DT)
+    spread = lambda middle: middle * np.exp(0.2 * random.standard_normal((16, 1)))
+    plants = hold_plants(spread(GAIN), spread(LAG), spread(0.004), OMEGA, DT)
+    loops = RateLoops.of(law, 0, plants, OMEGA)
+    gains = GAINS * np.exp(random.uniform(0, 4, (200, 3)))
+    exact, quick = loops.qualities(gains), loops.in_single_precision().qualities(gains)
+    usual = exact.stable & (exact.peak < 3)
+    assert 0.1 < np.mean(exact.stable) < 0.95 and np.sum(usual) > 200
+    np.testing.assert_array_equal(quick.stable[exact.peak < 100], exact.stable[exact.peak < 100])
+    for name in ("peak", "resonance", "crossover", "rejection", "noise"):
+        one, other = getattr(quick, name)[usual], getattr(exact, name)[usual]
+        np.testing.assert_allclose(one, other, rtol=1e-4, err_msg=name)
+    assert quick.peak.dtype == np.float32 and exact.peak.dtype == np.float64
+
+
 def test_betaflights_angle_loop_is_open_in_acro_and_has_no_yaw():
     values = {"levelPID": "50,75,75"}
     acro = firmware_named("betaflight").angle_loop(values, 0, 1 / 4000, levelled=False)

@@ -4,11 +4,13 @@ import json
 
 import numpy as np
 import pytest
+from html_pages import Page
 
-from jaxquad.autopilot import CHIRP_TRUTH, write_chirp_log
+from jaxquad.autopilot import AutopilotProposal, AxesProposal, CHIRP_TRUTH, write_chirp_log
 from jaxquad.cli import main
 from jaxquad.records import propose, read_settings
 from jaxquad.records.formats import load_log
+from jaxquad.workflows import autopilot, AutopilotSettings
 
 
 pytestmark = pytest.mark.usefixtures("compiled_quickly")
@@ -116,6 +118,10 @@ def test_the_command_finds_the_true_plant_and_shows_where_to_look(tmp_path, caps
     assert "gain 36, lag 0.025 s, delay 0.000625 s" in printed
     assert printed.split("Look at ")[1].splitlines()[0] == str(tmp_path / "autopilot.html")
     assert code == 0 and content["kind"] == "proposed"
+    shown = Page((tmp_path / "autopilot.html").read_text(encoding="utf-8"))
+    assert "PROPOSED" in shown.text("h1")  # the first page that a pilot sees is a success
+    linked = {each["href"] for each in shown.of("a") if "download" in each}
+    assert linked and all((tmp_path / name).exists() for name in linked)
     low, high = plant["intervals_95"]["gain"]
     assert low < 36 < high and (tmp_path / "proposal_100.txt").exists()
 
@@ -124,3 +130,22 @@ def test_a_measured_and_a_simulated_flight_are_not_asked_for_together(capsys):
     with pytest.raises(SystemExit) as stop:
         main(["demo", "--autopilot", "--flight"])
     assert stop.value.code == 2 and "not allowed with" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_gains_tuned_again_are_those_of_a_run_with_these_limits(tmp_path):
+    log = write_chirp_log(tmp_path / "demo.bfl")
+    heard = []
+    both = autopilot(log, listener=lambda axis, one: heard.append((axis, one)))
+    assert isinstance(both, AxesProposal)
+    assert heard == [*both.axes.items(), *both.unread.items()]
+    again = both.retuned(sensitivity=1.5, noise=1.2).axes["roll"]
+    alone = autopilot(log, AutopilotSettings(axis="roll", sensitivity=1.5, noise=1.2))
+    assert isinstance(alone, AutopilotProposal)
+    assert again.new == alone.new != both.axes["roll"].new
+    assert again.stages == alone.stages and again.verdict == alone.verdict
+    assert again.settings.content()["sensitivity"] == 1.5
+    with pytest.raises(ValueError, match="`members` is no limit"):
+        alone.retuned(members=64)
+    with pytest.raises(ValueError, match="nothing to tune again"):
+        both.axes["pitch"].retuned(sensitivity=1.5)

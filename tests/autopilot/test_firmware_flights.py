@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import math
+import re
 from types import SimpleNamespace
 
 import numpy as np
@@ -154,7 +155,8 @@ def test_the_gain_over_the_throttle_and_the_thrust_curve_are_the_vehicles(data, 
 def test_a_hover_is_refused_with_what_to_fly(data, tmp_path, capsys):
     code, content = run(data / BETAFLIGHT / "A_hover.BFL", "roll", tmp_path)
     assert code == 3 and content["kind"] == "cannot tell" and content["new"] == {}
-    assert "debug_mode = CHIRP" in content["verdict"]
+    assert "you did not move roll" in content["verdict"] and "model" not in content["verdict"]
+    assert "jaxquad recipe betaflight --axis roll" in content["verdict"]
     assert (tmp_path / "proposal_revert.txt").exists()
 
 
@@ -191,6 +193,19 @@ def test_all_axes_are_of_one_flight_of_a_file_with_several(data, tmp_path, capsy
     assert kinds == {"roll": "proposed", "pitch": "cannot tell", "yaw": "cannot tell"}
     for each in content["axes"].values():
         assert each["identified_with"]["output"].startswith("log2.")
+
+
+@pytest.mark.slow
+def test_all_axes_are_tuned_in_one_run_into_one_file_with_d_max(data, tmp_path):
+    log = str(data / BETAFLIGHT / "B_chirp_three_axes.BFL")
+    assert main(["autopilot", log, "--out", str(tmp_path), "--quiet"]) == 0
+    text = (tmp_path / "proposal_100.txt").read_text()
+    names = {"p_roll", "p_pitch", "p_yaw", "i_yaw", "d_pitch", "d_max_roll", "d_max_pitch"}
+    assert all(f"set {name} = " in text for name in names)
+    assert text.count("save") == 1
+    # Yaw swung between the motors' limits, and would a third of the way: that file holds all of it.
+    [yaw] = re.findall("set p_yaw = .*", (tmp_path / "proposal_033.txt").read_text())
+    assert yaw in text
 
 
 @pytest.mark.slow

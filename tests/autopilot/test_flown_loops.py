@@ -16,6 +16,7 @@ from jaxquad.autopilot import (
     px4_loop,
     replay_terms,
 )
+from jaxquad.autopilot._parameters import gains_of, parameters_of
 from jaxquad.records import read, read_settings
 from jaxquad.records.formats import load_log
 from jaxquad.spectra import frequency_response
@@ -55,6 +56,13 @@ def test_from_2025_on_d_is_the_base():
     assert law.d_max is not None
     assert float(law.d[0]) == 30 and float(law.d_max.ceiling[0]) == 40
     np.testing.assert_allclose(law.integral_limit, [400, 400, 320])
+
+
+def test_d_max_rises_with_d():
+    law = betaflight_loop({**HEADER, "rollPID": "45,80,30", "d_max": "40,46,0"}, (2025, 12, 0)).law
+    gains = gains_of(law, 0) * [1.0, 1.0, 1.5]
+    new = parameters_of(law, 0, gains)
+    assert (new["p_roll"], new["d_roll"], new["d_max_roll"]) == (45, 45, 60)
 
 
 PX4_VALUES = {

@@ -1,5 +1,6 @@
 """Parameter files, read back by a parser that is not the writer's."""
 
+import re
 from typing import Any
 
 import jax
@@ -127,7 +128,8 @@ def test_betaflights_cli_holds_whole_numbers_and_switches_the_sliders_off():
         "dterm_lpf1_dyn_min_hz": "90",
     }  # fmt: skip
     text = parameter_file("betaflight", changes, revert=True)
-    assert read_cli(text)["p_roll"] == "45" and "# p_roll was 52" in text
+    # After a third of the way, too, the comment is true: it is of the flight alone.
+    assert read_cli(text)["p_roll"] == "45" and "# the flight had p_roll 45" in text
 
 
 @pytest.mark.parametrize(
@@ -172,10 +174,13 @@ def test_words_are_set_last_and_back_and_for_betaflight_alone():
     words = [WordChange("pid_type", "CLASSIC", "ADRC", "it flies")]
     text = parameter_file("betaflight", changes, version=(2026, 6), words=words, title="two\nlines")
     assert text.splitlines()[:2] == ["# two", "# lines"] and "simplified" not in text
-    assert text.splitlines()[-3:] == ["# pid_type was CLASSIC", "set pid_type = ADRC", "save"]
+    assert text.splitlines()[-3:] == [
+        "# the flight had pid_type CLASSIC", "set pid_type = ADRC", "save",
+    ]  # fmt: skip
     back = parameter_file("betaflight", changes, version=(2026, 6), words=words, revert=True)
     assert read_cli(back) == {"adrc_b0_roll": "2000", "pid_type": "CLASSIC"}
-    assert "| pid_type | CLASSIC | ADRC |  |  | it flies |" in change_table(changes, words)
+    table = change_table(changes, words)
+    assert "| pid_type | CLASSIC | ADRC |  |  |" in table and "pid_type: it flies" in table
     with pytest.raises(ValueError, match="px4 stores numbers alone"):
         parameter_file("px4", [], words=words)
 
@@ -189,8 +194,37 @@ def test_a_staged_proposal_goes_a_third_of_the_way_then_all_and_back(tmp_path):
     for name, value in whole.items():
         assert third[name] == pytest.approx(old[name] + (value - old[name]) / 3, rel=1e-6)
     assert read_params(files.revert.read_text()) == pytest.approx({k: old[k] for k in whole})
-    row = "| MC_ROLLRATE_P | 0.15 | 0.1815 |  | 0.01 to 0.5 | delay margin |"
+    row = "| MC_ROLLRATE_P | 0.15 | 0.1815 |  | 0.01 to 0.5 |"
     assert row in files.table.read_text()
+
+
+@pytest.mark.parametrize("log", ["00000012.BIN", "a\nset p_roll = 250\r\n1\t1\tX\t9\t9.bfl"])
+@pytest.mark.parametrize("firmware", [*LAWS, "betaflight"])
+def test_files_name_the_log_and_what_flew_in_comments_that_are_read_as_nothing(
+    firmware, log, tmp_path
+):
+    if firmware == "betaflight":
+        old, new = betaflight_loop(HEADER, (2025, 12, 0)).parameters(), {"p_roll": 60}
+        read = read_cli
+    else:
+        old, new = proposed(LAWS[firmware])
+        read = lambda text: read_back(firmware, text, tmp_path)
+    write = lambda log: write_parameter_files(tmp_path, firmware, old, new, log=log)
+    plain, named = (
+        [path.read_text() for path in (*files.stages, files.revert)]
+        for files in map(write, ("", log))
+    )
+    safe = "".join(x if x.isprintable() else "?" for x in log)
+    for before, after in zip(plain, named, strict=True):
+        assert read(before) == read(after)
+        assert f"what flew in {safe}" in after and f"what flew in {safe}" not in before
+    if firmware == "crazyflie":  # its YAML has no comment for a parameter
+        return
+    comments = [dict(re.findall(r"^# the flight had (\S+) (\S+)$", x, re.M)) for x in named]
+    assert comments[0] == comments[1] == comments[2] != {}
+    back = read(named[2])
+    for name, value in comments[2].items():
+        assert np.float32(value) == np.float32(back[name])
 
 
 def test_the_table_says_where_no_range_is_documented():

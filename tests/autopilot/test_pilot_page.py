@@ -9,9 +9,18 @@ from html_pages import HOSTILE, Page, UNSEEN
 
 import jaxquad.plot
 import jaxquad.report
-from jaxquad.autopilot import _page, FilterChain, PilotPage, PT1, write_pilot_page
+from jaxquad.autopilot import (
+    _page,
+    FilterChain,
+    PilotPage,
+    propose_changes,
+    PT1,
+    write_pilot_page,
+)
+from jaxquad.autopilot._proposal import at_limit
 from jaxquad.plot import FlownAgain, Spectrum, StepBand
 from jaxquad.report import Headline, provenance, Table
+from jaxquad.workflows import AutopilotSettings
 
 
 FLOWN = {
@@ -63,6 +72,51 @@ def test_the_page_says_the_shares_of_the_delay_and_of_the_motors(tmp_path):
     assert cells[cells.index("p_roll") + 1 :][:2] == ["28", "40"]
 
 
+def test_old_and_new_are_beside_the_name_and_each_reason_stands_once_below(tmp_path):
+    """A wide column of reasons would move the numbers off the screen of a phone."""
+    old = {"p_roll": 45.0, "i_roll": 80.0, "d_roll": 30.0}
+    new = {"p_roll": 97.0, "i_roll": 240.0, "d_roll": 43.0}
+    reasons = dict.fromkeys(new, "less effect of torque") | {
+        "i_roll": "less effect of torque\nat the limit"
+    }
+    table = _page.change_rows(propose_changes("betaflight", old, new, reasons=reasons))
+    shown = dataclasses.replace(page("roll"), changes=table)
+    text = write_pilot_page(tmp_path / "page.html", shown).read_text(encoding="utf-8")
+    cells = [words.strip() for _, words in Page(text).texts if words.strip()]
+    assert cells[cells.index("i_roll") + 1 :][:2] == ["80", "240"]
+    assert max(len(cell) for row in table.rows for cell in row[1:]) < 12
+    assert text.count("less effect of torque") == 1
+    assert "p_roll, i_roll, d_roll: less effect of torque" in cells
+    assert "i_roll: at the limit" in cells
+
+
+def test_files_are_linked_and_their_texts_are_there_to_paste(tmp_path):
+    files = {"proposal_033.txt": "set p_roll = 62\nsave\n", "proposal_revert.txt": "<b>&"}
+    two = [page("roll"), page("pitch")]
+    for pages in (two[:1], two):
+        path = write_pilot_page(tmp_path / "page.html", *pages, files=files)
+        shown = Page(path.read_text(encoding="utf-8"))
+        assert not shown.errors
+        links = [each["href"] for each in shown.of("a") if "download" in each]
+        assert links == list(files)
+        assert [words for within, words in shown.texts if within[-1:] == ("pre",)] == [
+            *files.values()
+        ]
+
+
+def test_a_gain_at_the_limit_of_change_says_so():
+    old, new = {"p": 10.0, "i": 80.0, "d": 30.0}, {"p": 29.9, "i": 15.0, "d": 40.0}
+    said = at_limit(old, new, 3.0)
+    assert said.keys() == {"p", "i"}
+    assert said["p"].startswith("at the limit") and said["i"].startswith("beyond the limit")
+
+
+def test_overshoot_and_the_growth_of_noise_are_said_in_words():
+    said = _page.limits_text(AutopilotSettings(resonance=1.3, noise=2.0, change=4.0))
+    assert "overshoot of up to about 30 %" in said
+    assert "noise, which heats the motors, may grow 2 times" in said and "4 times" in said
+
+
 def test_what_a_log_does_not_hold_has_no_section(tmp_path):
     bare = PilotPage("roll", [Headline("bad", "THIS LOG CANNOT TELL", "fly more")], {"flown": {}})
     text = write_pilot_page(tmp_path / "page.html", bare).read_text(encoding="utf-8")
@@ -98,7 +152,7 @@ def test_a_section_that_raises_says_why_and_costs_no_other(tmp_path, monkeypatch
 
 
 def test_provenance_and_figures_may_fail_too(tmp_path, monkeypatch):
-    monkeypatch.setattr(jaxquad.plot, "steps_figure", lambda *_: 1 / 0)
+    monkeypatch.setattr(jaxquad.plot, "steps_figure", lambda *_, **__: 1 / 0)
     monkeypatch.setattr(jaxquad.report, "provenance_section", lambda _: 1 / 0)
     whole = dataclasses.replace(page("roll"), provenance=provenance())
     text = write_pilot_page(tmp_path / "page.html", whole).read_text(encoding="utf-8")
@@ -107,6 +161,18 @@ def test_provenance_and_figures_may_fail_too(tmp_path, monkeypatch):
     assert "figure could not be drawn: ZeroDivisionError" in shown.text("section")
     assert "Could not be computed: ZeroDivisionError" in shown.text("section")
     assert "Step responses" in shown.text("section")  # its table
+
+
+def test_the_step_of_the_log_itself_stands_beside_those_of_the_plants(tmp_path):
+    time = np.linspace(0.0, 1.0, 100)
+    rise = 1 - np.exp(-40 * time)
+    measured = StepBand(time, rise, rise - 0.05, rise + 0.05)
+    for steps in (page("roll").steps, {}):  # of a log that does not determine the plant
+        both = dataclasses.replace(page("roll"), steps=steps, measured=measured)
+        text = write_pilot_page(tmp_path / "page.html", both).read_text(encoding="utf-8")
+        shown = Page(text)
+        assert not shown.errors and "Step responses" in shown.text("section")
+        assert "measured" in shown.text("table")
 
 
 def test_what_the_caller_could_not_compute_is_said_where_it_would_stand(tmp_path):

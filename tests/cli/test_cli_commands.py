@@ -225,7 +225,18 @@ def chirped(folder, starts=(22,)):
 
 @pytest.mark.parametrize(
     "name",
-    ["demo", "channels", "identify", "verify", "report", "tune", "autopilot", "design", "batch"],
+    [
+        "demo",
+        "channels",
+        "identify",
+        "verify",
+        "report",
+        "tune",
+        "autopilot",
+        "compare",
+        "design",
+        "batch",
+    ],
 )
 def test_every_command_has_help_with_an_example(name, capsys):
     with pytest.raises(SystemExit) as stop:

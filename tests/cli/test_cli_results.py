@@ -11,7 +11,20 @@ from jaxquad.cli import main
 from jaxquad.workflows import free_folder, IdentifySettings
 
 
-ORDER = ["demo", "design", "channels", "identify", "verify", "tune", "autopilot", "report", "batch"]
+ORDER = [
+    "demo",
+    "app",
+    "recipe",
+    "design",
+    "channels",
+    "identify",
+    "verify",
+    "tune",
+    "autopilot",
+    "compare",
+    "report",
+    "batch",
+]
 
 
 @pytest.fixture(scope="module")

@@ -61,6 +61,13 @@ def test_steps_have_their_bands_and_terms_their_shares():
     [panel] = steps_figure(bands)
     filled = panel.collections
     assert len(filled) == 2 and filled[0].get_hatch() != filled[1].get_hatch()
+    # What settles within .1 s is not drawn for 1 s, however long the measured one is.
+    late = StepBand(3 * time, np.sin(time), np.sin(time) - 1, np.sin(time) + 1)
+    quick = StepBand(time, *(1 - np.exp(-100 * time) for _ in range(3)))
+    [panel] = steps_figure({"flown": quick}, measured=late)
+    assert panel.get_xlim()[1] < 0.15 and "measured" in lines(panel)
+    [alone] = steps_figure({}, measured=late)
+    assert alone.get_xlim()[1] > 0
     [bars] = balance_figure({"P": 3.0, "I": 1.0}, unit="pidsum")
     assert [text.get_text() for text in bars.texts] == ["3 (75 %)", "1 (25 %)"]
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 import re
+import shlex
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from html_pages import record_of, TRUTH
 from synthetic import response_of
 
 import jaxquad as jq
+from jaxquad.cli import main
 from jaxquad.report._answers import answer_section, next_flight, poor_bands
 
 
@@ -83,6 +85,49 @@ def test_a_log_of_feedback_alone_answers_nothing_about_the_vehicle():
     assert any("-1/C" in text for text in found["cannot"])
     assert found["flight"].what.startswith("Sweep the channel")
     assert "reference" in " ".join(found["flight"].why)
+
+
+def feedback_alone(rate: float, peak: float, reference: str | None):
+    """A response of the controller up to 1000 rad/s, and its record."""
+    frf = response_of(TRUTH, error=0.005, seed=0, omega=np.geomspace(0.5, 1000.0, 40))
+    omega = np.asarray(frf.omega)
+    said = jq.spectra.Remark("feedback-dominated: {where}", omega, kind=jq.spectra.DOMINATED)
+    time = np.arange(4000) / rate
+    signal = peak * np.sign(np.sin(3 * time))
+    flown = jq.Record(
+        time, signal, signal, signal if reference else None, input_names="axisSum[0]",
+        output_names="gyroADC[0]", reference_names=reference or (),
+    )  # fmt: skip
+    frf = dataclasses.replace(frf, remarks=(said,), coherence=frf.coherence.at[omega > 50].set(0.1))
+    return frf, flown
+
+
+@pytest.mark.parametrize(
+    ("reference", "peak", "most"),
+    [
+        ("rcCommand[0]", 450.0, 500.0),  # sticks end there
+        ("setpoint[0]", 350.0, 350.0),  # the pilot's rates are not in the record
+        ("r", 3.0, 6.0),
+    ],
+)
+def test_the_next_flight_stays_within_sticks_and_sample_rate_and_design_accepts_it(
+    tmp_path, reference, peak, most
+):
+    frf, flown = feedback_alone(1000.0, peak, reference)
+    flight = next_flight(fitted(frf), frf, flown, {})
+    low, high = band_of(flight)
+    assert low <= high / 9.9 and high <= 2 * np.pi * flown.sample_rate / 25 * 1.01
+    assert "e+" not in flight.what
+    words = shlex.split(flight.facts["signal"])
+    assert float(words[words.index("--amplitude") + 1]) == pytest.approx(most)
+    assert main([*words[1:], "--out", str(tmp_path / "sweep.csv")]) == 0
+
+
+def test_the_command_of_an_autopilots_loop_is_not_to_be_swept():
+    frf, flown = feedback_alone(1000.0, 50.0, None)
+    flight = next_flight(fitted(frf), frf, flown, {})
+    assert "chirp of the rate set-point" in flight.what and "Sweep" not in flight.what
+    assert not flight.facts and flight.why
 
 
 def test_an_incoherent_band_is_named():

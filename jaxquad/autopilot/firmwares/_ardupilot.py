@@ -24,7 +24,15 @@ from jaxquad.control import Reference, Setpoint
 from jaxquad.records import AXES
 
 from .._filters import Butterworth, FilterChain, Notch, PT1, Section
-from .._firmware import Channels, Firmware, Numbers, OuterLoop, Parameter, rows_of_axes
+from .._firmware import (
+    Channels,
+    Firmware,
+    Numbers,
+    OuterLoop,
+    Parameter,
+    RecipeOption,
+    rows_of_axes,
+)
 from .._law import (
     Advance,
     AngleLoop,
@@ -378,6 +386,17 @@ _ROWS = [
 ]
 
 
+_CHIRP = {
+    "SID_F_START_HZ": 0.5, "SID_F_STOP_HZ": 20, "SID_T_FADE_IN": 3, "SID_T_REC": 30,
+    "SID_T_FADE_OUT": 1,
+}  # fmt: skip
+# The usual messages, with fast attitude; the main gyro before its filters.
+_USUAL_LOGGING = {"LOG_BITMASK": 180222, "INS_RAW_LOG_OPT": 0}
+_LOGGING = {"LOG_BITMASK": 180222 + 1, "INS_RAW_LOG_OPT": 1}
+_MAGNITUDE = RecipeOption("amplitude", 0.05, 0.01, 0.3, "SID_MAGNITUDE, of the mixer's range")
+_POSITION = RecipeOption("switch", 6, 1, 6, "the position of the mode switch for SystemID")
+
+
 class ArduPilot(Firmware):
     """ArduPilot, Copter; files hold a name and a value in a line, as Mission Planner has them."""
 
@@ -407,14 +426,34 @@ class ArduPilot(Firmware):
             },
         )  # fmt: skip
 
-    def what_to_fly(self, axis: str) -> str:
-        rate = 7 + AXES.index(axis)
-        return (
-            f"Fly this: SID_AXIS {rate + 3} (mixer, {axis}; or {rate}, rate), SID_F_START_HZ 0.5, "
-            "SID_F_STOP_HZ 20, SID_T_REC 30, LOG_BITMASK with fast attitude and PIDs; hover high "
-            "and clear in Loiter, switch to mode SystemID for 30 s, back to end. Begin with a "
-            "small SID_MAGNITUDE and raise it until the vehicle is seen to shake"
-        )
+    def recipe(self, axes, *, amplitude=None, switch=None):
+        magnitude, position = _MAGNITUDE.choose(amplitude), int(_POSITION.choose(switch))
+        numbers = [10 + AXES.index(axis) for axis in axes]  # of the mixer
+        injected = [f"{number} ({axis})" for number, axis in zip(numbers, axes, strict=True)]
+        mode = {f"FLTMODE{position}": 25}  # SystemID
+        sweep = {"SID_AXIS": numbers[0], "SID_MAGNITUDE": f"{magnitude:g}"} | _CHIRP
+        back = _USUAL_LOGGING | dict.fromkeys(mode, 0) | {"SID_AXIS": 0}
+        again = f" Repeat it with SID_AXIS {', '.join(injected[1:])}." if numbers[1:] else ""
+        paste = sweep | _LOGGING | mode
+        lines = lambda values: [f"{x},{value}" for x, value in values.items()]
+        return self.make_recipe(
+            axes, lines(paste), lines(back), load=(paste, back),
+            before="Save all parameters to a file. Load the lines as a file (.param), refresh the "
+            "parameters, of which some are hidden while SID_AXIS was 0, and load the file again. "
+            "SID_MAGNITUDE is a share of the "
+            "mixer's range: begin with a small one, and raise it from flight to flight until the "
+            f"vehicle is seen to shake. Position {position} of the mode switch has to be free, and "
+            "Stabilize on another one.",
+            flight=f"in Stabilize. With SID_AXIS {injected[0]} switch to SystemID (position "
+            f"{position}) for {_CHIRP['SID_T_REC'] + 1} s, and back to end. It starts from "
+            "Stabilize or Acro alone and holds no height: keep the throttle steady, and correct "
+            f"gently.{again}",
+            abort="Switch to Stabilize: the chirp ends at once. It also ends where the vehicle "
+            "leans beyond its limit.",
+            after="Land and download the log. It holds SIDD, whose F goes from 0.5 to 20 Hz, RATE "
+            "and PIDR, PIDP or PIDY at the rate of the loop, and GYR, which shows the noise.",
+            log="flight.bin",
+        )  # fmt: skip
 
     def unfiltered_gyro(
         self, names: frozenset[str], values: Mapping[str, str], median: Callable[[str], float]

@@ -22,6 +22,7 @@ from .._firmware import (
     number_text,
     OuterLoop,
     Parameter,
+    RecipeOption,
     rows_of_axes,
     Stage,
 )
@@ -312,6 +313,19 @@ _ROWS = [
     Parameter("adrc_hover_throttle", "%", 35, 5, 100, True),
     Parameter("adrc_sigma_decay", "0.1/s", 3, 0, 100, True),
 ]
+_RECORDED = ("pids", "rc", "setpoint", "gyro", "gyrounfilt", "debug", "motors")
+_CHIRP = {
+    "debug_mode": "CHIRP", "blackbox_sample_rate": "1/4",
+    **{f"blackbox_disable_{x}": "OFF" for x in _RECORDED},
+    "chirp_lag_freq_hz": 3, "chirp_lead_freq_hz": 30, "chirp_frequency_start_deci_hz": 5,
+    "chirp_frequency_end_deci_hz": 600, "chirp_time_seconds": 20,
+}  # fmt: skip
+_USUAL = {  # of the firmware, where that differs
+    "debug_mode": "NONE", "chirp_frequency_start_deci_hz": 2, "chirp_frequency_end_deci_hz": 6000,
+    "chirp_amplitude_roll": 230, "chirp_amplitude_pitch": 230, "chirp_amplitude_yaw": 180,
+}  # fmt: skip
+_AMPLITUDE = RecipeOption("amplitude", 150, 20, 300, "the amplitude of the chirp in deg/s")
+_AUX = RecipeOption("switch", 4, 1, 14, "the AUX channel of the switch")
 _SAME_LOOP = 0.05  # of the interval in the header
 
 
@@ -350,13 +364,30 @@ class Betaflight(Firmware):
             resolution=(float(np.radians(0.1 if finer else 1.0)), 1.0),
         )  # fmt: skip
 
-    def what_to_fly(self, axis: str) -> str:
-        return (
-            "Fly this: set debug_mode = CHIRP, blackbox at 1 kHz or more, and CHIRP on a switch "
-            f"(firmware 2025.12 or later; each use takes the next axis, so until {axis}); hover "
-            "high and clear, hold the switch for 20 s, release it to end. Without CHIRP: strong "
-            f"and quick {axis} stick in acro for 20 s"
-        )
+    def recipe(self, axes, *, amplitude=None, switch=None):
+        amplitude, aux = _AMPLITUDE.choose(amplitude), int(_AUX.choose(switch))
+        sizes = {f"chirp_amplitude_{x}": f"{amplitude * (x in axes):.0f}" for x in AXES}
+        uses = [x if x in axes else f"{x} (not excited: 1 s is enough)" for x in AXES]
+        last = max(map(AXES.index, axes))
+        lines = lambda values, mode: [
+            *(f"set {x} = {value}" for x, value in values.items()), f"aux 19 {mode} 0 0", "save",
+        ]  # fmt: skip
+        return self.make_recipe(
+            axes, lines(_CHIRP | sizes, f"55 {aux - 1} 1700 2100"), lines(_USUAL, "0 0 900 900"),
+            before="Betaflight 2025.12 or later, built with the option CHIRP. (With another one "
+            "give strong and quick sticks in acro, one axis at a time, 20 s each.) Save the output "
+            "of diff all. Select the PID profile to be tuned, then paste the lines into the CLI. "
+            f"AUX {aux} and mode slot 19 have to be free. The log needs 1 kHz: where the PID loop "
+            "runs below 4 kHz (see status), set blackbox_sample_rate to 1/2.",
+            flight=f"in acro (ANGLE off). Hold the switch (AUX {aux}, mode CHIRP) for "
+            f"{_CHIRP['chirp_time_seconds']} s, correct gently with the sticks, and release it to "
+            "end. Each use takes the next axis, counted from power-on: "
+            f"{', then '.join(uses[: last + 1])}.",
+            abort="Release the switch: the chirp ends at once. The sticks work all the time.",
+            after="Land, disarm and download the log. During a chirp debug[0], its phase, moves; "
+            "from 2026.6 on debug[1] is the axis, 0 to 2, and debug[2] rises from 5 to 600 dHz.",
+            log="flight.bbl",
+        )  # fmt: skip
 
     def with_hold(self, values: Mapping[str, str], hold: float | None) -> Mapping[str, str]:
         if hold is None or "looptime" not in values:
@@ -446,7 +477,7 @@ class Betaflight(Firmware):
                 older[name] = _OLDER[name]
         rows = [f"# {line}" for line in title.splitlines()]
         if profile is None:
-            rows.append("# select the PID profile that flew first: the log does not name it")
+            rows.append("# first select the PID profile that flew: the log does not name it")
         else:
             rows.append(f"profile {profile}")
         if version >= (4, 3) and len(adrc) < len(values):
@@ -455,12 +486,12 @@ class Betaflight(Firmware):
             for part in ("gyro", "dterm"):
                 if any(row.name.startswith(f"{part}_lpf") for row, *_ in values):
                     rows.append(f"set simplified_{part}_filter = OFF")
-        for row, value, other in values:
+        for row, value, flown in values:
             name = older.get(row.name, row.name)
-            rows += [f"# {name} was {number_text(other, row.integer)}"]
+            rows += [f"# the flight had {name} {number_text(flown, row.integer)}"]
             rows += [f"set {name} = {number_text(value, row.integer)}"]
-        for name, word, other in words:
-            rows += [f"# {name} was {other}", f"set {name} = {word}"]
+        for name, word, flown in words:
+            rows += [f"# the flight had {name} {flown}", f"set {name} = {word}"]
         return joined_lines([*rows, "save"])
 
 

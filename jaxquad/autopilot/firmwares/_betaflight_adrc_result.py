@@ -23,6 +23,7 @@ from .._page import (
     Chains,
     chains_of,
     change_rows,
+    limits_text,
     logged_terms,
     motor_rows,
     PilotPage,
@@ -37,12 +38,14 @@ from .._parameters import (
     propose_changes,
     stage_texts,
     store_parameters,
+    what_flew,
     WordChange,
 )
-from .._proposal import beyond_limits, write_result
+from .._proposal import write_result
 from .._rate_design import best_on_grid, stored_near
 from .._rate_loops import DesignSettings, Kind, Limits, with_more_plants, with_plants, worst_plants
 from .._replay import Reproduction
+from .._verdict import beyond_limits
 from ._betaflight_adrc import (
     adrc_loops,
     adrc_parameters,
@@ -330,7 +333,7 @@ class ADRCAutopilot:
             rows = [(find_parameter("betaflight", name), flown[name]) for name in names]
             text = parameter_file(
                 "betaflight", [ParameterChange(row, x, x) for row, x in rows], revert=True,
-                version=version, profile=None, title="what flew",
+                version=version, profile=None, title=what_flew(self.path.name),
                 raised=[axis for axis in AXES if f"d_max_{axis}" in flown],
             )  # fmt: skip
             return {f"{_STEM}_revert.txt": text}
@@ -340,7 +343,7 @@ class ADRCAutopilot:
         )  # fmt: skip
         shares = {33: 1 / 3, 100: 1.0} if self.flew_adrc else {100: 1.0}
         stages = {percent: self.changes(share) for percent, share in shares.items()}
-        return stage_texts(_STEM, "txt", stages, file, self.words)
+        return stage_texts(_STEM, "txt", stages, file, self.words, self.path.name)
 
     @property
     def shown_again(self) -> Mapping[float, Reproduction]:
@@ -368,6 +371,7 @@ class ADRCAutopilot:
             [] if self.plant is None else [str(self.plant)], again,
             [] if self.proposal is None else [self.proposal.table()],
             [change_table(self.changes(), self.words).rstrip()] if self.new else [],
+            [limits_text(self.settings)] if self.new else [],
             [f"! {x}" for x in self.remarks],
         )  # fmt: skip
         for part in parts:
@@ -408,7 +412,10 @@ def adrc_page(result: ADRCAutopilot, origin: Provenance) -> PilotPage:
     return PilotPage(
         title=f"betaflight {version}, ADRC for {result.axis}".replace(" ,", ","),
         headlines=headlines,
-        remarks=[*result.remarks, *(f"not modelled: {text}" for text in flown.unmodelled)],
+        remarks=[
+            *result.remarks, *(f"not modelled: {text}" for text in flown.unmodelled),
+            *([limits_text(result.settings)] if result.new else []),
+        ],
         filters=filters, steps=steps, b0=b0, terms_are="as logged", unit="pidsum",
         terms={} if flight is None or not flight.terms else logged_terms(flight),
         motors=[] if flight is None else motor_rows(flight),

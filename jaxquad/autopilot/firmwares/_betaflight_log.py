@@ -257,6 +257,10 @@ BETAFLIGHT = FirmwareLog(
     name="betaflight", title="Betaflight", setup=betaflight_setup,
     rates=[f"gyroADC[{i}]" for i in range(3)], setpoints=[f"setpoint[{i}]" for i in range(3)],
     throttle=(("collective", 1.0), ("setpoint[3]", 1e-3)), hold=command_hold,
+    # A chirp is logged without its amplitude: 1000, or 1, is all of it.
+    limits={
+        "rcCommand": 500.0, "axisMixed": 500.0, "axisSum": 500.0, "debug[3]": 1e3, "chirp": 1.0,
+    },
     release="Firmware revision", gyro_cutoffs=("gyro_lpf1_static_hz", "gyro_lowpass_hz"),
     flights=flights_of, remarks_on=saturation,
 )  # fmt: skip
@@ -324,16 +328,20 @@ _SETTINGS = {
 _UNSIGNED = {"loopIteration", "time", "rcCommand[3]", *(f"motor[{i}]" for i in range(4))}
 
 
-def write_chirp_log(path: str | Path, seed: int = 0) -> Path:
+def write_chirp_log(
+    path: str | Path, seed: int = 0, *, roll: tuple[int, int, int] = _AXES[0].pid
+) -> Path:
     """Write a chirp on roll as Betaflight 2026.6 logs it; the same for the same seed.
 
-    A 5-inch quadrotor with default gains and filters rests on the ground, takes off, and is
-    excited from 0.5 to 40 Hz in 15 s, in gusts and gyro noise. Gyro at 8 kHz, PID at 4 kHz, log at
-    1 kHz, in whole numbers. `CHIRP_TRUTH` has the plant of roll, gain e^(-delay s) / (s (lag s +
-    1)): gain in deg/s^2 per unit of pidsum, lag and delay in s. Order of events, scales and filters
-    are those of docs/autopilots.md, "When each message is written".
+    A 5-inch quadrotor with default gains and filters, or with other P, I and D of `roll`, rests on
+    the ground, takes off, and is excited from 0.5 to 40 Hz in 15 s, in gusts and gyro noise. Gyro
+    at 8 kHz, PID at 4 kHz, log at 1 kHz, in whole numbers. `CHIRP_TRUTH` has the plant of roll,
+    gain e^(-delay s) / (s (lag s + 1)): gain in deg/s^2 per unit of pidsum, lag and delay in s.
+    Order of events, scales and filters are those of docs/autopilots.md, "When each message is
+    written".
     """
-    columns, chirping = _fly(np.random.default_rng(seed))
+    axes = (_AXES[0]._replace(pid=roll), *_AXES[1:])
+    columns, chirping = _fly(np.random.default_rng(seed), axes)
     rows = np.column_stack([np.full(chirping.size, ord("I")), *columns.values()])
     first, last = np.flatnonzero(chirping)[[0, -1]]
     slow = [_coded(np.array([[ord("S"), mode, 0, 0, 1, 1]])) for mode in (_ARMED, _CHIRPING)]
@@ -350,13 +358,15 @@ def write_chirp_log(path: str | Path, seed: int = 0) -> Path:
         "Field S name": "flightModeFlags,stateFlags,failsafePhase,rxSignalReceived,"
         "rxFlightChannelsValid",
         "Field S signed": "0,0,0,0,0", "Field S predictor": "0,0,0,0,0",
-        "Field S encoding": "1,1,1,1,1", **_SETTINGS,
+        "Field S encoding": "1,1,1,1,1", **_SETTINGS, "rollPID": joined(roll),
     }  # fmt: skip
     header = "".join(f"H {name}:{value}\n" for name, value in lines.items())
     return write_file(Path(path), header.encode() + frames)
 
 
-def _fly(random: np.random.Generator) -> tuple[dict[str, np.ndarray], np.ndarray]:
+def _fly(
+    random: np.random.Generator, axes: Sequence[_Axis]
+) -> tuple[dict[str, np.ndarray], np.ndarray]:
     """The log's columns as coded integers, and where the chirp is on."""
     time = np.arange(round(_END * _LOOP_HZ)) * _DT
     throttle = _HOVER * np.clip((time - _LIFT_OFF) / _RISE, 0, 1)
@@ -373,7 +383,7 @@ def _fly(random: np.random.Generator) -> tuple[dict[str, np.ndarray], np.ndarray
     setpoint = np.zeros((3, time.size))
     setpoint[0] = amplitude * _filtered(ahead, behind, excitation)
     now = slice(None, None, _LOGGED)
-    flown = [_fly_axis(x, r, throttle, random) for x, r in zip(_AXES, setpoint, strict=True)]
+    flown = [_fly_axis(x, r, throttle, random) for x, r in zip(axes, setpoint, strict=True)]
     p, i, d, gyro, raw = np.stack(flown, axis=1)[:, :, now]
     roll, pitch, yaw = (p + i + d) / 1000
     # Of the mixer: throttle_boost 5, throttle_boost_cutoff 15.

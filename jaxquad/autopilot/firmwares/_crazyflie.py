@@ -174,9 +174,6 @@ class Crazyflie(Firmware):
     def channels(self, prefix: str, axis: int, values: Mapping[str, str]) -> Channels:
         return Channels()
 
-    def what_to_fly(self, axis: str) -> str:
-        return f"Fly this: strong and quick {axis} stick for 20 s"
-
     def si_scales(self, axis: str) -> tuple[float, float, float]:
         return 65535 / DEGREES, 65535 / DEGREES, 65535 / DEGREES
 

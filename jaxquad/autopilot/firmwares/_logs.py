@@ -82,7 +82,7 @@ def px4_setup(log: Log, wanted: Selection) -> Setup:
     remarks = [
         f"{setpoint} is computed by the attitude loop: it contains feedback and cannot be the "
         f"external reference",
-        "for an external reference, run autotune, or inject a sweep and log it",
+        "for an external reference, fly Acro throughout the log, or inject a sweep and log it",
     ]
     stick = first_logged(signals, _STICKS[axis])
     if stick and moves(signals, stick):
@@ -97,6 +97,7 @@ PX4 = FirmwareLog(
     name="px4", title="PX4", setup=px4_setup,
     rates=[f"vehicle_angular_velocity.xyz[{i}]" for i in range(3)],
     setpoints=[f"{_RATE_SETPOINT}.{x}" for x in AXES],
+    limits={"manual_control_setpoint": 1.0, "vehicle_torque_setpoint": 1.0},
     throttle=(("vehicle_thrust_setpoint.xyz[2]", -1.0), ("actuator_controls_0.control[3]", 1.0)),
     hold=lambda log: hold_by_rate(log, "IMU_GYRO_RATEMAX"),
     of_loop=("MC_", "IMU_GYRO_", "IMU_DGYRO_", "THR_MDL_FAC", "CA_", "PWM_", "DSHOT_"),
@@ -258,6 +259,7 @@ def _chirped(log: Log, chirps: list[NumberedChirp]) -> Setup:
 ARDUPILOT = FirmwareLog(
     name="ardupilot", title="ArduPilot", setup=ardupilot_setup,
     rates=[f"RATE.{x}" for x in "RPY"], setpoints=[f"RATE.{x}Des" for x in "RPY"],
+    limits={f"RATE.{x}Out": 1.0 for x in "RPY"},
     throttle=(("RATE.AOut", 1.0), ("CTUN.ThO", 1.0)),
     hold=lambda log: hold_by_rate(log, "SCHED_LOOP_RATE"),
     of_loop=(

@@ -17,12 +17,11 @@ from .._filters import BandwidthNotch, Butterworth, Filter, FilterChain, PT1, Se
 from .._firmware import (
     Channels,
     Firmware,
-    joined_lines,
-    number_text,
     Numbers,
     OuterLoop,
     Parameter,
     Range,
+    RecipeOption,
     rows_of_axes,
 )
 from .._law import (
@@ -224,6 +223,12 @@ _ROWS = [
 ]  # fmt: skip
 
 
+# Default and high-rate topics; a log that a switch starts. Then what the firmware has.
+_LOGGING = {"SDLOG_PROFILE": 1 + 16, "SDLOG_MODE": 3}
+_USUAL_LOGGING = {"SDLOG_PROFILE": 1, "SDLOG_MODE": 0, "RC_MAP_AUX1": 0}
+_LOG_SWITCH = RecipeOption("switch", 8, 5, 18, "the RC channel of the switch that starts the log")
+
+
 class PX4(Firmware):
     """PX4, multicopters."""
 
@@ -231,6 +236,7 @@ class PX4(Firmware):
     parameters = {row.name: row for row in _ROWS}
     unit = "torque set-point"
     suffix = "params"
+    file_head = ("#", "# Vehicle-Id Component-Id Name Value Type")
     motor_shares = (np.sqrt(0.5), np.sqrt(0.5), 1.0)
     averages_gyro = True
     thrust_curve = "THR_MDL_FAC"
@@ -247,12 +253,32 @@ class PX4(Firmware):
             output={f"vehicle_torque_setpoint.xyz[{axis}]": 1.0},
         )
 
-    def what_to_fly(self, axis: str) -> str:
-        return (
-            "Fly this: SDLOG_PROFILE with high rate, hover high and clear in Position mode, and "
-            f"strong and quick {axis} stick in Acro for 20 s, or the autotune (MC_AT_EN) on this "
-            "axis"
-        )
+    def recipe(self, axes, *, amplitude=None, switch=None):
+        if amplitude is not None:
+            text = f"`amplitude` is {amplitude:g}, but PX4 is excited by the sticks: leave it out."
+            raise ValueError(text)
+        channel = int(_LOG_SWITCH.choose(switch))
+        lines = lambda values: [f"param set {x} {value}" for x, value in values.items()]
+        sticks, length = " stick, then ".join(axes), "20 s each" if len(axes) > 1 else "20 s"
+        paste = _LOGGING | {"RC_MAP_AUX1": channel}
+        return self.make_recipe(
+            axes, lines(paste), lines(_USUAL_LOGGING), load=(paste, _USUAL_LOGGING),
+            before="Save all parameters to a file. Type the lines into the MAVLink console, or "
+            "load them as a file (.params) in QGroundControl, then restart. RC channel "
+            f"{channel} has to be a free switch: it starts the log, which has to be flown in Acro "
+            "from beginning to end. Put Acro on the mode switch (6 in one of COM_FLTMODE1 to "
+            "COM_FLTMODE6). Full stick (MC_ACRO_R_MAX, MC_ACRO_P_MAX, MC_ACRO_Y_MAX) is 100 deg/s "
+            "by default.",
+            flight=f"in Position mode. Change to Acro, turn the log's switch (channel {channel}) "
+            f"on, and give strong and quick {sticks} stick for {length}: to both sides in turn, "
+            "0.2 to 0.5 s long, at 50 to 100 deg/s. Turn the log's switch off before you leave "
+            "Acro.",
+            abort="Change to Position mode: it levels the vehicle and holds it.",
+            after="Land and download the log. It holds vehicle_angular_velocity and "
+            "vehicle_torque_setpoint at 100 Hz or more, vehicle_rates_setpoint, which follows the "
+            "sticks, and vehicle_status.nav_state 10 (Acro) throughout.",
+            log="flight.ulg",
+        )  # fmt: skip
 
     def angle_loop(self, values, axis, dt, *, levelled):
         name = f"MC_{AXES[axis].upper()}_P"
@@ -262,14 +288,8 @@ class PX4(Firmware):
         width = float(np.rint(2 * half_width * centre_hz))
         return width, BandwidthNotch(centre_hz, width)
 
-    def parameter_file(self, values, title, *, version, profile, raised, words):
-        rows = [f"# {title}"] if title else []
-        rows += ["#", "# Vehicle-Id Component-Id Name Value Type"]
-        for row, value, other in values:
-            rows.append(f"# {row.name} was {number_text(other, row.integer)}")
-            kind = 6 if row.integer else 9  # int32, float
-            rows.append(f"1\t1\t{row.name}\t{number_text(value, row.integer)}\t{kind}")
-        return joined_lines(rows)
+    def file_line(self, name: str, text: str, is_whole: bool) -> str:
+        return f"1\t1\t{name}\t{text}\t{6 if is_whole else 9}"  # int32, float
 
 
 FIRMWARE = PX4()
