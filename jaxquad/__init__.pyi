@@ -18,7 +18,7 @@ from . import (
     workflows as workflows,
 )
 from ._compile import enable_compile_cache as enable_compile_cache, engine as engine
-from ._core import enable_x64 as enable_x64
+from ._core import __version__ as __version__, enable_x64 as enable_x64
 from .control import (
     AdaptiveLADRC as AdaptiveLADRC,
     LADRC as LADRC,
@@ -30,7 +30,9 @@ from .export import c_header as c_header
 from .identify import (
     compare as compare,
     fit as fit,
+    fit_state_space as fit_state_space,
     fit_transfer_function as fit_transfer_function,
+    predict as predict,
     refine as refine,
     verify as verify,
 )
@@ -55,7 +57,10 @@ from .simulation import (
     simulate as simulate,
     Step as Step,
 )
-from .spectra import frequency_response as frequency_response
+from .spectra import (
+    frequency_response as frequency_response,
+    FrequencyResponse as FrequencyResponse,
+)
 from .tuning import (
     certify as certify,
     Limit as Limit,

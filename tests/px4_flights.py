@@ -62,11 +62,19 @@ class Vehicle(NamedTuple):
         return self._replace(gain=self.gain * (1 - self.curve + 2 * self.curve * throttle), curve=0)
 
     def fly(
-        self, seconds=30.0, amplitude=1.5, noise=0.05, gust=0.02, seed=3, throttles=(0.5,)
+        self,
+        seconds=30.0,
+        amplitude=1.5,
+        noise=0.05,
+        gust=0.02,
+        seed=3,
+        throttles=(0.5,),
+        setpoint=None,
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Set-point, torque and filtered rate at 400 Hz.
 
-        A chirp from 0.5 to 30 Hz at each throttle, which take equal shares of the seconds.
+        A chirp from 0.5 to 30 Hz at each throttle, which take equal shares of the seconds, or
+        another set-point at 400 Hz.
         """
         p, i, d = self.gains
         rng = np.random.default_rng(seed)
@@ -76,7 +84,7 @@ class Vehicle(NamedTuple):
         time = np.arange(steps) % each / GYRO_HZ
         rise = np.log(60.0) / (each / GYRO_HZ)
         sweep = np.sin(2 * np.pi * 0.5 * (np.exp(rise * time) - 1) / rise)
-        r = (amplitude * sweep[::EACH]).tolist()
+        r = (amplitude * sweep[::EACH] if setpoint is None else setpoint).tolist()
         jitter = (noise * rng.standard_normal(steps)).tolist()
         gusts = np.repeat(gust * rng.standard_normal(steps // 160 + 1), 160).tolist()
         decay, share = float(np.exp(-1 / (GYRO_HZ * self.lag))), self.share

@@ -14,7 +14,7 @@ from jaxquad.records.firmware import firmware_log
 ORDER = (
     "_core", "_xla", "_compile", "records", "datasets", "excitation", "models", "spectra",
     "identify", "design", "control", "loops", "simulation", "ensembles", "tuning",
-    "export", "plot", "report", "autopilot", "workflows", "cli",
+    "export", "plot", "report", "autopilot", "workflows", "app", "cli",
 )  # fmt: skip
 FILES = sorted(path for path in PACKAGE.rglob("*.py") if path.parent != PACKAGE)
 FIRMWARES = {

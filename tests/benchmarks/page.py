@@ -49,6 +49,13 @@ PAIRS = (
         "scipy's solves",
     ),
     Pair(
+        "the same, with intervals and verdicts of all",
+        "test_batch_speed.py",
+        "test_ours_with_all_their_doubts",
+        "test_scipy",
+        "scipy's solves",
+    ),
+    Pair(
         "state-space fit, 20 parameters, with covariance and verdict",
         "test_state_space_speed.py",
         "test_fit_with_all_its_doubts",

@@ -75,6 +75,17 @@ def test_ours(benchmark, case):
 
 
 @pytest.mark.benchmark(group="1000 fits")
+def test_ours_with_all_their_doubts(benchmark, case):
+    truth, measured, error = case
+    model = Airframe(*(jnp.asarray(value) for value in START))
+    frfs = [frf_of(*each) for each in zip(measured, error, strict=True)]
+    intervals = benchmark(lambda: jq.identify.fit_batch(model, frfs).intervals)
+    one = jq.fit(model, frfs[3])
+    np.testing.assert_allclose(intervals[3], [one.interval(name) for name in one.names], rtol=1e-6)
+    assert np.all(np.mean((intervals[..., 0] <= truth) & (truth <= intervals[..., 1])) > 0.9)
+
+
+@pytest.mark.benchmark(group="1000 fits")
 def test_scipy(benchmark, case):
     truth, measured, error = case
 

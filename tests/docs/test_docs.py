@@ -22,6 +22,7 @@ RUN = (
     "limits.md",
     "measured.md",
     "own_log.md",
+    "own_parts.md",
     "ten_tasks.md",
 )
 LINK = re.compile(r"\]\(([^)#\s]+)(?:#[^)\s]*)?\)")

@@ -29,18 +29,32 @@ def run(*command, folder):
 
 
 @pytest.mark.slow
-def test_the_demo_prints_what_the_readme_shows_and_its_log_serves_the_eight_lines(tmp_path):
+def test_the_demo_prints_what_the_readme_shows(tmp_path):
     command = str(Path(sys.executable).with_name("jaxquad"))
     printed = " ".join(words(run(command, "demo", folder=tmp_path)))
     shown = blocks(README.partition("<!-- demo -->")[2])[1]
     assert len(shown.splitlines()) == 8
     for line in shown.splitlines():
         assert " ".join(words(line)) in printed, line
-    (example,) = blocks(README, "python")
-    assert len(example.splitlines()) == 8
+
+
+DIFFERENCES = """
+k, h = jnp.array([0.2, 0.03]), 1e-6  # |error| bends where it is 0
+slopes = [(error(k + h * unit) - error(k - h * unit)) / (2 * h) for unit in jnp.eye(2)]
+assert jnp.allclose(jax.grad(error)(k), jnp.array(slopes), rtol=1e-4), slopes
+assert not jq.evaluate(loop(k), flight).diverged.any()
+"""
+
+
+@pytest.mark.slow
+def test_the_python_of_the_readme_runs_by_itself(tmp_path):
+    first, second = blocks(README, "python")
+    assert len(first.splitlines()) == 9
     # jnp's strict promotion, which the tests switch on, is not what a user has.
-    printed = run(sys.executable, "-c", example, folder=tmp_path)
+    code = "\n".join([first, second, DIFFERENCES])
+    printed = run(sys.executable, "-c", code, folder=tmp_path)
     assert all(word in printed for word in ("gain", "lag + delay = 0.02", "verification"))
+    assert "8 fits; 0 of them reached no minimum" in printed
 
 
 @pytest.mark.slow

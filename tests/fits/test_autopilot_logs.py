@@ -30,7 +30,9 @@ def test_betaflights_loop_is_reproduced_and_its_plant_is_not_told(data, tmp_path
     assert text.count("=> this log cannot tell") == 2
     told = [line for line in text.splitlines() if line.startswith("=> this log cannot tell")]
     assert "law and plant, flown on the logged set-point, miss the rate by" in told[0]
-    assert "debug_mode = CHIRP" in told[1]
+    assert "mode CHIRP" in told[1] and told[1].endswith(
+        "says jaxquad recipe betaflight --axis pitch"
+    )
     assert text.count("which shows no curve: fly 0.24 and 0.44") == 2
     off = [float(x) for line in text.splitlines() if line[:4] in ("  P:", "  I:", "  D:")
            for x in line.replace(",", "").split() if x[0].isdigit()]  # fmt: skip

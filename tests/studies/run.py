@@ -21,6 +21,7 @@ STEPS = (
     ["hold.py", "--draws", "200"],
     ["feedthrough.py", "--draws", "60"],
     ["model_error.py", "--draws", "40"],
+    ["posterior.py", "--draws", "10"],
     ["refine.py", "--draws", "200"],
     ["tuned.py"],
     ["adrc.py", "--flights", "200"],
