@@ -220,3 +220,18 @@ def test_the_simplest_of_terms_that_explain_a_misfit_alike_is_named():
     alike = refitted(fit, of_1=1.0, of_2=0.9, of_3=0.1).explain()
     assert len(alike.best.model.term.names) == 1, str(alike)
     assert "to 1.0 random errors" in alike.summary
+
+
+@pytest.mark.slow
+def test_a_notch_in_the_plant_is_named_with_its_frequency():
+    s, rng = 1j * OMEGA, np.random.default_rng(5)
+    notch = (s**2 + 3.0 * s + 225.0) / (s**2 + 15.0 * s + 225.0)
+    noise = rng.standard_normal((2, OMEGA.size)) / np.sqrt(2)
+    true = np.asarray(TRUTH.frequency_response(OMEGA))[:, 0, 0] * notch
+    measured = true * (1 + 0.01 * (noise[0] + 1j * noise[1]))
+    frf = jq.FrequencyResponse.from_table(OMEGA, measured, random_error=np.full(OMEGA.size, 0.01))
+    found = jq.fit(START, frf).explain()
+    assert found.candidates[0].title == "a notch"
+    off = (found.best.values[3:] - [15.0, 0.1, 0.5]) / found.best.standard_errors[3:]
+    assert np.all(np.abs(off) < 4)
+    assert found.best.chi_squared < 1.5

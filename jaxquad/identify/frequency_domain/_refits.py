@@ -258,6 +258,13 @@ _TERMS = (
         lambda low, mid, high: [[np.sqrt(low * mid), 0.1, 1.1], [mid, 0.1, 0.9],
                                 [mid, 0.1, 1.1], [np.sqrt(mid * high), 0.1, 1.1]],
     ),
+    _Term(
+        "a notch", "(s^2 + 2 n w s + w^2) / (s^2 + 2 z w s + w^2)",
+        lambda s, x: _pair(s, x[0], x[1]) / _pair(s, x[0], x[2]), ("w", "n", "z"),
+        lambda low, mid, high: [
+            [place, 0.1, 0.4] for place in (np.sqrt(low * mid), mid, np.sqrt(mid * high), 0.7 * high)
+        ],
+    ),
 )  # fmt: skip
 _DRIFT = _Term(
     "a gain that drifts", "1 + change t / T (t from mid-record, T the length of the sweep)",
