@@ -29,6 +29,7 @@ from ..uncertainty._derived import (
 )
 from ..uncertainty._discrepancy import Discrepancy
 from ..uncertainty._log_density import Evidence, LogDensity, PriorDensity
+from ..uncertainty._profiles import Profile
 from ..uncertainty._verdict import (
     Combination,
     pooled_freedom,
@@ -37,7 +38,6 @@ from ..uncertainty._verdict import (
     USUAL,
     Verdict,
 )
-from ..uncertainty._zero_bounds import Profile
 from ._fit_table import parameter_lines, quality_lines
 from ._parameters import Parameters
 from ._refits import Bands, explain_misfit, Explanation, fit_bands, Origin
@@ -223,7 +223,8 @@ class Fit:
     ) -> tuple[float, float]:
         """The 95 % interval of one parameter; of one that keeps its sign, what has that sign.
 
-        Within six standard errors of zero its sides are those of the profile likelihood.
+        Within six standard errors of zero its sides are those of the profile likelihood, made so
+        that twice as long ones hold what they promise, too.
 
         **Arguments:**
 

@@ -31,6 +31,7 @@ from ._discrepancy import Discrepancy
 from ._error_budget import error_budget, ErrorBudget, Matrix, scaled_inverse, Weighting
 from ._log_density import Evidence, evidence_of
 from ._misfit import DOUBT, find_drift, local_misfits, MISFIT, with_resonance
+from ._profiles import Profile, profiles
 from ._response_term import Units, units_of
 from ._verdict import (
     identifiability_of,
@@ -41,7 +42,7 @@ from ._verdict import (
     Verdict,
     without_numbers,
 )
-from ._zero_bounds import bounds_among, near_zeros, one_sided, Profile, profiles, without_bounds
+from ._zero_bounds import bounds_among, near_zeros, one_sided, without_bounds
 
 
 UNFINISHED = 1e-2  # Newton decrement over cost, above which no number counts as determined
@@ -49,6 +50,7 @@ NO_MODEL = 0.5  # discrepancy in rad, above which nothing counts as determined
 _STILL = 0.25  # standard errors: a bias of that size leaves a 95 % interval at 94.3 %
 _ROUNDING = 1e-4  # relative change that nobody looks for, where there is no noise
 _LARGE = 0.3  # discrepancy in neper, above which intervals by small changes are rough
+_MANY = 0.8  # share of the parameters, undetermined: the model is too large
 _POOR = 10.0  # ratio above which a local minimum is likely
 _EXACT = 1e-9  # cost of a response without noise: no step lowers what rounding has left
 _FAR = 7.0  # in ln: a parameter that moved by a factor of 1000 ran for zero or infinity
@@ -96,7 +98,8 @@ def assess(
     budget = with_resonance(budget, beyond)
     if near:
         budget = up_to_limits(units)
-        bounds, mixed = bounds_among(near, budget, solution, units)
+        reached = np.max([np.zeros(count), *(one.reached() for one in followed)], axis=0)
+        bounds, mixed = bounds_among(near, budget, solution, units, reached)
         if not np.array_equal(mixed, units):
             units, budget = mixed, up_to_limits(mixed)
     step = step * (start / units)[:count]
@@ -207,6 +210,12 @@ def assess(
                 f"beyond by {max(far.values()):.0f} random errors«other sign|: start with the "
                 f"other sign, or let the sign change with {real}; where that cannot be, the model» "
                 "lacks something, or the time stamps of input and output are shifted",
+            )
+        if len(lost) >= max(_MANY * len(names), 4):
+            remark(
+                "too many parameters",
+                f"{len(lost)} of {len(names)} parameters are not determined, and any number rests "
+                "on them: fit a model with fewer poles and zeros",
             )
         remarks += _remarks_on_model(solution.model, frfs, used)
         if solution.converged and is_saddle(problem, solution, float(budget.cost), bread):

@@ -13,9 +13,9 @@ from ._assess import NO_MODEL, UNFINISHED
 from ._discrepancy import find_discrepancy
 from ._error_budget import ErrorBudget, scaled_inverse
 from ._misfit import may_have_local_misfits
+from ._profiles import WEAK
 from ._response_term import diagonal, PriorRows, Responses, ResponseTerm
 from ._verdict import LIMIT, REACH, USUAL
-from ._zero_bounds import WEAK
 
 
 _CLEAR = 1e-10  # of the largest eigenvalue: no null direction of a plain fit is near

@@ -17,7 +17,7 @@ from ._response_term import PriorRows
 
 
 if TYPE_CHECKING:
-    from ._zero_bounds import Profile
+    from ._profiles import Profile
 
 
 Kind = Literal["identifiable", "not identifiable", "no minimum", "no model", "too few points"]

@@ -7,20 +7,19 @@ Source: Self and Liang (1987), Asymptotic properties of maximum likelihood estim
 ratio tests under nonstandard conditions.
 """
 
-import functools as ft
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from ..frequency_domain._cost import mix
 from ..frequency_domain._problem import Problem
 from ..frequency_domain._solve import Solution, solution_at, solve
 from ._error_budget import ErrorBudget, Matrix, scaled_inverse
-from ._response_term import Units, units_of
-from ._verdict import Bound, LIMIT, REACH
+from ._response_term import Units
+from ._verdict import Bound, LIMIT
 
 
 _NEAR = 1e-2  # of the change that shows: a parameter below it is at zero
@@ -28,6 +27,7 @@ _AT_ZERO = 1e-6  # likewise, where its slopes are evaluated
 _ROUNDS = 4  # of releasing parameters that do not belong at zero
 _LONGEST = 1.0  # step of a logarithm, to where others go on from
 _POLISHES = 10  # steps
+_BEYOND = 2.0  # limits, where others take a parameter at the ends of their intervals
 _SHORTER = 4  # tries, each of a quarter of the step before it
 _LITTLE = 1e-3  # fall of the cost, of that per residual, that no limit shows
 _SMALLEST = 60.0  # in ln, below the start: 1e-26 of it
@@ -40,11 +40,6 @@ _FAR = 50.0  # standard deviations, beyond which the hazard's digits cancel
 _SLIGHT = 0.1
 _FEW = 0.1  # of the limit: below it the slopes at a value say little about the way to the limit
 _ONE_SIDED = 1.645  # standard errors that reach from the middle of a one-sided 95 % interval
-WEAK = 6.0  # standard errors to zero, within which the cost is followed there
-_FINE = 10  # places between two points of a profile
-_FAR_OUT = 2.5  # standard errors, where a profile ends
-_MOST = 12  # places to either side of it
-_NULL = 1e-12  # of the largest eigenvalue of the scaled bread: of a null direction
 
 Vector = Float[np.ndarray, " parameters"]
 
@@ -249,10 +244,12 @@ def one_sided_limits(
 
 
 def bounds_among(
-    near: Sequence[NearZero], budget: ErrorBudget, solution: Solution, units: Units
-) -> tuple[tuple[Bound, ...], Units]:
+    near: Sequence[NearZero], budget: ErrorBudget, solution: Solution, units: Units,
+    reached: Vector,
+) -> tuple[tuple[Bound, ...], Units]:  # fmt: skip
     """Those that a limit determines; and units in which those count that are mixed up with others:
-    another one would change by too much on the way to the limit."""
+    another one would change by too much on the way to the limit, or takes them far beyond it, to
+    what the profiles have `reached`."""
     bounds, mixed, covariance = [], {}, budget.covariance
     slight = [one.k for one in near if one.slight]
     for one in near:
@@ -260,7 +257,7 @@ def bounds_among(
         moved = along * abs(one.bound.limit / units[one.k])
         moved[[one.k, *(solution.at_zero if one.k in solution.at_zero else ())]] = 0.0
         moved[slight if one.slight else []] = 0.0
-        if np.all(moved <= LIMIT):
+        if np.all(moved <= LIMIT) and reached[one.k] <= _BEYOND * abs(one.bound.limit):
             bounds.append(one.bound)
         elif one.k in solution.at_zero or one.changes is not None:
             mixed[one.k] = moved
@@ -319,166 +316,3 @@ def one_sided(covariance: Matrix, k: int, optimum: float) -> Matrix:
         remaining = max(1 - below * (hazard - below), 0.0)
     along = covariance[:, k] / variance
     return covariance + np.outer(along, along) * (variance * remaining - variance)
-
-
-class Profile(NamedTuple):
-    """The cost along one weak parameter `k`, the others being where it is lowest.
-
-    What a small lag does beside a delay goes by its square: towards zero the cost rises by less
-    than its curvature says. Source: Venzon and Moolgavkar (1988), A method for computing
-    profile-likelihood-based confidence intervals.
-    """
-
-    k: int
-    values: Float[np.ndarray, "points parameters"]  # the estimate is one of the points
-    distances: Float[np.ndarray, " points"]  # from it, in standard errors by the curvature
-    inflations: Float[np.ndarray, " 2"]  # of these standard errors; by the noise alone
-    along: Float[np.ndarray, "2 parameters"]  # changes with one standard error of `k`; likewise
-    ends: bool  # whether the cost rises enough away from zero, too
-
-    def interval(
-        self, j: int, error: float, reach: float = REACH, *, model_error: bool = True
-    ) -> tuple[float, float]:
-        """Of parameter `j` with this standard error, within `reach` of them."""
-        part = 0 if model_error else 1
-        quantity, along = self.values[:, j], float(self.along[part, j])
-        low, high = self._sides(quantity, error, along, reach, part)
-        if j == self.k and self.distances[0] > -reach * self.inflations[part]:
-            low, high = min(low, 0.0), max(high, 0.0)  # the last point towards zero is as good
-        if j == self.k and not self.ends:
-            return (low, np.inf) if self.values[-1, j] > 0 else (-np.inf, high)
-        return low, high
-
-    def sides_of(
-        self, quantity: Float[np.ndarray, " points"], value: float, error: float, slope: Vector,
-        *, model_error: bool = True,
-    ) -> tuple[float, float]:  # fmt: skip
-        """The sides of a quantity's interval, over those by its `slope` where they are longer."""
-        part = 0 if model_error else 1
-        low, high = self._sides(quantity, error, float(slope @ self.along[part]), REACH, part)
-        usual = max(REACH * error, 1e-300)
-        return max((value - low) / usual, 1.0), max((high - value) / usual, 1.0)
-
-    def _sides(
-        self, quantity: Float[np.ndarray, " points"], error: float, along: float, reach: float,
-        part: int,
-    ) -> tuple[float, float]:  # fmt: skip
-        """Of an interval; `along` is the share of the error that goes with `k`."""
-        places = np.arange(self.distances.size)
-        fine = np.linspace(0, places[-1], _FINE * places[-1] + 1)
-        columns = self.distances / self.inflations[part], quantity
-        distance, value = (np.interp(fine, places, column) for column in columns)
-        inside = np.abs(distance) <= reach
-        aside = np.sqrt((reach**2 - distance[inside] ** 2) * max(error**2 - along**2, 0.0))
-        return float(np.min(value[inside] - aside)), float(np.max(value[inside] + aside))
-
-    def undetermined(
-        self, values: Vector, errors: Vector, imprecise: Bool[np.ndarray, " parameters"]
-    ) -> Bool[np.ndarray, " parameters"]:
-        """The imprecise parameters, those that may be three times as large, and what changes by
-        more than the limit along with one of them."""
-        sizes = np.abs(values)
-        ends = np.array([self.interval(j, float(error)) for j, error in enumerate(errors)])
-        longest = sizes + REACH * np.maximum(2 * LIMIT * sizes, errors)
-        imprecise = imprecise | (np.max(np.abs(ends), axis=1) > longest)
-        if self.k < 0 or not imprecise[self.k]:
-            return imprecise
-        ends = np.array([self.interval(j, 0.0) for j in range(values.size)])
-        return imprecise | (np.max(np.abs(ends - values[:, None]), axis=1) > LIMIT * sizes)
-
-    def among(self, kept: np.ndarray) -> "Profile":
-        """With some of the parameters alone."""
-        place = int(np.argmax(kept == self.k)) if self.k in kept else -1
-        return self._replace(k=place, values=self.values[:, kept], along=self.along[:, kept])
-
-
-def profiles(
-    problem: Problem, solution: Solution, budget: ErrorBudget, near: Sequence[NearZero]
-) -> tuple[Profile, ...]:
-    """Of the parameters that keep their sign and lie within a few standard errors of zero, and of
-    one in each direction in which all run to infinity."""
-    variances, by_noise = np.diagonal(budget.covariance), np.diagonal(budget.by_noise)
-    weak = variances > 1 / WEAK**2
-    weak[[one.k for one in near]] = True
-    weak[_of_null_directions(budget.bread)] = True
-    weak &= np.array(problem.parameters.logarithmic[: budget.count])
-    weak &= (by_noise > 0) & (np.diagonal(scaled_inverse(budget.bread)) > 0)
-    relative = np.sqrt(np.where(variances > 0, variances, 1.0))
-    errors = units_of(solution)[: budget.count] * relative
-    for one in near:
-        if np.isfinite(one.bound.limit):
-            errors[one.k] = one.bound.limit / 2
-    some = np.flatnonzero(weak).tolist()
-    return tuple(_profile(problem, solution, budget, k, float(errors[k])) for k in some)
-
-
-def _profile(
-    problem: Problem, solution: Solution, budget: ErrorBudget, k: int, error: float
-) -> Profile:
-    """Of parameter `k`, whose standard error is about this."""
-    values, units = np.asarray(solution.values)[: budget.count], units_of(solution)[: budget.count]
-    parts = budget.covariance, budget.by_noise
-    inflations = np.sqrt([part[k, k] / scaled_inverse(budget.bread)[k, k] for part in parts])
-    far, value = _FAR_OUT * float(np.max(inflations)), values[k]
-    estimate = _Place(solution.z, values)
-    solutions = ft.partial(_places_along, problem, solution, k, estimate, far)
-    below = solutions(value / 2, value / 1000) if value else []
-    above = solutions(value + error, value + 2.5 * error)
-    places = [*below[::-1], estimate, *above]
-    points = np.stack([place.values for place in places])
-    distances = np.array([place.distance for place in places])
-    distances[: len(below)] *= -1
-    ends = bool(distances[-1] >= far)
-    if ends:  # on along a straight line
-        points = np.concatenate([points, [2 * points[-1] - points[-2]]])
-        distances = np.append(distances, 2 * distances[-1] - distances[-2])
-    along = np.stack([units * part[k] / np.sqrt(part[k, k]) for part in parts])
-    return Profile(k, points, distances, inflations, along, ends)
-
-
-def _of_null_directions(bread: Matrix) -> list[int]:
-    """The parameter of the largest share in each."""
-    scale = np.sqrt(np.maximum(np.diagonal(bread), 1e-300))
-    sizes, directions = np.linalg.eigh(bread / np.outer(scale, scale))
-    return np.argmax(np.abs(directions[:, sizes < _NULL * sizes[-1]]), axis=0).tolist()
-
-
-class _Place(NamedTuple):
-    """Of a profile."""
-
-    z: Vector
-    values: Vector
-    distance: float = 0.0
-
-
-def _places_along(
-    problem: Problem, solution: Solution, k: int, estimate: _Place, far: float, *aims: float
-) -> list[_Place]:
-    """Places of the profile of `k` on the way to the last of the `aims`, and beyond it up to the
-    distance `far`, so close to each other that straight lines connect them."""
-    best, scale = linearise(problem, solution).cost, float(np.asarray(problem.parameters.scale)[k])
-
-    def at(aim: float, nearest: _Place) -> _Place:
-        z = nearest.z.copy()
-        z[k] = np.log(abs(aim / scale))
-        there, local = polish(problem, z, [k], solution)
-        rise = max(local.cost - best, 0.0)
-        return _Place(there.z, np.asarray(there.values)[: z.size], float(np.sqrt(rise)))
-
-    places, start = [estimate], estimate.values[k]
-    for aim in aims:
-        places.append(at(aim, places[-1]))
-    while abs(aim) > abs(start) and places[-1].distance < far and len(places) < _MOST / 2:
-        aim = start + 2.5 * (aim - start)
-        places.append(at(aim, places[-1]))
-    while len(places) < _MOST:
-        distances = np.array([place.distance for place in places])
-        coarse = (np.diff(distances) > far / 3) & (distances[:-1] < far)
-        if not coarse.any():
-            break
-        n = int(np.argmax(coarse))
-        ends = places[n].values[k], places[n + 1].values[k]
-        alike = abs(ends[0]) < 4 * abs(ends[1])
-        middle = (ends[0] + ends[1]) / 2 if alike else np.sign(start) * np.sqrt(ends[0] * ends[1])
-        places.insert(n + 1, at(middle, places[n]))
-    return places[1:]
