@@ -262,7 +262,7 @@ _TERMS = (
         "a notch", "(s^2 + 2 n w s + w^2) / (s^2 + 2 z w s + w^2)",
         lambda s, x: _pair(s, x[0], x[1]) / _pair(s, x[0], x[2]), ("w", "n", "z"),
         lambda low, mid, high: [
-            [place, 0.1, 0.4] for place in (np.sqrt(low * mid), mid, np.sqrt(mid * high), 0.7 * high)
+            [w, 0.1, 0.4] for w in (np.sqrt(low * mid), mid, np.sqrt(mid * high), 0.7 * high)
         ],
     ),
 )  # fmt: skip

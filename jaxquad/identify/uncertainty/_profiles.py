@@ -198,9 +198,9 @@ def _places_along(
         places.append(at(aim, places[-1]))
     while len(places) < _MOST:
         distances = np.array([place.distance for place in places])
-        apart = np.array([np.abs(place.values[k] - start) for place in places])
+        changes = np.array([np.abs(place.values[k] - start) for place in places])
         coarse = (np.diff(distances) > far / 3) & (distances[:-1] < far)
-        coarse &= np.diff(apart) > _JUMP * apart[1:]
+        coarse &= np.diff(changes) > _JUMP * changes[1:]
         if not coarse.any():
             break
         n = int(np.argmax(coarse))
