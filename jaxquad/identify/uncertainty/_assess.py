@@ -211,12 +211,10 @@ def assess(
                 f"other sign, or let the sign change with {real}; where that cannot be, the model» "
                 "lacks something, or the time stamps of input and output are shifted",
             )
-        if len(lost) >= max(_MANY * len(names), 4):
-            remark(
-                "too many parameters",
-                f"{len(lost)} of {len(names)} parameters are not determined, and any number rests "
-                "on them: fit a model with fewer poles and zeros",
-            )
+        structural = len(verdict.exact) and verdict.combinations  # the model's, at any noise
+        if len(lost) >= max(_MANY * len(names), 4) and not structural:
+            text = f"{len(lost)} of {len(names)} parameters are not determined, others rest on them"
+            remark("too many parameters", f"{text}: fit a model with fewer poles and zeros")
         remarks += _remarks_on_model(solution.model, frfs, used)
         if solution.converged and is_saddle(problem, solution, float(budget.cost), bread):
             remark(
