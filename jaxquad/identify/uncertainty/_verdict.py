@@ -202,7 +202,8 @@ class Verdict:
                 rows = self.null_directions
                 every = all(name in self.undetermined for row in rows for name in row)
                 only = "only " if every else ""  # else one in it is determined, too
-                determined = f"{only}{names} is determined by this record"
+                verb = "is" if len(self.combinations) == 1 else "are"
+                determined = f"{only}{names} {verb} determined by this record"
             elif self.curved and not self.reasons:
                 curved = ", ".join(self.curved)
                 determined = (
