@@ -164,11 +164,11 @@ class Notched(eqx.Module):
         return self.model.frequency_response(omega) * factor[:, None, None]
 
 
-def flown_notch(seed):
+def flown_notch(seed, noise=0.09):
     """Sharp where it is slow, as a sweep through an integrator in white noise."""
     omega = np.geomspace(2.0, 70.0, 60)
     plant = Notched(jq.LaggedIntegrator(40.0, 0.03, 0.01), 90.0, 3.0)
-    error = (0.09 * (omega / 70) ** 2)[:, None, None]
+    error = (noise * (omega / 70) ** 2)[:, None, None]
     frf = response_of(plant, omega=omega)
     exact, white = np.asarray(frf.response), np.random.default_rng(seed).standard_normal((2, 60))
     response = exact * (1 + error * (white[0] + 1j * white[1])[:, None, None])
@@ -190,8 +190,23 @@ def test_a_notch_is_remarked_where_it_is_and_intervals_hold_what_it_moves():
         assert fit.interval("delay", model_error=False)[0] > 0.01
 
 
-def test_a_right_model_has_no_local_misfit(right):
-    assert not any(remark.kind == "misfit" for fit in right for remark in fit.remarks)
+def test_a_notch_within_the_noise_is_likely_and_intervals_hold_what_it_moves():
+    """By the noise alone, the delay is off by 13 to 16 standard errors."""
+    likely = []
+    for seed in range(8):
+        fit = jq.fit(jq.LaggedIntegrator(48.0, 0.024, 0.011), flown_notch(seed, noise=0.2))
+        likely += [text for text in fit.remarks if text.kind == "resonance"]
+        assert (
+            fit.chi_squared < 1.25**2 and fit.values[2] > 0.01 + 10 * fit.noise_standard_errors[2]
+        )
+        assert fit.values[2] < 0.01 + 3 * fit.standard_errors[2]
+    assert len(likely) > 4
+    assert " with a probability of " in likely[0] and " times as wide" in likely[0]
+
+
+def test_a_right_model_has_no_local_misfit_and_no_likely_resonance(right):
+    kinds = {remark.kind for fit in right for remark in fit.remarks}
+    assert not kinds & {"misfit", "resonance"}
 
 
 def refitted(fit, **found):

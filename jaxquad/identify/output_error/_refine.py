@@ -389,6 +389,7 @@ def _verdict(
         return Information(
             root=spaced,
             covariance=covariance,
+            without=covariance,
             by_noise=covariance,
             places=places,
             values=np.asarray(solution.values)[: reduced.aim.size],

@@ -30,8 +30,9 @@ from ..output_error._simulated import Linear, linear_model
 from ._discrepancy import Discrepancy
 from ._error_budget import error_budget, ErrorBudget, Matrix, scaled_inverse, Weighting
 from ._log_density import Evidence, evidence_of
-from ._misfit import DOUBT, find_drift, local_misfits, MISFIT, with_resonance
+from ._misfit import DOUBT, find_drift, local_misfits, MISFIT
 from ._profiles import Profile, profiles
+from ._resonance import likely_resonance, with_resonance
 from ._response_term import Units, units_of
 from ._verdict import (
     identifiability_of,
@@ -75,6 +76,8 @@ def assess(
     parameters, budget, bounds = problem.parameters, weighting.budget, ()
     names, count, start = parameters.names, parameters.count, units_of(solution)
     bread, gradient, units = budget.bread, budget.gradient, start  # by slopes at the solution
+    local, beyond = local_misfits(budget, weighting.points)
+    budget = with_resonance(budget, certain=beyond is not None)
     near = near_zeros(problem, solution, budget)
     changes = {one.k: one.changes for one in near if one.changes is not None}
     # The next Gauss-Newton step, downhill: parameters at zero do not become negative, and those so
@@ -91,11 +94,9 @@ def assess(
         """With slopes that hold up to the limits of parameters near zero."""
         again = error_budget(problem, weighting.points, solution, units, changes)
         again = dataclasses.replace(again, mixtures=weighting.budget.mixtures)
-        return with_resonance(again, beyond)
+        return with_resonance(again, certain=beyond is not None)
 
     followed = profiles(problem, solution, budget, near)
-    local, beyond = local_misfits(budget, weighting.points)
-    budget = with_resonance(budget, beyond)
     if near:
         budget = up_to_limits(units)
         reached = np.max([np.zeros(count), *(one.reached() for one in followed)], axis=0)
@@ -143,12 +144,10 @@ def assess(
     elif amplitude > NO_MODEL:
         verdict = by_data = no_model(names, amplitude)
     else:
-        without = covariance
-        if beyond:  # a resonance widens intervals, and makes no direction a null one
-            without = cut(dataclasses.replace(budget, moved=0.0).covariance)
         information = Information(
             root=budget.root,
-            covariance=without,
+            covariance=covariance,
+            without=cut(budget.without_resonance),
             by_noise=by_noise,
             places=parameters.places,
             values=np.asarray(solution.values),
@@ -194,6 +193,8 @@ def assess(
                 f"the misfit is {ratio:.1f} times the random error{where}: the model's structure "
                 f"does not explain the whole response{minimum if ratio > _POOR else ''}",
             )
+        elif text := likely_resonance(budget):
+            remark("resonance", text)
         drift = None if stopped or near else find_drift(alone)
         if drift and drift.is_clear(misfit) and all(one.kind != drift.kind for one in remarks):
             remark(drift.kind, str(drift))

@@ -14,11 +14,13 @@ from ._discrepancy import find_discrepancy
 from ._error_budget import ErrorBudget, scaled_inverse
 from ._misfit import may_have_local_misfits
 from ._profiles import WEAK
+from ._resonance import with_resonance
 from ._response_term import diagonal, PriorRows, Responses, ResponseTerm
 from ._verdict import LIMIT, REACH, USUAL
 
 
 _CLEAR = 1e-10  # of the largest eigenvalue: no null direction of a plain fit is near
+_AT_ONCE = 64  # fits whose rows stay within a processor's cache
 _MARGIN = 1.001  # to a limit, for what is rounded in another way
 
 Weights = Float[np.ndarray, "members frequencies outputs inputs 2"]
@@ -51,12 +53,12 @@ def assess_many(
     errors = np.full((len(points), count), np.inf)
     plain = np.zeros(errors.shape, bool)
     intervals = np.full((*errors.shape, 2), np.nan)
-    if some.size:
-        stops = Stops(*(part[some] for part in stops))
-        points, mixings = [points[k] for k in some.tolist()], [mixings[k] for k in some.tolist()]
+    for few in np.split(some, range(_AT_ONCE, some.size, _AT_ONCE)) if some.size else ():
+        here = Stops(*(part[few] for part in stops))
+        mine, mixed = [points[k] for k in few.tolist()], [mixings[k] for k in few.tolist()]
         with np.errstate(all="ignore"):  # of fits that are not plain
-            parts = _numbers(parameters, points, mixings, weights[some], stops)
-        plain[some], errors[some], intervals[some] = parts
+            parts = _numbers(parameters, mine, mixed, weights[few], here)
+        plain[few], errors[few], intervals[few] = parts
     return Assessment(plain, errors, intervals)
 
 
@@ -76,7 +78,7 @@ def _numbers(
     )  # fmt: skip
     prior = PriorRows(np.zeros((len(points), 0)), np.zeros((len(points), *stops.values[:0].shape)))
     mixtures = find_discrepancy([record], [shared], prior, range(count))
-    budget = ErrorBudget([record], prior, count, mixtures)
+    budget = with_resonance(ErrorBudget([record], prior, count, mixtures))
     step = np.squeeze(scaled_inverse(budget.bread) @ budget.gradient[..., None], axis=-1)
     decrement = 0.5 * np.sum(budget.gradient * step, axis=-1)
     variances, by_noise = diagonal(budget.covariance), diagonal(budget.by_noise)

@@ -78,7 +78,8 @@ class ErrorBudget:
     prior: PriorRows
     count: int  # of free parameters, the first of all
     mixtures: tuple[Mixture, Mixture] = (NO_DISCREPANCY, NO_DISCREPANCY)
-    moved: Matrix | float = 0.0  # covariance by what may explain a local misfit
+    moved: Matrix | float = 0.0  # covariance by a resonance that the model may lack
+    resonance: PerFit = 0.0  # its probability
 
     @ft.cached_property
     def products(self) -> tuple[Matrix, Float[np.ndarray, "*members parameters"]]:
@@ -155,7 +156,7 @@ class ErrorBudget:
         lined_up = (row.reshape(*row.shape[:-3], -1, row.shape[-1]) for row in rows)
         return np.concatenate([*lined_up], axis=-2)
 
-    @property
+    @ft.cached_property
     def degrees_of_freedom(self) -> Float[np.ndarray, "*members parameters"]:
         """Of the noise estimate behind each parameter's variance; infinite where it is known.
 
@@ -186,6 +187,11 @@ class ErrorBudget:
     def covariance(self) -> Matrix:
         """With what the model leaves unexplained."""
         return self.by_noise + self._unexplained[0]
+
+    @property
+    def without_resonance(self) -> Matrix:
+        """With all but a resonance, which widens intervals, and makes no direction a null one."""
+        return self.covariance - self.moved
 
     @ft.cached_property
     def _unexplained(self) -> tuple[Matrix, Matrix]:

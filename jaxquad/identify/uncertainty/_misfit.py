@@ -24,7 +24,7 @@ from jaxtyping import Bool, Float, Int
 
 from jaxquad.spectra import in_hertz
 
-from ..frequency_domain._cost import mix, Points
+from ..frequency_domain._cost import Points
 from ._discrepancy import SHARES
 from ._error_budget import ErrorBudget, Matrix, scaled_inverse
 from ._response_term import PriorRows, ResponseTerm
@@ -37,9 +37,6 @@ _CHANCE = 0.002  # of a local misfit somewhere, where the model is right
 _WIDTHS = (0.5, 1.0, 2.0)  # octaves
 _MOST = 0.5  # share of the misfit beyond the noise
 _FEWEST = 2.0  # degrees of freedom of a window
-_PLACES, _DAMPINGS = 24, (0.1, 0.2, 0.4)  # of the resonances that are tried
-_OUTSIDE = 1.3  # times the window's ends: resonances up to there show within it
-_DISTINCT = 1e-8  # share of a resonance that the parameters do not take up
 _FALLS, _RISES = 0.004, 0.0005  # chance of a remark on what is steady: batteries fall
 _LOOKED_AT = 2.0  # standard errors of a drift from which its covariance is computed
 _EXPLAINED = 0.2  # of a large misfit, which a drift may leave
@@ -185,41 +182,6 @@ def local_misfits(
         return local, local
     floor = float(budget.mixtures[0].amplitude)
     return local, find_local_misfit(budget, points, floor, MISFIT**2)
-
-
-def with_resonance(budget: ErrorBudget, local: LocalMisfit | None) -> ErrorBudget:
-    """With what a resonance in the place of a local misfit would move: a notch or a mode bends the
-    phase far below its frequency, as a delay does."""
-    if local is None:
-        return budget
-    number, o, i = local.place
-    record, inverse = budget.records[number], scaled_inverse(budget.bread)
-    used, s = record.used[:, o, i], 1j * np.asarray(record.frf.omega)
-    axes = (0, 1, 2, 3)
-    dot = lambda one, other: np.tensordot(one, other, axes=(axes, axes))
-    lowered, moves = [0.0], [np.zeros((budget.count, budget.count))] * 2
-    for place in np.geomspace(local.low / _OUTSIDE, local.high * _OUTSIDE, _PLACES).tolist():
-        for damping in _DAMPINGS:
-            # Of a pair of zeros beside its poles, by the first order.
-            pole = place**2 / (s**2 + 2 * damping * place * s + place**2)
-            logs = np.stack([s / place * pole, pole - 1], axis=1)
-            parts = np.zeros((*record.misfit.shape, 2))
-            parts[used, o, i] = np.stack([np.real(logs), np.imag(logs)], axis=1)[used]
-            rows = np.asarray(mix(record.mixing, record.weights[..., None] * parts))
-            along, size_of_rows = dot(record.rows[..., : budget.count], rows), dot(rows, rows)
-            left = size_of_rows - along.T @ inverse @ along
-            if np.linalg.eigvalsh(left)[0] <= _DISTINCT * np.trace(size_of_rows):
-                continue
-            pull = dot(rows, record.residual) - along.T @ inverse @ budget.gradient
-            size = np.linalg.solve(left, pull)
-            lowered.append(float(pull @ size))
-            moves.append(inverse @ along @ np.outer(size, size) @ along.T @ inverse)
-    # Each as probable as it explains the misfit.
-    points = 2 * sum(np.count_nonzero(one.used) for one in budget.records)
-    scale = max(budget.data_cost - max(lowered), budget.noise.cost) / points
-    shares = np.exp((np.array(lowered) - max(lowered)) / (2 * scale))
-    moved = np.tensordot(shares / np.sum(shares), np.array(moves[1:]), axes=1)
-    return dataclasses.replace(budget, moved=moved)
 
 
 class Drift(NamedTuple):

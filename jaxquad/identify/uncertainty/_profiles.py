@@ -122,7 +122,7 @@ def profiles(
 ) -> tuple[Profile, ...]:
     """Of the parameters that keep their sign and lie within a few standard errors of zero, and of
     one in each direction in which all run to infinity."""
-    variances, by_noise = np.diagonal(budget.covariance), np.diagonal(budget.by_noise)
+    variances, by_noise = np.diagonal(budget.without_resonance), np.diagonal(budget.by_noise)
     weak = variances > 1 / WEAK**2
     weak[[one.k for one in near]] = True
     weak[_of_null_directions(budget.bread)] = True
@@ -142,7 +142,7 @@ def _profile(
 ) -> Profile:
     """Of parameter `k`, whose standard error is about this."""
     values, units = np.asarray(solution.values)[: budget.count], units_of(solution)[: budget.count]
-    parts = budget.covariance, budget.by_noise
+    parts = budget.without_resonance, budget.by_noise
     inflations = np.sqrt([part[k, k] / scaled_inverse(budget.bread)[k, k] for part in parts])
     far, value = _FAR_OUT * float(np.max(inflations)), values[k]
     estimate = _Place(solution.z, values)

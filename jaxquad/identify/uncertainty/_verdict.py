@@ -246,14 +246,14 @@ class Information(NamedTuple):
     """All that the decision rests on: free parameters first, then the fixed ones.
 
     The fixed ones take part in names only: the arm L in L K_t / J_x. `root` holds derivatives of
-    ln-magnitudes and phases (alternate rows), in units of their random error, with respect to
-    relative changes; `covariance` is that of the free parameters' relative changes, and `by_noise`
-    what of it the noise alone accounts for; `same` says whether other values of the free ones give
-    the same responses.
+    ln-magnitudes and phases (alternate rows), in units of their random error, by relative changes;
+    `covariance` is that of the free ones, `without` a resonance, or `by_noise`; other values of the
+    free ones may give the `same` responses.
     """
 
     root: Float[np.ndarray, "rows all"]
     covariance: Matrix
+    without: Matrix
     by_noise: Matrix
     places: Sequence[Place]
     values: Float[np.ndarray, " all"]
@@ -265,8 +265,8 @@ class Information(NamedTuple):
 def identifiability_of(
     information: Information, prior: PriorRows, bounds: tuple[Bound, ...] = ()
 ) -> tuple[Verdict, Verdict]:
-    """What data and priors determine together, and what the data determine alone. Parameters with a
-    bound are determined by it, and take part in no direction."""
+    """What data and priors determine together, and the data alone. Parameters with a bound are
+    determined by it, and take part in no direction."""
     by_data = _determine(information, bounds)
     if not len(prior.misfit):
         return by_data, by_data
@@ -293,6 +293,7 @@ def _determine(information: Information, bounds: tuple[Bound, ...]) -> Verdict:
         some = Information(
             root=information.root[:, kept],
             covariance=information.covariance[np.ix_(free, free)],
+            without=information.without[np.ix_(free, free)],
             by_noise=information.by_noise[np.ix_(free, free)],
             places=[places[k] for k in kept],
             values=information.values[kept],
@@ -312,10 +313,10 @@ def _determine(information: Information, bounds: tuple[Bound, ...]) -> Verdict:
     is_exact = singular <= _FLOOR * singular[0]
     null, exact = right[is_exact | (singular * LIMIT < 1)], right[is_exact]
     null = _sparse(null) if len(null) else null
-    # What a record determines is a matter of its noise: a standard error beyond the limit; what is
-    # unknown by all of its size even so, model error included, is of no use to anyone.
-    parts = (information.covariance, information.by_noise)
-    errors = [np.sqrt(np.maximum(np.diagonal(part), 0.0)) for part in parts]
+    # What a record determines is a matter of its noise: a standard error beyond the limit. What is
+    # unknown by all of its size, model error included, is of no use to anyone.
+    parts = np.stack([information.without, information.by_noise])
+    errors = np.sqrt(np.maximum(np.diagonal(parts, axis1=1, axis2=2), 0.0))
     imprecise = (errors[0] > 2 * LIMIT) | (errors[1] > LIMIT)
     values, units = information.values[:count], np.abs(information.units[:count])
     for profile in information.profiles:
@@ -323,7 +324,7 @@ def _determine(information: Information, bounds: tuple[Bound, ...]) -> Verdict:
     lost = np.any(null, axis=0) | imprecise
     left = imprecise & ~np.any(null, axis=0)
     if left.any():  # the direction of most variance of an imprecise parameter that is in none
-        spread, directions = np.linalg.eigh(information.covariance)
+        spread, directions = np.linalg.eigh(information.without)
         most = {int(np.argmax(spread * directions[k] ** 2)) for k in np.flatnonzero(left)}
         null = _sparse(np.concatenate([null, directions.T[sorted(most)]]))
     names, remedies = [place.name for place in places[:count]], []
@@ -385,8 +386,9 @@ def _analyse_groups(
         return combinations, alternatives, curved
     # A pseudo-inverse shows no variance along exact null directions.
     keep = np.eye(null.shape[1]) - exact.T @ exact
-    covariance = keep @ information.covariance @ keep + 1e4 * exact.T @ exact
-    information = information._replace(covariance=covariance)
+    parts = np.stack([information.covariance, information.without])
+    parts = keep @ parts @ keep + 1e4 * exact.T @ exact
+    information = information._replace(covariance=parts[0], without=parts[1])
     groups: list[set[int]] = []
     for row in null:
         group = set(np.flatnonzero(row).tolist())
@@ -414,8 +416,7 @@ def _analyse_groups(
             combination = _combination(row, block, effects[:, k], information, kinds)
             combinations += [] if combination is None else [combination]
         alternatives += moved.values()
-        names = [information.places[k].name for k in block]
-        curved += names if not kinds and len(rows) else []
+        curved += [] if kinds or not len(rows) else [information.places[k].name for k in block]
     return combinations, alternatives, curved
 
 
@@ -440,12 +441,12 @@ def _combination(
         weights = -weights if np.sum(effect[::2]) < 0 else weights  # to raise the response
     order = lambda k: (information.places[k].leaf, information.places[k].index)
     used = np.array(sorted(np.flatnonzero(weights), key=order))  # as the model orders them
-    relative = np.zeros((len(weights), len(weights)))
-    relative[:count, :count] = information.covariance
-    relative, weights = relative[np.ix_(used, used)], weights[used]
+    relative = np.zeros((2, len(weights), len(weights)))
+    relative[:, :count, :count] = information.covariance, information.without
+    (relative, without), weights = relative[:, used[:, None], used], weights[used]
     names, values = [information.places[k].name for k in used], information.values[used]
     units = information.units[used]  # the value itself where its logarithm is fitted
-    error = lambda w: float(np.sqrt(max(w @ relative @ w, 0.0)))
+    error = lambda w, by=relative: float(np.sqrt(max(w @ by @ w, 0.0)))
 
     def simplest(weights: Vector, largest: int) -> Vector | None:
         """The nearest vector of whole numbers up to `largest`, or None if there is none near."""
@@ -458,7 +459,7 @@ def _combination(
 
     def as_sharp(simple: Vector) -> bool:
         along = abs(float(simple @ weights)) / float(weights @ weights)
-        return error(simple) <= 1.25 * error(weights) * along
+        return error(simple, without) <= 1.25 * error(weights, without) * along
 
     powers = simplest(weights, 2) if "product" in kinds and np.all(units == values) else None
     sums = simplest(weights / units, 1) if "sum" in kinds else None

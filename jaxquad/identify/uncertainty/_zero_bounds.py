@@ -162,8 +162,9 @@ class NearZero(NamedTuple):
 
 
 def near_zeros(problem: Problem, solution: Solution, budget: ErrorBudget) -> list[NearZero]:
-    """Parameters at zero, or so near it that the data allow it, with one-sided 95 % limits."""
-    parameters, parts = problem.parameters, (budget.covariance, budget.by_noise)
+    """Parameters at zero, or so near it that the data allow it, with one-sided 95 % limits, before
+    what a resonance may move."""
+    parameters, parts = problem.parameters, (budget.without_resonance, budget.by_noise)
     possible = np.sqrt(np.diagonal(budget.covariance)) * _ONE_SIDED > 1
     possible |= np.sqrt(np.diagonal(budget.by_noise)) > LIMIT
     possible &= np.array(parameters.logarithmic[: parameters.count])
@@ -250,7 +251,7 @@ def bounds_among(
     """Those that a limit determines; and units in which those count that are mixed up with others:
     another one would change by too much on the way to the limit, or takes them far beyond it, to
     what the profiles have `reached`."""
-    bounds, mixed, covariance = [], {}, budget.covariance
+    bounds, mixed, covariance = [], {}, budget.without_resonance
     slight = [one.k for one in near if one.slight]
     for one in near:
         along = np.abs(covariance[:, one.k] / covariance[one.k, one.k])
@@ -258,7 +259,8 @@ def bounds_among(
         moved[[one.k, *(solution.at_zero if one.k in solution.at_zero else ())]] = 0.0
         moved[slight if one.slight else []] = 0.0
         if np.all(moved <= LIMIT) and reached[one.k] <= _BEYOND * abs(one.bound.limit):
-            bounds.append(one.bound)
+            by_resonance = float(np.asarray(budget.moved)[one.k, one.k]) * units[one.k] ** 2
+            bounds.append(_further(one.bound, _RISE * by_resonance))
         elif one.k in solution.at_zero or one.changes is not None:
             mixed[one.k] = moved
     others = [j for j in range(len(covariance)) if j not in mixed]
@@ -268,6 +270,12 @@ def bounds_among(
             share = float(np.max(mixed[one.k][others], initial=0.0))
             units[one.k] = one.bound.limit / (share if share > LIMIT else 1.0)
     return tuple(bounds), units
+
+
+def _further(bound: Bound, rise: float) -> Bound:
+    """With a limit at which the square of the distance from the minimum has risen by more."""
+    reach = np.hypot(abs(bound.limit - bound.value) + bound.beyond, np.sqrt(rise)) - bound.beyond
+    return bound._replace(limit=float(bound.value + np.copysign(reach, bound.limit)))
 
 
 def without_bounds(
