@@ -385,6 +385,21 @@ def mix(mixing: Mixing | None, weighted: Columns, *, twice: bool = False) -> Col
     return np.stack([np.real(turned), np.imag(turned)], axis=-2)
 
 
+def mix_pair(
+    mixing: Mixing,
+    weighted: Float[np.ndarray, "*members frequencies 2 columns"],
+    pair: tuple[int, int],
+) -> Columns:
+    """As `mix`, of what only one output and input has."""
+    (o, i), (outputs, inputs) = pair, mixing.factor.shape[-4:-2]
+    flat = mixing.factor[..., o, i, :, :] @ (weighted[..., 0, :] + 1j * weighted[..., 1, :])
+    flat = flat[..., None, :]
+    if mixing.across is not None:
+        flat = mixing.across[..., o * inputs + i, None] * flat
+    flat = flat.reshape(*flat.shape[:-2], outputs, inputs, -1)
+    return np.stack([np.real(flat), np.imag(flat)], axis=-2)
+
+
 def expected_cost(
     mixing: Mixing | None, sizes: Float[np.ndarray, "*members frequencies outputs inputs 2"]
 ) -> Float[np.ndarray, "*members outputs inputs"]:

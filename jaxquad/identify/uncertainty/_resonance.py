@@ -13,7 +13,7 @@ import dataclasses
 import numpy as np
 from jaxtyping import Bool, Float
 
-from ..frequency_domain._cost import mix
+from ..frequency_domain._cost import mix_pair
 from ._error_budget import ErrorBudget, FOLLOWS, scaled_inverse
 from ._response_term import ResponseTerm
 
@@ -68,10 +68,13 @@ def _resonances(
     used = record.used[..., *pair]
     if members and np.all(used == used[:1]):
         used = used[0]
-    shape = (*used.shape, *record.misfit.shape[-3:], 2 * _PLACES * len(_DAMPINGS))
-    columns = np.zeros(shape)
-    columns[..., *pair, :, :] = _logarithms(np.asarray(record.frf.omega), used)
-    rows = mix(record.mixing, record.weights[..., None] * columns)
+    columns = _logarithms(np.asarray(record.frf.omega), used)
+    columns = record.weights[..., *pair, :, None] * columns
+    if record.mixing is None:
+        rows = np.zeros((*record.misfit.shape, columns.shape[-1]))
+        rows[..., *pair, :, :] = columns
+    else:
+        rows = mix_pair(record.mixing, columns, pair)
     flat = lambda rows: np.asarray(rows).reshape(*members, -1, rows.shape[-1])
     rows, inverse = flat(rows), scaled_inverse(budget.bread)
     across = np.swapaxes(rows, -1, -2)
