@@ -120,7 +120,8 @@ def test_one_scenario_serves_an_ensemble_of_plants():
     found, expected = (
         simulate(Loop(rig(INERTIAS), PILOT, dt=DT, drive=DRIVE), case) for case in (one, wide)
     )
-    np.testing.assert_array_equal(found.angle, expected.angle)
+    # Two programs: their last digits differ between processors.
+    np.testing.assert_allclose(found.angle, expected.angle, rtol=1e-13)
     assert found.injection.shape == (SAMPLES, 3, 3)
 
 
