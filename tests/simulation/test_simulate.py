@@ -120,8 +120,8 @@ def test_one_scenario_serves_an_ensemble_of_plants():
     found, expected = (
         simulate(Loop(rig(INERTIAS), PILOT, dt=DT, drive=DRIVE), case) for case in (one, wide)
     )
-    # Two programs: their last digits differ between processors.
-    np.testing.assert_allclose(found.angle, expected.angle, rtol=1e-13)
+    # Two programs, whose last bits differ on some processors.
+    np.testing.assert_allclose(found.angle, expected.angle, rtol=1e-15)
     assert found.injection.shape == (SAMPLES, 3, 3)
 
 

@@ -49,7 +49,6 @@ class LocalMisfit(NamedTuple):
     low: float  # rad/s
     high: float
     within: bool  # a part of the band, and not the whole of it
-    place: tuple[int, int, int]  # of the response, and its output and input
 
     def __str__(self) -> str:
         where = in_hertz(np.array([self.low, self.high]))
@@ -64,7 +63,7 @@ def find_local_misfit(
     from scipy.special import chdtrc, fdtrc
 
     tried, candidates, inverse = 0, [], scaled_inverse(budget.bread)
-    for number, (record, counted) in enumerate(zip(budget.records, points, strict=True)):
+    for record, counted in zip(budget.records, points, strict=True):
         omega = np.asarray(record.frf.omega)
         for o, i in record.pairs:
             some = np.flatnonzero(record.used[:, o, i])
@@ -93,7 +92,7 @@ def find_local_misfit(
             k = most[np.argmin(np.log(omega[some[ends[most] - 1]] / omega[some[starts[most]]]))]
             edges = float(omega[some[starts[k]]]), float(omega[some[ends[k] - 1]])
             ratio = float(np.sqrt(total[k] / freedom[k]))
-            local = LocalMisfit(ratio, *edges, bool(k), (number, o, i))
+            local = LocalMisfit(ratio, *edges, bool(k))
             candidates.append((float(np.min(chances[clear])), -float(np.max(beyond)), local))
     chance, _, clearest = min(candidates, key=lambda one: one[:2], default=(1.0, 0.0, None))
     return clearest if tried * chance < _CHANCE else None
