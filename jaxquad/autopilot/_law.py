@@ -196,6 +196,10 @@ class RateLoop(FirmwareLoop):
         """The law as it is inside an angle loop that was closed."""
         return self
 
+    def deflected(self) -> "RateLoop":
+        """The law under sticks far from their middle, for all of the feed-forward."""
+        return self
+
     def holds_integral(self, axis: int) -> bool:
         """Whether the integral can be held while the set-point moves (iterm_relax)."""
         return False

@@ -288,6 +288,8 @@ def pilot_page(proposal: "AutopilotProposal", origin: Provenance, overview: str)
         headlines.append(Headline("good", "THE FLOWN LOOP AGAIN", check.verdict))
     if filters is not None:
         headlines.append(Headline("good" if filters.flown else "warn", "FILTERS", filters.text))
+    if proposal.sticks is not None:
+        headlines.append(Headline("good", "FEED-FORWARD", proposal.sticks.text))
     if throttle is not None:
         level = "warn" if throttle.gains is None else "good"
         headlines.append(Headline(level, "THROTTLE", throttle.text))
@@ -300,7 +302,8 @@ def pilot_page(proposal: "AutopilotProposal", origin: Provenance, overview: str)
         remarks=[
             *(f"not modelled: {text}" for text in flown.loop.unmodelled),
             *([flown.filters_text] if flown.filters_text else []),
-            *([limits_text(proposal.settings), FORWARD_STAYS] if new else []),
+            *([limits_text(proposal.settings)] if new else []),
+            *([FORWARD_STAYS] if new and proposal.sticks is None else []),
         ],
         filters={
             name: chains_of(other, axis)

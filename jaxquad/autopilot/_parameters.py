@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple, TypeVar
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -19,6 +20,7 @@ from ._law import AngleLoop, FirmwareLoop, FlownLoop, RateLoop
 
 
 Law = TypeVar("Law", bound=FirmwareLoop)
+Part = TypeVar("Part", bound=eqx.Module)  # of a law
 
 
 class _Tables(Mapping[str, Mapping[str, Parameter]]):
@@ -158,7 +160,7 @@ def _value_at(law: FirmwareLoop, field: str) -> object:
     return part
 
 
-def _replaced(law: Law, field: str, value: Array) -> Law:
+def _replaced(law: Part, field: str, value: Array) -> Part:
     if field.startswith("angle."):
         return dataclasses.replace(law, **{field.removeprefix("angle."): value})
     if isinstance(law, AngleLoop):

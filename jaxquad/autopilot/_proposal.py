@@ -13,6 +13,7 @@ from jaxquad.records import AXES
 from jaxquad.records.firmware import firmware_names
 from jaxquad.report import Provenance, provenance, write_json
 
+from ._feed_forward import FeedForwardVerdict
 from ._filter_bank import GyroNoise, SharedChange
 from ._firmware import firmware_named
 from ._flight_channels import FlownAutopilot, IdentifiedPlant
@@ -85,6 +86,7 @@ class AutopilotProposal:
     stages: tuple[Stage, ...] = ()
     new: Mapping[str, float] = dataclasses.field(default_factory=dict)  # what is proposed, if any
     filters: FilterVerdict | None = None  # what freeing them brings; None without a search
+    sticks: FeedForwardVerdict | None = None  # None of a firmware whose feed-forward stays
     noise: GyroNoise | None = None  # of the gyros, where the log shows it
     throttle: ThrottleVerdict | None = None  # where gains hold, and the thrust curve, apart
     search: "Search | None" = dataclasses.field(default=None, repr=False, compare=False)
@@ -138,7 +140,8 @@ class AutopilotProposal:
         angle = self.flown.angle
         around = {} if angle is None or angle.name not in self.new else {angle.name: angle.value}
         filters = {} if self.filters is None else dict(self.filters.flown)
-        return self.flown.old | filters | around
+        ahead = {} if self.sticks is None else self.sticks.flown
+        return self.flown.old | ahead | filters | around
 
     @property
     def at_once(self) -> tuple[str, ...]:
@@ -175,7 +178,11 @@ class AutopilotProposal:
             f"what flew; Ms {before.peak:.2f} -> {after.peak:.2f}"
         )
         reasons = dict.fromkeys(self.new, why)
-        for name, text in at_limit(self.flown.old, self.new, self.settings.change).items():
+        old = self.flown.old
+        if self.sticks is not None:
+            old = old | self.sticks.flown
+            reasons |= dict.fromkeys(self.sticks.flown, self.sticks.reason)
+        for name, text in at_limit(old, self.new, self.settings.change).items():
             reasons[name] += f"\n{text}"
         if self.filters is not None:
             reasons |= dict.fromkeys(self.filters.flown, self.filters.reason)
@@ -212,6 +219,7 @@ class AutopilotProposal:
             "new": dict(self.new),
             "stages": [stage.content() for stage in self.stages],
             "filters": part(self.filters),
+            "feed_forward": part(self.sticks),
             "noise": part(self.noise),
             "throttle": part(self.throttle),
             "reproduction": part(self.reproduction),
@@ -266,9 +274,12 @@ class AutopilotProposal:
             lines += [row(x, stage.peaks) for x, stage in zip(WAYS, self.stages, strict=False)]
         if self.filters is not None:
             lines += ["", f"filters: {self.filters.text}"]
+        if self.sticks is not None:
+            lines += ["", f"feed-forward: {self.sticks.text}"]
         if self.kind == "proposed":
             lines += ["", change_table(self.changes).rstrip(), ""]
-            lines.append(f"{limits_text(self.settings)}; {FORWARD_STAYS}")
+            stays = "" if self.sticks is not None else f"; {FORWARD_STAYS}"
+            lines.append(f"{limits_text(self.settings)}{stays}")
         if curve is not None:
             lines += ["", f"thrust curve: {curve.text}"]
             if curve.change is not None:

@@ -12,6 +12,7 @@ from jaxtyping import Float, Int
 
 from jaxquad._core import announce
 
+from ._feed_forward import design_feed_forward
 from ._filter_bank import (
     filter_choices,
     FilterBank,
@@ -107,9 +108,15 @@ def _searched(
         more = worst_plants(hardest, best.gains[-1][None], _WORST)
         more = more if len(loops) > 1 else [np.concatenate(more)]
         loops = with_more_plants(loops, more)
+    new, sticks = {}, None
+    if kind == "proposed":
+        behind = design.filtered(loops, best.filters) if best.filters else loops
+        ends = (best.loops[0], best.loops[-1]), (best.gains[0], best.gains[-1])
+        sticks = design_feed_forward(flown, behind, *ends, settings)
+        new = best.new if sticks is None else best.new | sticks.new
     return dataclasses.replace(
-        proposal, kind=kind, verdict=text, stages=best.stages, filters=verdict, noise=noise,
-        new=best.new if kind == "proposed" else {}, search=ft.partial(_search_again, design),
+        proposal, kind=kind, verdict=text, stages=best.stages, filters=verdict, sticks=sticks,
+        noise=noise, new=new, search=ft.partial(_search_again, design),
     )  # fmt: skip
 
 

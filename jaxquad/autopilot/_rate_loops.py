@@ -214,15 +214,21 @@ def delay_margin(loop: Responses, omega: Frequencies) -> Float[np.ndarray, " pla
 
 def law_paths(law: RateLoop, axis: int, omega: Frequencies) -> tuple[Parts, Parts]:
     """Per unit of P, I and D: from the filtered rate to minus the command, from the set-point."""
-    bare = law.without_gyro_filters()  # the logged rate is behind them: they are in the plant
-    fields, responses = (*law.tuned, *law.feed_forward), []
-    for name in law.tuned:  # a gain of 1, none of the other two and no feed-forward
-        gains = [jnp.full_like(vars(law)["p"], float(field == name)) for field in fields]
-        # What `replace` would check anew is known to be right.
-        alone = eqx.tree_at(lambda law: [vars(law)[field] for field in fields], bare, gains)
-        responses.append(linear_responses(alone.linear(axis), omega))
-    ahead, back = np.stack(responses, axis=1)
+    paths = [unit_path(law, axis, name, omega) for name in law.tuned]
+    ahead, back = np.stack(paths, axis=1)
     return -back, ahead
+
+
+def unit_path(
+    law: RateLoop, axis: int, name: str, omega: Frequencies
+) -> Complex[np.ndarray, "2 frequencies"]:
+    """With a gain of 1 and no other, from the set-point and the filtered rate to the command."""
+    bare = law.without_gyro_filters()  # the logged rate is behind them: they are in the plant
+    fields = (*law.tuned, *law.feed_forward)
+    gains = [jnp.full_like(vars(law)["p"], float(field == name)) for field in fields]
+    # What `replace` would check anew is known to be right.
+    alone = eqx.tree_at(lambda law: [vars(law)[field] for field in fields], bare, gains)
+    return linear_responses(alone.linear(axis), omega)
 
 
 def gyro_chain_response(law: RateLoop, omega: Frequencies) -> Response:

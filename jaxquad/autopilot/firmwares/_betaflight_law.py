@@ -198,6 +198,9 @@ class BetaflightPID(BetaflightRate):
         relax = dataclasses.replace(self.relax, threshold=0.2 * self.relax.threshold)
         return dataclasses.replace(self, relax=relax)
 
+    def deflected(self) -> "BetaflightPID":
+        return dataclasses.replace(self, f_share=jnp.ones_like(self.f_share))
+
     def holds_integral(self, axis: int) -> bool:
         return self.relax is not None and float(np.broadcast_to(self.relax.share, (3,))[axis]) > 0
 
