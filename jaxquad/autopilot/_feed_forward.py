@@ -27,6 +27,8 @@ from ._rate_loops import (
 
 
 _STICK_HZ, _LAGS = 15.0, 3  # of a quick stick: a step of the set-point behind so many lags
+_STEEPEST = 0.27 * 2 * np.pi * _STICK_HZ  # 1/s, of it
+_SIZE, _SHARE = np.radians(200.0), 0.5  # of it in rad/s, which may ask for this share of the limit
 _LOWEST = 1.0  # rad/s, below which no stick is quick
 _RESERVE = 0.99  # of the limit, because fresh plants reach further than those that were tuned on
 _VALUES = 49  # that are tried
@@ -94,8 +96,10 @@ def design_feed_forward(
     row = find_parameter(law.firmware, name)
     before = float(np.broadcast_to(vars(law)[field], 3)[axis])
     sticks = _QuickSticks(loops, designs[-1], law, axis)
-    ends = before / settings.change, before * settings.change if before > 0 else row.high
-    value = _best_value(sticks, before, np.clip(ends, row.low, row.high), settings.resonance)
+    least, most = before / settings.change, before * settings.change if before > 0 else row.high
+    asked_for = _SHARE * float(np.broadcast_to(vars(law)["limit"], 3)[axis]) / sticks.command
+    ends = np.clip((least, min(most, max(before, asked_for))), row.low, row.high)
+    value = _best_value(sticks, before, ends, settings.resonance)
     flew, last = (_QuickSticks(*x, law, axis) for x in zip(fresh, designs, strict=True))
     unit = flew.errors(np.array([before]))
     ways = (flew, before), (last, before), (last, value)
@@ -145,18 +149,20 @@ class _QuickSticks:
         quick = loops[0].omega >= _LOWEST
         omega = loops[0].omega[quick]
         unit = unit_path(law.deflected(), axis, law.feed_forward[0], loops[0].omega)[0]
+        # The greatest that a unit of it asks for after a quick stick.
+        self.command = float(np.abs(unit[0]) / loops[0].omega[0]) * _STEEPEST * _SIZE
         lag = 1 / (1 + 1j * omega / (2 * np.pi * _STICK_HZ))
         weight = np.abs(lag) ** (2 * _LAGS) / omega**2 * cells_of(omega)
         # While the sticks move, the integral may be held and D raised.
-        held = np.array([1.0, 0.0 if any(x.relaxed for x in loops) else 1.0, 1.0])
+        follows = np.array([1.0, 0.0 if any(x.relaxed for x in loops) else 1.0, 1.0])
         raised = np.array([1.0, 1.0, max(x.ceiling for x in loops)])
-        states = np.unique([held, held * raised, raised, np.ones(3)], axis=0)
+        states = np.unique([follows, follows * raised, raised, np.ones(3)], axis=0)
         self.parts: list[tuple[Responses, Responses]] = []  # without it, and of a unit of it
         for state in states:
             both = [_responses(x, state * gains, unit) for x in loops]
             alone, ahead = (np.concatenate(x)[:, quick] for x in zip(*both, strict=True))
             self.parts.append((alone, ahead))
-        following, ahead = self.parts[int(np.flatnonzero((states == held).all(axis=1))[0])]
+        following, ahead = self.parts[int(np.flatnonzero((states == follows).all(axis=1))[0])]
         missing = 1 - following
         mean = lambda x: float(np.mean(np.real(x) @ weight))
         self.square = mean(np.abs(missing) ** 2)
