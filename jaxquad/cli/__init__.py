@@ -177,8 +177,10 @@ def app(declared: argparse.ArgumentParser) -> Run:
         try:
             from jaxquad.app import serve
         except ModuleNotFoundError as error:
-            text = f'jaxquad app needs {error.name}: pip install "jaxquad[app]"'
-            raise ValueError(text) from error
+            raise ValueError(
+                f'jaxquad app needs {error.name}: pip install "jaxquad[app]", or run it as '
+                'uvx "jaxquad[app]" app'
+            ) from error
         serve(
             options.file, port=options.port, browser=not options.no_browser,
             linger=options.linger,
