@@ -55,6 +55,7 @@ from ._verdict import BELIEVED, judge, SWINGING
 _THIRD = 1 / 3
 _FILTERS_WORTH = 0.97  # of that with gains alone, above which filters are not worth one
 _CERTIFICATES = 3  # at most: the worst plants of one that fails are tuned on, too
+_HOPELESS = 1.05  # times a limit on plants tuned on, from which more of them change nothing
 _WORST = 16
 _HARD = 14  # plants of a search with filters
 _ANGLES, _ANGLE_RESERVE = 25, 0.98  # gains of the angle loop that are tried; of its limits
@@ -88,13 +89,16 @@ def _searched(
         fresh = design.groups(settings.fresh, attempt)
         announce(f"searching gains on {len(loops[0].plants)} plants")
         behind = design.filtered(loops, filters) if filters else loops
-        gains = _Search(design, behind, loops, change).gains(gains)
+        search = _Search(design, behind, loops, change)
+        gains = search.gains(gains)
+        excess = search.excess(gains)
         best = design.certified(fresh, parameters_of(law, axis, gains), filters)
         if bank is not None and noise is not None:
             announce("searching gains and filters together")
             hard, alone = with_plants(loops, worst_plants(loops, gains[None], _HARD)), best
             search = _Search(design, hard, hard, change, bank)
             both, picks = search.gains_and_filters(gains, settings.seed)
+            excess = min(excess, search.excess(both, picks))
             if changed := bank.parameters(picks):
                 best = design.certified(fresh, parameters_of(law, axis, both), changed)
             best, verdict = design.compared(alone, best, bank, noise)
@@ -102,7 +106,7 @@ def _searched(
             best.stages, settings, proposal.identification.band[1], verdict.shared,
             design.throttle.logged, design.swings,
         )  # fmt: skip
-        if kind != "not to be flown":
+        if kind != "not to be flown" or excess > _HOPELESS:
             break
         hardest = fresh if filters else best.loops[-1]
         more = worst_plants(hardest, best.gains[-1][None], _WORST)
@@ -337,6 +341,7 @@ def _switched(flown: FlownAutopilot, filters: Mapping[str, float]) -> tuple[str,
 _POINTS, _LEVELS, _NARROWED = 7, 6, 0.4  # of the search, along each gain and one after the other
 _AROUND, _POINTS_AROUND, _LEVELS_AROUND = 0.3, 5, 4  # likewise, around known gains, in ln
 _RESERVE = 0.97  # of the limit, because fresh plants reach further than those that were tuned on
+_BEYOND = 1e9  # times the worst excess: the score of what does not keep the limits
 _TOGETHER = 384  # loops of designs and plants evaluated at once: beyond, memory is slow
 _ROUNDS, _DRAWN, _BEST, _KEPT = 14, 140, 18, 0.3  # of the search with filters
 _WIDTH, _NARROWEST = (0.35, 0.25), (0.02, 0.3)  # of gains in ln, of filters in options
@@ -433,6 +438,12 @@ class _Search:
         picks = best[count:].astype(int)
         return self._stored(np.exp(best[:count]), picks), picks
 
+    def excess(self, gains: OneGains, picks: Int[np.ndarray, " choices"] | None = None) -> float:
+        """How many times a limit the gains are, 0 where they keep all."""
+        one = None if picks is None else picks[None]
+        [score] = self.score(gains[None, self.free], one)
+        return float(score) / _BEYOND if score >= _BEYOND else 0.0
+
     def score(self, points: Gains, picks: Picks | None = None) -> Float[np.ndarray, " designs"]:
         """Of free gains, and picked filters."""
         gains = np.tile(self.flown, (len(points), 1))
@@ -464,7 +475,7 @@ class _Search:
         worst = np.stack(beyond).max(axis=0)
         worst = np.where(np.all(qualities.stable, axis=1), worst, 1e6 * worst)
         rejection = np.sqrt(np.mean(qualities.rejection**2, axis=1))
-        return np.where(worst <= 1, rejection, 1e9 * worst)
+        return np.where(worst <= 1, rejection, _BEYOND * worst)
 
     def _stored(
         self, free: Float[np.ndarray, " free"], picks: Int[np.ndarray, " choices"] | None
