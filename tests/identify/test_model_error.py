@@ -211,7 +211,7 @@ def test_a_right_model_has_no_local_misfit_and_no_likely_resonance(right):
 def refitted(fit, **found):
     """The fit, with refits that end with these misfits by the number of the term's parameters."""
 
-    def run(model, frfs, options, rounds):
+    def run(model, frfs, options, rounds, by_slopes):
         extra = getattr(model, "extra", np.zeros(0))
         chi_squared = found.get(f"of_{len(extra)}", fit.chi_squared)
         values, cost = np.concatenate([fit.values, extra]), chi_squared * 2 * fit.points

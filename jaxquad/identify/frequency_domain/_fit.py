@@ -205,13 +205,16 @@ def fit_with(
     options: Options,
     *,
     rounds: int = 3,
+    by_slopes: bool = False,
     descents: list[Descent] | None = None,
 ) -> Fit:
     """Fit as `jq.fit` does, and up to `rounds` times more with what the model leaves unexplained as
-    a floor on the random error; without, costs compare structures. `descents` gets all of them."""
+    a floor on the random error; without, costs compare structures. With `by_slopes` no parameter is
+    followed along the cost, which a remark says. `descents` gets all of them."""
     small = all(np.size(frf.omega) <= _SMALL for frf in frfs)
+    descents = [] if descents is None else descents
     with one_blas_thread() if small else contextlib.nullcontext():
-        return _fit(with_arrays(model), frfs, options, rounds, [] if descents is None else descents)
+        return _fit(with_arrays(model), frfs, options, rounds, by_slopes, descents)
 
 
 def _fit(
@@ -219,6 +222,7 @@ def _fit(
     frfs: Sequence[FrequencyResponse],
     options: Options,
     rounds: int,
+    by_slopes: bool,
     descents: list[Descent],
 ) -> Fit:
     # The problem: points, parameters, priors.
@@ -338,8 +342,12 @@ def _fit(
                 f"left out; free what joins the two, or say band={{{pair}: None}}"
             )
             remarks.append(Message(text, "no response"))
+    if by_slopes:
+        remarks.append("one of several structures: its intervals are by slopes alone")
     origin = Origin(fit_with, tuple(points), options)
-    return assess(problem, weighting, solution, minima, further=remarks, origin=origin)
+    return assess(
+        problem, weighting, solution, minima, further=remarks, origin=origin, by_slopes=by_slopes
+    )
 
 
 def _check_finite(solution: Solution, solver: eqx.Module | None) -> None:

@@ -88,7 +88,7 @@ def check_options(cost: PyTree, band: PyTree, min_coherence: float | None, max_s
 @pytree_node
 class Origin:
     """The responses and options of a fit. `run(model, responses, options, rounds=...)` fits as
-    `jq.fit` does; with 0 rounds, costs compare structures."""
+    `jq.fit` does; with 0 rounds, costs compare structures, and `by_slopes=True` is enough."""
 
     run: Callable[..., PyTree] = eqx.field(static=True)
     points: tuple[Points, ...]
@@ -111,10 +111,12 @@ class Origin:
         """How many points in use there would be if none shared their noise."""
         return sum(float(np.sum(1 / points.shared[points.used])) for points in self.points)
 
-    def fit_again(self, model: PyTree, options: Options, rounds: int = 3) -> PyTree:
+    def fit_again(
+        self, model: PyTree, options: Options, rounds: int = 3, *, by_slopes: bool = False
+    ) -> PyTree:
         """A `jq.identify.Fit`; None where the solver diverged."""
         try:
-            return self.run(model, self.frfs, options, rounds=rounds)
+            return self.run(model, self.frfs, options, rounds=rounds, by_slopes=by_slopes)
         except ValueError:
             return None
 
@@ -329,7 +331,7 @@ def _sweeps(origin: Origin) -> list[tuple[np.ndarray, np.ndarray]] | None:
 
 
 class Candidate(NamedTuple):
-    """A structure that was tried; `gain` is by how much it lowers BIC."""
+    """A structure that was tried; `gain` is by how much it lowers BIC. Intervals are by slopes."""
 
     title: str
     formula: str
@@ -404,13 +406,14 @@ def explain_misfit(fit: PyTree) -> Explanation:
         return Explanation(fit, (candidate, *inner.candidates), best, actuator)
     low, high = origin.band
     model, middle = model_to_start_from(fit), float(np.sqrt(low * high))
-    plain = origin.fit_again(model, _options(fit, origin, None), 0) or fit
+    plain = origin.fit_again(model, _options(fit, origin, None), 0, by_slopes=True) or fit
     tried = []
     for term in (*_TERMS, *(_OF_SWEEPS if _sweeps(origin) else ())):
         options, fits = _options(fit, origin, term), []
         for start in term.starts(low, middle, high):
             with np.errstate(all="ignore"):  # of a term that runs away, dropped below
-                other = origin.fit_again(Extended(model, jnp.asarray(start), term), options, 0)
+                extended = Extended(model, jnp.asarray(start), term)
+                other = origin.fit_again(extended, options, 0, by_slopes=True)
             if other is None or not np.isfinite(other.cost):
                 continue
             # A frequency far from the band makes the term a gain, or nothing.
@@ -443,11 +446,11 @@ def explain_misfit(fit: PyTree) -> Explanation:
     equal = [candidate for candidate in better if candidate.gain >= least]
     first = min(equal, key=lambda candidate: len(candidate.fit.model.term.names))
     candidates.sort(key=lambda candidate: candidate is not first)
-    best = first.fit
-    again = origin.fit_again(best.model, _options(fit, origin, best.model.term), 3)
-    if again is not None and again.chi_squared < fit.chi_squared:
-        best = again
-    return Explanation(fit, tuple(candidates), best)
+    best, options = first.fit, _options(fit, origin, first.fit.model.term)
+    again = origin.fit_again(best.model, options)
+    if again is None or again.chi_squared >= fit.chi_squared:
+        again = origin.fit_again(best.model, options, 0)
+    return Explanation(fit, tuple(candidates), best if again is None else again)
 
 
 def _options(fit: PyTree, origin: Origin, term: _Term | None) -> Options:

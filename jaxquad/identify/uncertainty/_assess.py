@@ -70,15 +70,16 @@ def assess(
     *,
     further: Sequence[str] = (),
     origin: Origin | None = None,
+    by_slopes: bool = False,
 ) -> Fit:
     """Costs, bounds, calibrated covariance and identifiability at the solution. The fit gets the
-    `further` remarks and its `origin`."""
+    `further` remarks and its `origin`; `by_slopes` follows no parameter along the cost."""
     parameters, budget, bounds = problem.parameters, weighting.budget, ()
     names, count, start = parameters.names, parameters.count, units_of(solution)
     bread, gradient, units = budget.bread, budget.gradient, start  # by slopes at the solution
     local, beyond = local_misfits(budget, weighting.points)
     budget = with_resonance(budget, certain=beyond is not None)
-    near = near_zeros(problem, solution, budget)
+    near = [] if by_slopes else near_zeros(problem, solution, budget)
     changes = {one.k: one.changes for one in near if one.changes is not None}
     # The next Gauss-Newton step, downhill: parameters at zero do not become negative, and those so
     # near it that slopes there say nothing about a step stand still.
@@ -96,7 +97,7 @@ def assess(
         again = dataclasses.replace(again, mixtures=weighting.budget.mixtures)
         return with_resonance(again, certain=beyond is not None)
 
-    followed = profiles(problem, solution, budget, near)
+    followed = () if by_slopes else profiles(problem, solution, budget, near)
     if near:
         budget = up_to_limits(units)
         reached = np.max([np.zeros(count), *(one.reached() for one in followed)], axis=0)
