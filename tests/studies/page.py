@@ -50,7 +50,7 @@ FINDINGS = {
 their defaults. The least possible error is the Cramer-Rao bound; the luck of the draws is taken
 out. Wanted: 93 to 97 %, at most 1.06 (coloured noise 1.10), at most 2 % of records with a remark.
 scipy's `csd` and `least_squares` on the same records: 1.5 to 490 times the bound. Counting
-model error widens intervals by 0 to 12 % where the model is right.
+model error widens intervals by 0 to 15 % where the model is right.
 """,
     "New ground": """\
 1000 plants drawn at random, seed 688949 (each run draws others): 95.2 % of the printed 95 %
