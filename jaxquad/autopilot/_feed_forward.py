@@ -41,7 +41,7 @@ class StickFollowing(NamedTuple):
     """How the rate follows a quick stick with one gain of feed-forward."""
 
     value: float  # of the gain, as stored
-    error: float  # rms of set-point less rate, over all plants, relative to what flew
+    error: float  # rms of set-point less rate, over all plants, relative to the flown gain
     peak: float  # the greatest of the response from set-point to rate
 
 
@@ -51,7 +51,7 @@ class FeedForwardVerdict:
 
     text: str
     parameter: str
-    stages: tuple[StickFollowing, ...]  # what flew, the same with the new gains, and the new one
+    stages: tuple[StickFollowing, StickFollowing]  # with the flown gain of it, and the new one
 
     @property
     def flown(self) -> dict[str, float]:
@@ -66,8 +66,8 @@ class FeedForwardVerdict:
     @property
     def reason(self) -> str:
         """Why it changes."""
-        _, error, peak = self.stages[-1]
-        return f"error after a quick stick {error:.2f} of what flew, peak of response {peak:.2f}"
+        (old, _, _), (_, error, peak) = self.stages
+        return f"error after a quick stick {error:.2f} of that with {old:.0f}, peak {peak:.2f}"
 
     def content(self) -> dict[str, object]:
         stages = [stage._asdict() for stage in self.stages]
@@ -75,8 +75,8 @@ class FeedForwardVerdict:
 
 
 def design_feed_forward(
-    flown: FlownAutopilot, loops: Sequence[RateLoops], fresh: Sequence[Sequence[RateLoops]],
-    designs: Sequence[OneGains], settings: DesignSettings,
+    flown: FlownAutopilot, loops: Sequence[RateLoops], fresh: Sequence[RateLoops], gains: OneGains,
+    settings: DesignSettings,
 ) -> FeedForwardVerdict | None:  # fmt: skip
     """The gain with the least error after a quick stick whose response keeps the limit on its peak.
 
@@ -84,9 +84,8 @@ def design_feed_forward(
 
     **Arguments:**
 
-    - `loops`: that the last of the `designs` was tuned on, behind its filters.
-    - `fresh`: those of what flew and of the last design, for the certificate.
-    - `designs`: P, I and D of both.
+    - `loops`: what the new P, I and D, `gains`, were tuned on, behind the new filters.
+    - `fresh`: likewise, for the certificate.
     """
     law, axis = flown.law, flown.axis
     if not law.of_sticks:
@@ -95,21 +94,15 @@ def design_feed_forward(
     name = names_by_field(law.firmware, axis)[field]
     row = find_parameter(law.firmware, name)
     before = float(np.broadcast_to(vars(law)[field], 3)[axis])
-    sticks = _QuickSticks(loops, designs[-1], law, axis)
+    sticks, others = (_QuickSticks(x, gains, law, axis) for x in (loops, fresh))
     least, most = before / settings.change, before * settings.change if before > 0 else row.high
     asked_for = _SHARE * float(np.broadcast_to(vars(law)["limit"], 3)[axis]) / sticks.command
     ends = np.clip((least, min(most, max(before, asked_for))), row.low, row.high)
-    value = _best_value(sticks, before, ends, settings.resonance)
-    flew, last = (_QuickSticks(*x, law, axis) for x in zip(fresh, designs, strict=True))
-    unit = flew.errors(np.array([before]))
-    ways = (flew, before), (last, before), (last, value)
-    stages = []
-    for those, value in ways:
-        one = np.array([value])
-        [error], [peak] = those.errors(one) / unit, those.peaks(one)
-        stages.append(StickFollowing(value, float(error), float(peak)))
-    text = _in_words(name, stages, settings.resonance)
-    return FeedForwardVerdict(text, name, tuple(stages))
+    values = np.array([before, _best_value(sticks, before, ends, settings.resonance)])
+    errors = others.errors(values)
+    rows = zip(values, errors / errors[0], others.peaks(values), strict=True)
+    old, new = (StickFollowing(*map(float, row)) for row in rows)
+    return FeedForwardVerdict(_in_words(name, old, new, settings.resonance), name, (old, new))
 
 
 def _best_value(sticks: "_QuickSticks", before: float, ends: Values, limit: float) -> float:
@@ -122,23 +115,16 @@ def _best_value(sticks: "_QuickSticks", before: float, ends: Values, limit: floa
     return before if _WORTH * flown <= score.min() else float(values[np.argmin(score)])
 
 
-def _in_words(name: str, stages: Sequence[StickFollowing], limit: float) -> str:
-    flew, same, new = stages
-    allowed = f"the response to the set-point peaks at {new.peak:.2f}, of at most {limit:g}"
-    if flew.value == 0:
-        return (
-            f"off, and stays so; {name} = {new.value:.0f} would leave {new.error / same.error:.2f} "
-            f"of the error after a quick stick ({allowed})"
-        )
-    if new.value == flew.value:
-        return (
-            f"{name} = {new.value:.0f} stays: the error after a quick stick is {new.error:.2f} of "
-            f"what flew ({allowed})"
-        )
+def _in_words(name: str, old: StickFollowing, new: StickFollowing, limit: float) -> str:
+    peak = f"the response to the set-point peaks at {new.peak:.2f}, of at most {limit:g}"
+    if new.value == old.value:
+        return f"{name} = {new.value:.0f} stays: {peak}"
+    share = f"{new.error:.2f} of the error after a quick stick"
+    if old.value == 0:
+        return f"off, and stays so; {name} = {new.value:.0f} would leave {share} ({peak})"
     return (
-        f"{name} = {flew.value:.0f} -> {new.value:.0f}: the error after a quick stick is "
-        f"{new.error:.2f} of what flew ({allowed}); with {flew.value:.0f} it would be "
-        f"{same.error:.2f} (peak {same.peak:.2f})"
+        f"{name} = {old.value:.0f} -> {new.value:.0f} leaves {share} with the new gains; {peak} "
+        f"(with {old.value:.0f} at {old.peak:.2f})"
     )
 
 

@@ -115,8 +115,7 @@ def _searched(
     new, sticks = {}, None
     if kind == "proposed":
         behind = design.filtered(loops, best.filters) if best.filters else loops
-        ends = (best.loops[0], best.loops[-1]), (best.gains[0], best.gains[-1])
-        sticks = design_feed_forward(flown, behind, *ends, settings)
+        sticks = design_feed_forward(flown, behind, best.loops[-1], best.gains[-1], settings)
         new = best.new if sticks is None else best.new | sticks.new
     return dataclasses.replace(
         proposal, kind=kind, verdict=text, stages=best.stages, filters=verdict, sticks=sticks,

@@ -128,7 +128,10 @@ def test_the_true_plant_is_inside_and_gains_are_proposed(
         before = content["stages"][0]
         assert before["peak"] == pytest.approx(1.80, abs=0.06)  # of the true loop
         assert after["angle"]["closed"] and after["angle"]["peak"] < 1.8
-    elif axis != "yaw" and name != "A_chirp_plain.BFL":  # where iterm_relax is on
+    elif name == "A_chirp_plain.BFL":
+        assert content["feed_forward"]["text"].startswith("off, and stays so; f_roll = ")
+        assert "f_roll" not in content["new"]
+    elif axis != "yaw":  # where iterm_relax is on
         assert after["relaxed"] is not None and after["relaxed"] <= 1.8
 
 
