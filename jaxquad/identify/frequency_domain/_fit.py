@@ -343,7 +343,8 @@ def _fit(
             )
             remarks.append(Message(text, "no response"))
     if by_slopes:
-        remarks.append("one of several structures: its intervals are by slopes alone")
+        text = "one of several structures: its intervals are by slopes alone"
+        remarks.append(Message(text, "by slopes"))
     origin = Origin(fit_with, tuple(points), options)
     return assess(
         problem, weighting, solution, minima, further=remarks, origin=origin, by_slopes=by_slopes
