@@ -288,8 +288,9 @@ def pilot_page(proposal: "AutopilotProposal", origin: Provenance, overview: str)
         headlines.append(Headline("good", "THE FLOWN LOOP AGAIN", check.verdict))
     if filters is not None:
         headlines.append(Headline("good" if filters.flown else "warn", "FILTERS", filters.text))
-    if proposal.sticks is not None:
-        headlines.append(Headline("good", "FEED-FORWARD", proposal.sticks.text))
+    if (sticks := proposal.sticks) is not None:
+        level = "good" if sticks.keeps else "warn"
+        headlines.append(Headline(level, "FEED-FORWARD", sticks.text))
     if throttle is not None:
         level = "warn" if throttle.gains is None else "good"
         headlines.append(Headline(level, "THROTTLE", throttle.text))

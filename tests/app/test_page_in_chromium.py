@@ -350,7 +350,7 @@ def test_a_million_samples_zoom_without_a_wait(page, tmp_path):
 
 def test_two_flights_are_compared(page, data):
     page.get_by_role("tab", name="Compare").click()
-    page.wait_for_timeout(1000)  # a file that is dropped while the panel slides in is lost
+    page.get_by_text("Two flights over each other").wait_for()  # the box of the other tab is gone
     folder = data / "betaflight_firmware"
     for k, name in enumerate(("A_chirp_roll.BFL", "A_chirp_plain.BFL")):
         page.set_input_files(f"input[type=file] >> nth={k}", str(folder / name))
